@@ -1,0 +1,1 @@
+"""Mathematics of adaptive backlash inverse control: no ROS, no plotting, no bags."""

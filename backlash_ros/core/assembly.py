@@ -1,0 +1,118 @@
+"""From checked parameters to the objects of the core: the one place that knows both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+
+import numpy as np
+
+from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.controller import AdaptiveController, Limits
+from backlash_ros.core.estimator import Bounds, Estimate, Estimator
+from backlash_ros.core.input_reconstruction import InputReconstruction
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.kalman import KalmanEstimator
+from backlash_ros.core.lms import NormalisedLms
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.printed_law import PrintedLaw
+from backlash_ros.core.proportional import Proportional
+from backlash_ros.core.reference_signal import ReferenceSignal
+from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Structure
+from backlash_ros.core.transfer_function import TransferFunction
+
+
+def build_model(p: Parameters) -> TransferFunction:
+    """G(z)."""
+    return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator'))
+
+
+def build_controller(p: Parameters) -> AdaptiveController:
+    """The controller with the law and the structure that the parameters name."""
+    period = p.real('sample_period')
+    inverse = BacklashInverse(
+        p.real('inverse.direction_band'), p.real('inverse.take_up_rate') * period
+    )
+    return AdaptiveController(
+        ESTIMATORS[p.word('estimator.law')](p), STRUCTURES[p.word('structure')](p), inverse,
+        build_limits(p),
+    )
+
+
+def build_limits(p: Parameters) -> Limits:
+    """Limits of v per sample."""
+    rate = p.real('control.rate_max')
+    move = inf if rate == inf else rate * p.real('sample_period')
+    return Limits(p.real('control.min'), p.real('control.max'), move)
+
+
+def build_plant(p: Parameters) -> SimulatedPlant:
+    """The simulated plant with its hidden backlash."""
+    backlash = Backlash(
+        p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l'),
+        p.real('backlash.initial_u'),
+    )
+    imperfections = Imperfections(
+        p.real('output_noise_std'), p.real('output_quantum'), p.real('input_disturbance'),
+        p.triple('backlash.rate'), p.real('backlash.jump_time'), p.triple('backlash.jump'),
+    )
+    rng = np.random.default_rng(p.integer('seed'))
+    return SimulatedPlant(build_model(p), backlash, p.real('sample_period'), rng, imperfections)
+
+
+def build_reference(p: Parameters, samples: tuple[float, ...] = ()) -> ReferenceSignal:
+    """y_m(t); samples are the values of the file for waveform: file."""
+    return ReferenceSignal(
+        p.word('waveform'), p.real('amplitude'), p.real('frequency'), p.real('bias'),
+        p.real('frequency_start'), p.real('sweep_time'), p.real('sample_period'), samples,
+    )
+
+
+def _bounds(p: Parameters) -> Bounds:
+    return Bounds(
+        p.pair('estimator.bounds.m'), p.pair('estimator.bounds.c_r'),
+        p.pair('estimator.bounds.c_l'),
+    )
+
+
+def _initial(p: Parameters) -> Estimate:
+    return Estimate(
+        p.real('estimator.initial.m'), p.real('estimator.initial.c_r'),
+        p.real('estimator.initial.c_l'), p.real('proportional.f'),
+    )
+
+
+def _reconstruction(p: Parameters) -> InputReconstruction:
+    return InputReconstruction(
+        build_model(p), p.real('estimator.output_noise_std'), p.integer('estimator.lag')
+    )
+
+
+def _kalman(p: Parameters) -> Estimator:
+    return KalmanEstimator(
+        _initial(p), _bounds(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+        p.triple('estimator.drift_std'), p.real('sample_period'),
+    )
+
+
+def _lms(p: Parameters) -> Estimator:
+    return NormalisedLms(
+        _initial(p), _bounds(p), p.pair('proportional.bounds'), _reconstruction(p),
+        p.real('lms.step'), p.real('lms.step_f'),
+    )
+
+
+def _printed(p: Parameters) -> Estimator:
+    return PrintedLaw(_initial(p), _bounds(p), p.pair('proportional.bounds'), _reconstruction(p))
+
+
+def _proportional(p: Parameters) -> Structure:
+    return Proportional()
+
+
+ESTIMATORS: dict[str, Callable[[Parameters], Estimator]] = {
+    'kalman': _kalman, 'lms': _lms, 'printed': _printed,
+}
+STRUCTURES: dict[str, Callable[[Parameters], Structure]] = {'proportional': _proportional}

@@ -1,0 +1,68 @@
+"""The whole loop in one process: reference, controller and simulated plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import nan
+
+import numpy as np
+
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
+from backlash_ros.core.controller import AdaptiveController
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulated_plant import SimulatedPlant
+
+
+@dataclass
+class ClosedLoop:
+    """Controller, plant and reference stepped together; row k holds sample k.
+
+    lose: says of each sample whether y(k) is lost on the way.
+    """
+
+    controller: AdaptiveController
+    plant: SimulatedPlant
+    reference: Callable[[float], float]
+    sample_period: float
+    lose: Callable[[], bool] = field(default=lambda: False)
+
+    def run(
+        self, samples: int, on_sample: Callable[[int], None] | None = None,
+    ) -> RunRecord:
+        """Simulate and return every signal; on_sample(k) is called after each sample."""
+        rows = np.full((samples, len(COLUMNS)), nan)
+        lost, v = 0, 0.0
+        kept = 0
+        for k in range(samples):
+            t = k * self.sample_period
+            y = self.plant.measure()
+            if k > 0 and self.lose():
+                lost += 1
+                self.plant.step(v)
+            else:
+                step = self.controller.step(y, self.reference(t), lost)
+                lost, v = 0, step.v
+                truth = self.plant.backlash
+                u = self.plant.step(v)
+                e = step.estimate
+                rows[kept] = (
+                    t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f, e.std_m, e.std_c_r,
+                    e.std_c_l, step.u_hat, step.innovation, e.status, truth.m, truth.c_r,
+                    truth.c_l,
+                )
+                kept += 1
+            if on_sample is not None:
+                on_sample(k)
+        return RunRecord(rows[:kept], self.sample_period, self.controller.lost_samples + lost)
+
+
+def build_closed_loop(p: Parameters, reference_samples: tuple[float, ...] = ()) -> ClosedLoop:
+    """The loop of the given parameters; the seed also draws which outputs are lost."""
+    loss = p.real('output_loss')
+    rng = np.random.default_rng([p.integer('seed'), 1])
+    return ClosedLoop(
+        build_controller(p), build_plant(p), build_reference(p, reference_samples),
+        p.real('sample_period'), lambda: loss > 0.0 and float(rng.random()) < loss,
+    )

@@ -1,0 +1,103 @@
+"""What every estimator of the backlash offers, and the values it publishes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+from backlash_ros.core.errors import ParameterError
+
+
+class Status(IntEnum):
+    """How much an estimate may be trusted; the code stands in `controller/signals`."""
+
+    ACQUIRING = 0  # not enough known yet, the estimate still moves freely
+    TRACKING = 1  # consistent with the data and updated by them
+    NOT_EXCITED = 2  # frozen: v did not swing past the gap lately
+    NO_DATA = 3  # frozen: y is missing
+    INCONSISTENT = 4  # frozen: y does not follow from v through G and a backlash
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the last good estimate is held."""
+        return self >= Status.NOT_EXCITED
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Estimates of the backlash and their standard deviations (nan where the law has none).
+
+    m [unit of u / unit of v], c_r and c_l [unit of v], f of (3.2).
+    """
+
+    m: float
+    c_r: float
+    c_l: float
+    f: float
+    std_m: float = float('nan')
+    std_c_r: float = float('nan')
+    std_c_l: float = float('nan')
+    status: Status = Status.ACQUIRING
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Projection intervals (low, high) of the estimates; 0 < m, c_l <= 0 <= c_r."""
+
+    m: tuple[float, float] = (0.01, 100.0)
+    c_r: tuple[float, float] = (0.0, 100.0)
+    c_l: tuple[float, float] = (-100.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name, (low, high) in (('m', self.m), ('c_r', self.c_r), ('c_l', self.c_l)):
+            if not low < high:
+                raise ParameterError(
+                    f'estimator.bounds.{name}', [low, high], 'must be [low, high] with low < high'
+                )
+        if not self.m[0] > 0.0:
+            raise ParameterError('estimator.bounds.m', list(self.m), 'must have low > 0')
+        if self.c_r[0] < 0.0:
+            raise ParameterError('estimator.bounds.c_r', list(self.c_r), 'must have low >= 0')
+        if self.c_l[1] > 0.0:
+            raise ParameterError('estimator.bounds.c_l', list(self.c_l), 'must have high <= 0')
+
+    def project(self, m: float, c_r: float, c_l: float) -> tuple[float, float, float]:
+        """Nearest (m, c_r, c_l) inside the bounds."""
+        return (
+            min(max(m, self.m[0]), self.m[1]),
+            min(max(c_r, self.c_r[0]), self.c_r[1]),
+            min(max(c_l, self.c_l[0]), self.c_l[1]),
+        )
+
+
+@dataclass(frozen=True)
+class Interval:
+    """What the controller did between two samples: v was applied, y_m and u_d led to it.
+
+    f: the gain of (3.2) that was in use.
+    """
+
+    v: float
+    y_m: float
+    u_d: float
+    f: float
+
+
+class Estimator(Protocol):
+    """Learns (m, c_r, c_l), and f where the law adapts it, from v and y alone."""
+
+    @property
+    def estimate(self) -> Estimate:
+        """Newest estimate; reading it changes nothing."""
+
+    @property
+    def u_hat(self) -> float:
+        """Newest reconstruction of u, `lag` samples old."""
+
+    @property
+    def innovation(self) -> float:
+        """y(k) minus its prediction from the samples before; nan where y(k) was lost."""
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k), None if it was lost, and what was applied from k-1 to k."""

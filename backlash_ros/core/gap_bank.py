@@ -1,0 +1,215 @@
+"""A bank of Kalman filters on [x; theta], one per hypothesis on the gap width g = c_r - c_l.
+
+Given g, the play operator says from v alone which side of the gap was engaged last and at which
+v_a. Then u = phi' theta with theta = (m, m c_r, m c_l) and phi = (v_a, -1{right}, -1{left}), and
+y is linear in everything unknown:
+
+    x(k+1) = A x(k) + B phi(k)' theta,   y(k) = C x(k) + noise
+
+so that a Kalman filter is the optimal estimator under each hypothesis, and the likelihood of its
+innovations says how well the hypothesis fits. In the gap u is held: the last engaged phi goes on.
+
+Reference: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and
+Navigation, Wiley 2001, section 11.6 (static multiple models).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, log, nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+# Rounding in the propagation is not symmetric; left alone it would grow.
+SYMMETRISE_EVERY = 16
+NIS_MEMORY = 1.0 / 40.0  # the mean of a true hypothesis is 1, its standard deviation then 0.16
+NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is believed before the first sample: theta and its standard deviations, shape (3,).
+
+    state_std: standard deviation of the unknown x in the coordinates of StateModel.
+    """
+
+    theta: Array
+    theta_std: Array
+    state_std: float
+
+
+class GapBank:
+    """Kalman filters for gap widths g (H,), ascending, stepped together.
+
+    A hypothesis starts when v has swung over its whole gap for the first time: only then is it
+    certain which side is engaged, whatever u was held at before. Until then it is charged what a
+    true model would cost per sample, so that early and late starters can be compared.
+
+    noise_var: variance R of the noise on y. drift_var: added to the covariance of theta per
+    sample, shape (3, 3), None without drift. with_null: put the hypothesis "v never engaged: u is
+    a constant" in front as row 0, for which theta[0] is that constant.
+    """
+
+    def __init__(
+        self, gaps: Array, model: StateModel, prior: Prior, noise_var: float,
+        drift_var: Array | None = None, with_null: bool = False,
+    ) -> None:
+        if with_null:
+            gaps = np.concatenate([[0.0], gaps])
+        n, count = model.order, len(gaps)
+        self.gaps = gaps.copy()
+        self.noise_var, self.drift_var = noise_var, drift_var
+        self.mean = np.zeros((count, n + 3))
+        self.mean[:, n:] = prior.theta
+        variances = np.concatenate([np.full(n, prior.state_std**2), prior.theta_std**2])
+        self.cov = np.tile(np.diag(variances), (count, 1, 1))
+        # Every filter pays once for how little its prior says of x; repaid here, so that banks
+        # with different priors can be compared.
+        self.log_likelihood = np.full(count, n * log(prior.state_std))
+        self.active = 0  # hypotheses [:active] have started
+        self.since_engaged = 0  # samples since the leader was last engaged
+        self.leader = 0  # most likely hypothesis that has started
+        self.innovation = nan  # of the leader
+        self.innovation_var = noise_var
+        self.nis = 1.0  # running mean of the leader's normalised innovation squared
+        self._model, self._n, self._first = model, n, 1 if with_null else 0
+        self._transition = np.tile(np.eye(n + 3), (count, 1, 1))
+        self._transition[:, :n, :n] = model.a
+        self._reach = np.zeros(count)  # q of the play operator: clamped between v and v + g
+        self._left = np.zeros(count)  # 1 where the left side was engaged last
+        self._phi = np.zeros((count, 3))
+        self._phi[0, 0] = 1.0  # for good under the null hypothesis
+        self._v_low, self._v_high = inf, -inf  # swing of v so far
+        self._corrections = 0
+        self._noise_charge = 0.5 * (1.0 + log(noise_var))
+
+    @property
+    def theta(self) -> Array:
+        """Estimates of (m, m c_r, m c_l) per hypothesis, shape (H, 3)."""
+        return self.mean[:, self._n:]
+
+    @property
+    def theta_cov(self) -> Array:
+        """Covariances of theta per hypothesis, shape (H, 3, 3)."""
+        return self.cov[:, self._n:, self._n:]
+
+    def score(self, tolerance: float) -> Array:
+        """Log-likelihood of each started hypothesis, its own gap held against its estimate.
+
+        A hypothesis g that fits the data with another m (c_r - c_l) than m g contradicts itself.
+        tolerance: relative width of g that one hypothesis stands for.
+        """
+        rows = slice(self._first, self.active)
+        gaps, theta, cov = self.gaps[rows], self.theta[rows], self.theta_cov[rows]
+        weights = np.stack([-gaps, np.ones_like(gaps), -np.ones_like(gaps)], axis=1)
+        mismatch = (weights * theta).sum(axis=1)
+        variance = (weights[:, None, :] @ cov @ weights[:, :, None])[:, 0, 0]
+        variance = np.maximum(variance, 0.0) + (tolerance * gaps * theta[:, 0]) ** 2
+        score = self.log_likelihood[:self.active].copy()
+        score[rows] -= 0.5 * (mismatch**2 / variance + np.log(variance))
+        score[rows][theta[:, 0] <= 0.0] = -inf
+        return score
+
+    def u_hat(self) -> float:
+        """u under the leading hypothesis after the last step."""
+        return float(self._phi[self.leader] @ self.theta[self.leader])
+
+    def move_gaps(self, gaps: Array) -> None:
+        """Give the hypotheses other gaps (H,), ascending; what they have learned stays."""
+        # v_a = q - g of a left engagement must not move with g.
+        self._reach += self._left * (gaps - self.gaps)
+        self.gaps = gaps
+        self.log_likelihood[:] = 0.0
+
+    def predict(self, v: float) -> None:
+        """Go from k-1 to k with v applied in between."""
+        before = self.active
+        if before < len(self.gaps):
+            self._start(v)
+            self.log_likelihood[self.active:] -= self._noise_charge
+        if before:
+            self._play(before, v)
+            self._propagate(before)
+
+    def _start(self, v: float) -> None:
+        """Start the hypotheses whose whole gap v has swung over with this sample."""
+        rising = v > self._v_high
+        if not (rising or v < self._v_low):
+            return
+        self._v_low, self._v_high = min(v, self._v_low), max(v, self._v_high)
+        before, swing = self.active, max(self._v_high - self._v_low, 0.0)
+        self.active = int(np.searchsorted(self.gaps, swing, side='right'))
+        new = slice(before, self.active)
+        self._reach[new] = v if rising else v + self.gaps[new]
+        self._left[new] = 0.0 if rising else 1.0
+        self._set_phi(new)
+
+    def _play(self, count: int, v: float) -> None:
+        """Move the play operators; phi is that of the last engagement."""
+        rows = slice(self._first, count)
+        reach, left = self._reach[rows], self._left[rows]
+        upper = v + self.gaps[rows]
+        on_left, on_right = reach >= upper, reach <= v
+        left[on_left] = 1.0
+        left[on_right] = 0.0
+        np.minimum(np.maximum(reach, v, out=reach), upper, out=reach)
+        self._set_phi(rows)
+        index = self.leader - self._first
+        engaged = index >= 0 and bool(on_left[index] or on_right[index])
+        self.since_engaged = 0 if engaged else self.since_engaged + 1
+
+    def _set_phi(self, rows: slice) -> None:
+        rows = slice(max(rows.start, self._first), rows.stop)
+        left, phi = self._left[rows], self._phi[rows]
+        phi[:, 0] = self._reach[rows] - left * self.gaps[rows]
+        phi[:, 1] = left - 1.0
+        phi[:, 2] = -left
+
+    def _propagate(self, count: int) -> None:
+        n, transition = self._n, self._transition[:count]
+        mean, cov = self.mean[:count], self.cov[:count]
+        transition[:, :n, n:] = self._model.b[:, None] * self._phi[:count, None, :]
+        mean[:] = (transition @ mean[:, :, None])[:, :, 0]
+        cov[:] = transition @ cov @ transition.transpose(0, 2, 1)
+        if self.drift_var is not None:
+            cov[:, n:, n:] += self.drift_var
+
+    def correct(self, y: float, gate: float = inf, learn: bool = True) -> bool:
+        """Take in y(k); return False if it was refused as an outlier.
+
+        gate: largest innovation of the leader in standard deviations. learn: False holds theta
+        and corrects x alone, its covariance still counting theta as unknown (Schmidt's filter).
+        """
+        count, n = self.active, self._n
+        if not count:
+            return True
+        mean, cov = self.mean[:count], self.cov[:count]
+        cross = cov[:, :, :n] @ self._model.c
+        variance = cross[:, :n] @ self._model.c + self.noise_var
+        e = y - mean[:, :n] @ self._model.c
+        leader = self.leader
+        self.innovation, self.innovation_var = float(e[leader]), float(variance[leader])
+        square = self.innovation**2 / self.innovation_var
+        self.nis += NIS_MEMORY * (min(square, NIS_CAP) - self.nis)
+        if square > gate * gate:
+            return False
+        scaled = cross / variance[:, None]
+        if learn:
+            mean += scaled * e[:, None]
+            cov -= scaled[:, :, None] * cross[:, None, :]
+        else:
+            mean[:, :n] += scaled[:, :n] * e[:, None]
+            learned = cov[:, n:, n:].copy()
+            cov -= scaled[:, :, None] * cross[:, None, :]
+            cov[:, n:, n:] = learned
+        self._corrections += 1
+        if self._corrections % SYMMETRISE_EVERY == 0:
+            cov[:] = 0.5 * (cov + cov.transpose(0, 2, 1))
+        self.log_likelihood[:count] -= 0.5 * (e * e / variance + np.log(variance))
+        self.leader = int(self.log_likelihood[:count].argmax())
+        return True

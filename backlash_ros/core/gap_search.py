@@ -1,0 +1,210 @@
+"""Global search for the gap width: a coarse grid finds the basin, replays refine it.
+
+The coarse bank covers every gap the bounds allow. Its winner names a narrow fine bank around its
+own estimate of c_r - c_l, which is run over the recorded samples from the first one on, several
+at a time, until it has caught up and takes over. As the estimate sharpens, this is repeated at
+growing intervals: samples that an earlier, wrong gap had put on the wrong side are read afresh,
+so that noise-free data lead to the exact parameters and not to a residue of the grid.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import ceil, inf, isnan, log, nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.crossings import Crossings, crossings_of
+from backlash_ros.core.estimator import Bounds, Estimate
+from backlash_ros.core.gap_bank import GapBank, Prior
+from backlash_ros.core.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+GRID_RATIO = 1.2  # between neighbouring gaps of the coarse grid
+SMALLEST_GAP = 5e-4  # of the widest gap the bounds allow
+# Fine hypotheses in standard deviations of the gap: near ones for precision, far ones for doubt.
+FINE_OFFSETS = np.array([-1.0, 0.0, 1.0])
+BRACKET = np.array([-0.7, -0.35, 0.0, 0.35, 0.7])
+LARGEST_SPREAD = 0.2  # of the gap: the standard deviation is not to be trusted beyond
+CAPACITY = 8192  # samples kept for replays
+REPLAY_SPEED = 4  # recorded samples per new one
+GROWTH = 1.5  # of the record between two replays
+START_GATE = 8.0  # standard deviations; before the fine bank stands only gross outliers are told
+PATIENCE = 2  # outliers in a row that the coarse bank refuses before it believes them
+NULL_MARGIN = 15.0  # log-likelihood by which a gap must beat "v never engaged"
+COARSE_MARGIN = 10.0  # log-likelihood by which the fine bank may not fall behind the coarse one
+COARSE_TOLERANCE = 0.1  # half of GRID_RATIO - 1
+SETTLED = 100  # samples of the fine bank after which the coarse one may rest
+NIS_SETTLED = 1.6  # normalised innovation squared of a fine bank that may be trusted to go alone
+# Without noise the filter still needs some, this far below what one sample of u does to x.
+NOISE_FLOOR = 1e-5
+STATE_REACH = 100.0  # prior of x, in terms of what was seen of y and v
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """What a search needs to know: the model, the bounds, the first guess and the noise."""
+
+    model: StateModel
+    bounds: Bounds
+    initial: Estimate
+    noise_std: float
+    drift_std: tuple[float, float, float]  # of m, c_r, c_l per square root of a sample
+
+
+class GapSearch:
+    """Finds and refines the gap from (y, v), sample by sample."""
+
+    def __init__(self, settings: SearchSettings) -> None:
+        self.fine: GapBank | None = None
+        self.coarse: GapBank | None = None
+        self.samples = 0
+        self._settings = settings
+        self._y, self._v = np.empty(CAPACITY), np.empty(CAPACITY)
+        self._replay: GapBank | None = None
+        self._replayed = 0
+        self._next_replay = 0
+        self._fine_since = 0
+        self._earliest = 0
+        self._refused = 0
+        self._settled = False
+
+    @property
+    def full(self) -> bool:
+        """Whether the record is full, so that nothing can be replayed any more."""
+        return self.samples >= CAPACITY
+
+    @property
+    def excited(self) -> bool:
+        """Whether the data show that v has engaged at all."""
+        coarse = self.coarse
+        if coarse is None or coarse.leader == 0:
+            return False
+        likelihood = coarse.log_likelihood
+        return bool(likelihood[coarse.leader] - likelihood[0] > NULL_MARGIN)
+
+    def add(self, y: float | None, v: float, accepted: bool = True) -> None:
+        """Take in a sample; y is None if it was lost, not accepted if it is an outlier."""
+        value = nan if y is None or not accepted else y
+        if not self.full:
+            self._y[self.samples], self._v[self.samples] = value, v
+            self.samples += 1
+        if self.coarse is None:
+            self._begin()
+        else:
+            self._step_coarse(value, v)
+        if self._replay is not None:
+            self._advance_replay()
+        elif not self.full:
+            self._plan_replay()
+
+    def _begin(self) -> None:
+        """Start the coarse bank with the first motion of v, which gives the scale of things."""
+        count = self.samples
+        if np.ptp(self._v[:count]) == 0.0:
+            return
+        bounds = self._settings.bounds
+        widest = bounds.c_r[1] - bounds.c_l[0]
+        steps = ceil(-log(SMALLEST_GAP) / log(GRID_RATIO))
+        self.coarse = self._bank(np.geomspace(SMALLEST_GAP * widest, widest, steps + 1), True)
+        for y, v in zip(self._y[:count], self._v[:count], strict=True):
+            _advance(self.coarse, y, v)
+
+    def _step_coarse(self, y: float, v: float) -> None:
+        coarse = self.coarse
+        assert coarse is not None
+        if self._settled:
+            return
+        coarse.predict(v)
+        if isnan(y):
+            return
+        if coarse.correct(y, START_GATE if self.fine is None else inf):
+            self._refused = 0
+        elif self._refused < PATIENCE:
+            self._refused += 1
+            if not self.full:
+                self._y[self.samples - 1] = nan
+        else:
+            coarse.correct(y)
+        fine = self.fine
+        if fine is not None and fine.nis < NIS_SETTLED and not self._behind(fine):
+            self._settled = self.samples - self._fine_since > SETTLED
+
+    def _behind(self, fine: GapBank) -> bool:
+        """Whether the coarse bank explains the data better than the fine one."""
+        coarse = self.coarse
+        assert coarse is not None
+        lead = coarse.score(COARSE_TOLERANCE).max() - fine.score(COARSE_TOLERANCE).max()
+        return not self._settled and bool(lead > COARSE_MARGIN)
+
+    def _plan_replay(self) -> None:
+        """Start a fine bank around the best estimate there is, when it is worth it."""
+        bank = self.fine
+        if self.samples < self._earliest or not self.excited:
+            return
+        if bank is None or self._behind(bank):
+            bank = self.coarse
+        elif self.samples < self._next_replay:
+            return
+        assert bank is not None
+        best = int(bank.score(COARSE_TOLERANCE).argmax())
+        found = crossings_of(bank.theta[best], bank.theta_cov[best])
+        if found is None or not 0.0 < found.std_gap < 0.5 * found.gap:
+            return
+        self._next_replay = int(GROWTH * self.samples) + 10
+        self._earliest = self.samples + self.samples // 4
+        gaps = np.union1d(fine_gaps(found), bracket(bank.gaps, best))
+        self._replay, self._replayed = self._bank(gaps, False), 0
+
+    def _advance_replay(self) -> None:
+        replay = self._replay
+        assert replay is not None
+        end = min(self._replayed + REPLAY_SPEED, self.samples)
+        for k in range(self._replayed, end):
+            _advance(replay, float(self._y[k]), float(self._v[k]))
+        self._replayed = end
+        if end == self.samples:
+            if self.fine is None or self._behind(self.fine):
+                self._fine_since = self.samples
+            self.fine, self._replay = replay, None
+
+    def _bank(self, gaps: Array, with_null: bool) -> GapBank:
+        s, count = self._settings, self.samples
+        kick = float(np.linalg.norm(s.model.b) * np.abs(self._v[:count]).max()) * s.initial.m
+        noise = max(s.noise_std, NOISE_FLOOR * kick)
+        seen = np.abs(self._y[:count][np.isfinite(self._y[:count])]).max(initial=0.0)
+        i, b = s.initial, s.bounds
+        prior = Prior(
+            np.array([i.m, i.m * i.c_r, i.m * i.c_l]),
+            np.array([b.m[1], 0.25 * b.m[1] * b.c_r[1], 0.25 * b.m[1] * -b.c_l[0]]),
+            STATE_REACH * (seen + noise + kick),
+        )
+        drift = drift_in_products(i, s.drift_std) if any(s.drift_std) else None
+        return GapBank(gaps, s.model, prior, noise**2, drift, with_null)
+
+
+def _advance(bank: GapBank, y: float, v: float) -> None:
+    bank.predict(v)
+    if not isnan(y):
+        bank.correct(y)
+
+
+def bracket(gaps: Array, leader: int) -> Array:
+    """Gaps between the neighbours of the leader, should its estimate of the gap mislead."""
+    low = gaps[leader - 1] if leader > 0 and gaps[leader - 1] > 0.0 else 0.9 * gaps[leader]
+    high = gaps[leader + 1] if leader + 1 < len(gaps) else 1.1 * gaps[leader]
+    return np.asarray(gaps[leader] + BRACKET * np.where(BRACKET < 0.0, gaps[leader] - low, high - gaps[leader]))
+
+
+def fine_gaps(found: Crossings) -> Array:
+    """Gaps of a fine bank around an estimate, ascending and > 0."""
+    spread = min(found.std_gap, LARGEST_SPREAD * found.gap)
+    return np.asarray(found.gap + spread * FINE_OFFSETS)
+
+
+def drift_in_products(at: Estimate, std: tuple[float, float, float]) -> Array:
+    """Covariance (3, 3) that one sample of drift of (m, c_r, c_l) adds to theta."""
+    jacobian = np.array([[1.0, 0.0, 0.0], [at.c_r, at.m, 0.0], [at.c_l, 0.0, at.m]])
+    return np.asarray(jacobian @ np.diag(np.square(std)) @ jacobian.T)

@@ -1,0 +1,71 @@
+"""Backlash inverse, equations (2.2) and (2.3), with a direction band and a slope-limited take-up."""
+
+from math import inf
+
+from backlash_ros.core.backlash import Region
+from backlash_ros.core.errors import ParameterError
+
+
+class BacklashInverse:
+    """v = BI(u_d): crosses the gap whenever u_d turns, equations (2.2) and (2.3).
+
+    With the true m, c_r, c_l this is the exact inverse (2.2); with estimates, which may differ
+    from call to call, the adaptive inverse (2.3).
+
+    direction_band: u_d has turned only when it came back from its extreme by more than this
+        [unit of u_d]; until then v is held. 0 is the printed inverse.
+    take_up: largest move of v per sample while the gap is crossed [unit of v] (2.3: "a line
+        segment with a finite slope"); inf jumps.
+    """
+
+    def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
+        if not direction_band >= 0.0:
+            raise ParameterError('inverse.direction_band', direction_band, 'must be >= 0')
+        if not take_up > 0.0:
+            raise ParameterError('inverse.take_up_rate', take_up, 'must be > 0')
+        self.direction_band, self.take_up = direction_band, take_up
+        self.v = 0.0
+        self.side = Region.GAP  # line in use; GAP until u_d moves for the first time
+        self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
+        self._taking_up = False
+
+    def direction(self, u_d: float) -> Region:
+        """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held.
+
+        Asking does not advance the state.
+        """
+        move = u_d - self.extreme
+        # Only a turn has to leave the band; going on in the same direction is never noise.
+        up = self.direction_band if self.side != Region.RIGHT else 0.0
+        down = self.direction_band if self.side != Region.LEFT else 0.0
+        if move > up:
+            return Region.RIGHT
+        if move < -down:
+            return Region.LEFT
+        return Region.GAP
+
+    def step(self, u_d: float, m: float, c_r: float, c_l: float) -> float:
+        """Return v(t) for u_d(t) and the parameters in use, equation (2.3)."""
+        side = self.direction(u_d)
+        if side != Region.GAP:
+            self._taking_up = self._taking_up or side != self.side
+            self.side, self.extreme = side, u_d
+        elif not self._taking_up:
+            return self.v
+        target = self.extreme / m + (c_r if self.side == Region.RIGHT else c_l)
+        move = target - self.v
+        if self._taking_up and abs(move) > self.take_up:
+            self.v += self.take_up if move > 0.0 else -self.take_up
+        else:
+            self.v, self._taking_up = target, False
+        return self.v
+
+    def hold(self, u_d: float) -> float:
+        """Keep v although u_d moved to where no line fits, and return v."""
+        if self.direction_band == 0.0:
+            self.extreme = u_d
+        return self.v
+
+    def applied(self, v: float) -> None:
+        """Say which v was really applied (limits), so that the next move starts from there."""
+        self.v = v

@@ -1,0 +1,79 @@
+"""Normalised LMS with projection: the recursion the paper describes in words (section 3.2).
+
+With theta = (m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi while a side is
+engaged: the error is linear in the products, not in m, c_r, c_l themselves, so they are learned:
+
+    theta(k+1) = theta(k) + step e W phi / (phi' W phi),   e = u - theta' phi
+
+W = diag(1/v_max^2, 1, 1) gives the slope and the crossings regressors of one size.
+f follows the gradient of J = E{(u - u_d)^2} (3.6): f(k+1) = f(k) + step_f (u - u_d) v / (1 + v^2).
+
+Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the paper's [6]).
+"""
+
+from __future__ import annotations
+
+from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.history import History
+from backlash_ros.core.input_reconstruction import InputReconstruction
+
+# A side is engaged when the reconstructed u moves by more than this many standard deviations.
+MOTION_THRESHOLD = 4.0
+
+
+class NormalisedLms:
+    """LMS on (m, m c_r, m c_l) and f, fed with u reconstructed from y.
+
+    step: 0 < step < 2. step_f: 0 keeps f. The side comes from the motion of u: it rises only on
+    the right line and falls only on the left one, so that no wrong side can lock in.
+    """
+
+    def __init__(
+        self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
+        reconstruction: InputReconstruction, step: float = 1.0, step_f: float = 0.0,
+    ) -> None:
+        self.estimate = initial
+        self.step, self.step_f = step, step_f
+        self._bounds, self._f_bounds = bounds, f_bounds
+        self._reconstruction = reconstruction
+        self._history = History(reconstruction.lag)
+        self._threshold = MOTION_THRESHOLD * reconstruction.std
+        self._u_before = 0.0
+        self._v_max = 0.0
+
+    @property
+    def u_hat(self) -> float:
+        """Reconstruction of u, `lag` samples old."""
+        return self._reconstruction.u_hat
+
+    @property
+    def innovation(self) -> float:
+        """y(k) minus its prediction; nan where y(k) was lost."""
+        return self._reconstruction.innovation
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k) and learn from the sample that the reconstruction has reached."""
+        u = self._reconstruction.update(y)
+        motion, self._u_before = u - self._u_before, u
+        past = self._history.push(interval)
+        if past is None or not self._reconstruction.ready or abs(motion) <= self._threshold:
+            return
+        old = self.estimate
+        m, c_r, c_l = old.m, old.c_r, old.c_l
+        v = past.v
+        self._v_max = max(self._v_max, abs(v))
+        rising = motion > 0.0
+        e = u - m * (v - (c_r if rising else c_l))
+        weight = 1.0 / self._v_max**2 if self._v_max > 0.0 else 0.0
+        gain = self.step * e / (weight * v * v + 1.0)
+        # Products first: they enter the error linearly, the crossings follow by division.
+        product_r = m * c_r - gain if rising else m * c_r
+        product_l = m * c_l if rising else m * c_l - gain
+        low, high = self._bounds.m
+        m = min(max(m + gain * weight * v, low), high)
+        m, c_r, c_l = self._bounds.project(m, product_r / m, product_l / m)
+        f = old.f
+        if self.step_f > 0.0:
+            f += self.step_f * (u - past.u_d) * v / (1.0 + v * v)
+            f = min(max(f, self._f_bounds[0]), self._f_bounds[1])
+        self.estimate = Estimate(m, c_r, c_l, f, status=Status.TRACKING)

@@ -1,0 +1,134 @@
+"""Every parameter, declared once: used by the nodes, the YAML check and the documents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+
+Value = bool | int | float | str | tuple[float, ...]
+
+CONTROLLER, PLANT, REFERENCE, RECORDER = 'controller', 'plant', 'reference', 'recorder'
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter: its default gives its type, low and high hold for each element of a list.
+
+    above: low itself is excluded. length: how many elements a list must have, None for any.
+    choices: the allowed words. used_by: executables that read it. live: may change in a
+    running node.
+    """
+
+    name: str
+    default: Value
+    description: str
+    unit: str = ''
+    low: float = -inf
+    high: float = inf
+    above: bool = False
+    length: int | None = None
+    choices: tuple[str, ...] = ()
+    used_by: tuple[str, ...] = (CONTROLLER,)
+    live: bool = False
+    infinite: bool = False  # inf is allowed and means "no limit"
+
+
+BOTH = (CONTROLLER, PLANT)
+
+PARAMETERS: tuple[Parameter, ...] = (
+    Parameter(
+        'sample_period', 0.01, 'sample period T of G(z)', 's', low=0.0, above=True,
+        used_by=(CONTROLLER, PLANT, REFERENCE),
+    ),
+    Parameter(
+        'plant.numerator', (1e-5, 4e-5, 1e-5),
+        'numerator of G(z), descending powers of z', used_by=BOTH,
+    ),
+    Parameter(
+        'plant.denominator', (1.0, -2.88504, 2.77196, -0.88692),
+        'denominator of G(z), descending powers of z', used_by=BOTH,
+    ),
+    Parameter(
+        'lockstep', False,
+        'run as fast as the machine allows: each sample waits for its reference and its control',
+        used_by=(CONTROLLER, PLANT, REFERENCE),
+    ),
+    Parameter(
+        'estimator.law', 'kalman', 'law that learns m, c_r, c_l',
+        choices=('kalman', 'lms', 'printed'),
+    ),
+    Parameter('estimator.initial.m', 0.696, 'first estimate of the slope', 'u/v',
+              low=0.0, above=True),
+    Parameter('estimator.initial.c_r', 0.5, 'first estimate of the right crossing', 'v', low=0.0),
+    Parameter('estimator.initial.c_l', -0.5, 'first estimate of the left crossing', 'v', high=0.0),
+    Parameter('estimator.bounds.m', (0.01, 100.0), 'interval of the slope', 'u/v', length=2,
+              low=0.0, above=True),
+    Parameter('estimator.bounds.c_r', (0.0, 100.0), 'interval of the right crossing', 'v',
+              length=2, low=0.0),
+    Parameter('estimator.bounds.c_l', (-100.0, 0.0), 'interval of the left crossing', 'v',
+              length=2, high=0.0),
+    Parameter('estimator.output_noise_std', 1e-4, 'standard deviation of the noise on y', 'y',
+              low=0.0, live=True),
+    Parameter('estimator.drift_std', (0.0, 0.0, 0.0),
+              'kalman: random walk of m, c_r, c_l per square root of a second', length=3,
+              low=0.0),
+    Parameter('estimator.use_applied_control', False,
+              'take v from applied_control instead of the own command'),
+    Parameter('estimator.lag', 20,
+              'lms and printed: samples by which the reconstruction of u looks back', 'samples',
+              low=1, high=1000),
+    Parameter('lms.step', 1.0, 'step of the normalised LMS on (m, m c_r, m c_l)', low=0.0,
+              high=2.0, above=True, live=True),
+    Parameter('lms.step_f', 0.0, 'step of the normalised LMS on f, 0 keeps f', low=0.0, high=2.0,
+              live=True),
+    Parameter('structure', 'proportional', 'linear part that makes u_d',
+              choices=('proportional',)),
+    Parameter('proportional.f', 0.22, 'gain f of u_d = y_m + f v (3.2)', 'u/v'),
+    Parameter('proportional.bounds', (-0.5, 0.5), 'interval of f when the law adapts it', 'u/v',
+              length=2),
+    Parameter('control.min', -inf, 'smallest v', 'v', live=True, infinite=True),
+    Parameter('control.max', inf, 'largest v', 'v', live=True, infinite=True),
+    Parameter('control.rate_max', inf, 'largest speed of v', 'v/s', low=0.0, above=True,
+              live=True, infinite=True),
+    Parameter('inverse.direction_band', 0.0,
+              'u_d has turned only after coming back by more than this', 'u', low=0.0, live=True),
+    Parameter('inverse.take_up_rate', inf, 'largest speed of v while it crosses the gap', 'v/s',
+              low=0.0, above=True, live=True, infinite=True),
+    Parameter('timeout.plant_output', 0.5,
+              'longest silence of plant_output before it is reported, 0 for never', 's', low=0.0),
+    Parameter('backlash.m', 1.3, 'simulated slope', 'u/v', low=0.0, above=True, used_by=(PLANT,)),
+    Parameter('backlash.c_r', 3.0, 'simulated right crossing', 'v', used_by=(PLANT,)),
+    Parameter('backlash.c_l', -3.0, 'simulated left crossing', 'v', used_by=(PLANT,)),
+    Parameter('backlash.initial_u', 0.0, 'simulated u held at the start', 'u', used_by=(PLANT,)),
+    Parameter('backlash.rate', (0.0, 0.0, 0.0), 'simulated wear of m, c_r, c_l', '1/s', length=3,
+              used_by=(PLANT,)),
+    Parameter('backlash.jump_time', 0.0, 'time at which backlash.jump is added', 's', low=0.0,
+              used_by=(PLANT,)),
+    Parameter('backlash.jump', (0.0, 0.0, 0.0), 'simulated step of m, c_r, c_l', length=3,
+              used_by=(PLANT,)),
+    Parameter('output_noise_std', 0.0, 'simulated noise on y', 'y', low=0.0, used_by=(PLANT,)),
+    Parameter('output_quantum', 0.0, 'simulated resolution of y, 0 for none', 'y', low=0.0,
+              used_by=(PLANT,)),
+    Parameter('output_loss', 0.0, 'simulated share of y that never arrives', low=0.0, high=0.99,
+              used_by=(PLANT,)),
+    Parameter('input_disturbance', 0.0, 'simulated constant added to u', 'u', used_by=(PLANT,)),
+    Parameter('seed', 1, 'seed of the simulated noise', low=0, used_by=(PLANT,)),
+    Parameter('waveform', 'sine', 'shape of y_m',
+              choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'),
+              used_by=(REFERENCE,)),
+    Parameter('amplitude', 10.0, 'amplitude of y_m', 'y_m', low=0.0, used_by=(REFERENCE,)),
+    Parameter('frequency', 12.6, 'frequency of y_m (chirp: the last one)', 'rad/s', low=0.0,
+              above=True, used_by=(REFERENCE,)),
+    Parameter('frequency_start', 0.63, 'first frequency of a chirp', 'rad/s', low=0.0, above=True,
+              used_by=(REFERENCE,)),
+    Parameter('sweep_time', 10.0, 'duration of a chirp', 's', low=0.0, above=True,
+              used_by=(REFERENCE,)),
+    Parameter('bias', 0.0, 'constant added to y_m', 'y_m', used_by=(REFERENCE,)),
+    Parameter('file', '', 'CSV with a row t,y_m per sample for waveform: file',
+              used_by=(REFERENCE,)),
+    Parameter('storage', 'mcap', 'format of the bag', choices=('mcap', 'sqlite3'),
+              used_by=(RECORDER,)),
+    Parameter('bag', '', 'folder of the bag, must not exist yet', used_by=(RECORDER,)),
+)
+
+BY_NAME: dict[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}

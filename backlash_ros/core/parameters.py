@@ -1,0 +1,155 @@
+"""Check of parameter values against the table, wherever they come from."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from math import isfinite, isnan
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter, Value
+
+
+class Parameters(Mapping[str, Value]):
+    """A complete, checked set of parameter values, by name."""
+
+    def __init__(self, values: Mapping[str, object] | None = None) -> None:
+        """Take given values and the defaults of all others; raises ParameterError."""
+        given = dict(values or {})
+        check_names(given)
+        self._values = {
+            p.name: check_value(p, given[p.name]) if p.name in given else p.default
+            for p in PARAMETERS
+        }
+
+    def __getitem__(self, name: str) -> Value:
+        return self._values[name]
+
+    def __iter__(self):  # type: ignore[no-untyped-def]
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def real(self, name: str) -> float:
+        """Value of a parameter of type float."""
+        value = self._values[name]
+        assert isinstance(value, float)
+        return value
+
+    def integer(self, name: str) -> int:
+        """Value of a parameter of type int."""
+        value = self._values[name]
+        assert isinstance(value, int)
+        return value
+
+    def flag(self, name: str) -> bool:
+        """Value of a parameter of type bool."""
+        value = self._values[name]
+        assert isinstance(value, bool)
+        return value
+
+    def word(self, name: str) -> str:
+        """Value of a parameter of type str."""
+        value = self._values[name]
+        assert isinstance(value, str)
+        return value
+
+    def reals(self, name: str) -> tuple[float, ...]:
+        """Value of a list parameter."""
+        value = self._values[name]
+        assert isinstance(value, tuple)
+        return value
+
+    def pair(self, name: str) -> tuple[float, float]:
+        """Value of a list parameter of length 2."""
+        low, high = self.reals(name)
+        return low, high
+
+    def triple(self, name: str) -> tuple[float, float, float]:
+        """Value of a list parameter of length 3."""
+        first, second, third = self.reals(name)
+        return first, second, third
+
+    def replaced(self, changes: Mapping[str, object]) -> Parameters:
+        """A new set with some values changed; raises ParameterError."""
+        return Parameters({**self._values, **changes})
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Raise ParameterError for the first unknown name, naming the nearest valid one."""
+    for name in names:
+        if name not in BY_NAME:
+            near = difflib.get_close_matches(name, BY_NAME, n=1, cutoff=0.0)[0]
+            raise ParameterError(name, '...', 'is not a parameter', f'did you mean {near}?')
+
+
+def check_value(parameter: Parameter, value: object) -> Value:
+    """Return value in the type of the parameter; raises ParameterError."""
+    default = parameter.default
+    if isinstance(default, bool):
+        return _flag(parameter, value)
+    if isinstance(default, str):
+        return _word(parameter, value)
+    if isinstance(default, tuple):
+        return _reals(parameter, value)
+    number = _real(parameter, value)
+    if isinstance(default, int):
+        if number != int(number):
+            raise ParameterError(parameter.name, value, 'must be a whole number')
+        return int(number)
+    return number
+
+
+def _flag(parameter: Parameter, value: object) -> bool:
+    if isinstance(value, str) and value.lower() in ('true', 'false'):
+        return value.lower() == 'true'
+    if not isinstance(value, bool):
+        raise ParameterError(parameter.name, value, 'must be true or false')
+    return value
+
+
+def _word(parameter: Parameter, value: object) -> str:
+    if not isinstance(value, str):
+        raise ParameterError(parameter.name, value, 'must be a text')
+    if parameter.choices and value not in parameter.choices:
+        raise ParameterError(
+            parameter.name, value, 'must be one of ' + ', '.join(parameter.choices)
+        )
+    return value
+
+
+def _reals(parameter: Parameter, value: object) -> tuple[float, ...]:
+    if isinstance(value, str):
+        value = value.strip('[] ').split(',')
+    if isinstance(value, (bool, int, float)) or not isinstance(value, Iterable):
+        raise ParameterError(parameter.name, value, 'must be a list of numbers')
+    numbers = tuple(_real(parameter, element) for element in value)
+    if parameter.length is not None and len(numbers) != parameter.length:
+        raise ParameterError(
+            parameter.name, list(numbers), f'must have {parameter.length} numbers'
+        )
+    if not numbers:
+        raise ParameterError(parameter.name, [], 'must have at least one number')
+    return numbers
+
+
+def _real(parameter: Parameter, value: object) -> float:
+    if isinstance(value, str):
+        # YAML 1.1 reads 1e-5 (no point, no sign) as a text.
+        try:
+            value = float(value)
+        except ValueError:
+            raise ParameterError(parameter.name, value, 'must be a number') from None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ParameterError(parameter.name, value, 'must be a number')
+    number = float(value)
+    if isnan(number) or not (isfinite(number) or parameter.infinite):
+        raise ParameterError(parameter.name, number, 'must be finite')
+    unit = f' {parameter.unit}' if parameter.unit else ''
+    if number < parameter.low or (parameter.above and number == parameter.low):
+        sign = '>' if parameter.above else '>='
+        raise ParameterError(parameter.name, number, f'must be {sign} {parameter.low:g}{unit}')
+    if number > parameter.high:
+        raise ParameterError(parameter.name, number, f'must be <= {parameter.high:g}{unit}')
+    return number

@@ -1,0 +1,95 @@
+"""The update law exactly as printed, equation (3.11), with guards, as a reference.
+
+All four quotients reduce to the one equation e = u - u_d = 0, solved for one unknown at a time:
+
+    f   = m (u - y_m) / (u + m w)         m   = u f / (u - y_m - f w)
+    c   = (u - y_m) / f - u / m           (c_r and c_l alike)
+
+One equation cannot identify four unknowns; docs/paper.md says what follows. Use `lms` to learn.
+"""
+
+from __future__ import annotations
+
+from math import isfinite, nan
+
+from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.history import History
+from backlash_ros.core.input_reconstruction import InputReconstruction
+
+
+def printed_f(u: float, y_m: float, m: float, w: float) -> float:
+    """f = F_n / F_d of (3.11); nan where F_d is 0."""
+    numerator = u * y_m * m**2 + u * w * m**3 - y_m**2 * m**2 - y_m * m**3 * w
+    denominator = u * y_m * m + y_m * w * m**2 + w**2 * m**3 + u * w * m**2
+    return numerator / denominator if denominator != 0.0 else nan
+
+
+def printed_m(u: float, y_m: float, f: float, w: float) -> float:
+    """m = M_n / M_d of (3.11); nan where M_d is 0."""
+    numerator = u * y_m * f**2 + u * f**3 * w
+    denominator = (
+        u * y_m * f + u * f**2 * w - y_m**2 * f - 2.0 * y_m * f**2 * w - f**3 * w**2
+    )
+    return numerator / denominator if denominator != 0.0 else nan
+
+
+def printed_c(u: float, y_m: float, f: float, m: float) -> float:
+    """c_r = C_1n / C_1d and c_l = C_2n / C_2d of (3.11), which are alike; nan where C_1d is 0."""
+    numerator = u * f * m**2 - u * f**2 * m - y_m * m**2 * f
+    denominator = f**2 * m**2
+    return numerator / denominator if denominator != 0.0 else nan
+
+
+class PrintedLaw:
+    """Equations (3.11), evaluated in the printed order with the newest values.
+
+    u is reconstructed from y and therefore `lag` samples old; the law is evaluated for that time.
+    Guards: a quotient that is not finite is skipped, the rest is projected into the bounds.
+    """
+
+    def __init__(
+        self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
+        reconstruction: InputReconstruction,
+    ) -> None:
+        self.estimate = initial
+        self.skipped = 0
+        self._bounds, self._f_bounds = bounds, f_bounds
+        self._reconstruction = reconstruction
+        self._history = History(reconstruction.lag)
+        self._w = initial.c_r
+        self._u_before = 0.0
+
+    @property
+    def u_hat(self) -> float:
+        """Reconstruction of u, `lag` samples old."""
+        return self._reconstruction.u_hat
+
+    @property
+    def innovation(self) -> float:
+        """y(k) minus its prediction; nan where y(k) was lost."""
+        return self._reconstruction.innovation
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k) and apply (3.11) to the sample that the reconstruction has reached."""
+        u = self._reconstruction.update(y)
+        past = self._history.push(interval)
+        if past is None or not self._reconstruction.ready:
+            return
+        old = self.estimate
+        # w is c_r in the upward region, c_l in the downward one, and kept in the gap.
+        if u != self._u_before:
+            self._w = old.c_r if u > self._u_before else old.c_l
+        upward = self._w == old.c_r
+        self._u_before = u
+        f = self._guarded(printed_f(u, past.y_m, old.m, self._w), old.f, self._f_bounds)
+        m = self._guarded(printed_m(u, past.y_m, f, self._w), old.m, self._bounds.m)
+        c = printed_c(u, past.y_m, f, m)
+        c_r = self._guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
+        c_l = old.c_l if upward else self._guarded(c, old.c_l, self._bounds.c_l)
+        self.estimate = Estimate(m, c_r, c_l, f, status=Status.TRACKING)
+
+    def _guarded(self, value: float, old: float, bounds: tuple[float, float]) -> float:
+        if not isfinite(value):
+            self.skipped += 1
+            return old
+        return min(max(value, bounds[0]), bounds[1])

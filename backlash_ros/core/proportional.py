@@ -1,0 +1,37 @@
+"""The paper's structure u_d = y_m + f v, equation (3.2), with its algebraic loop solved."""
+
+from __future__ import annotations
+
+from backlash_ros.core.backlash import Region
+from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.structure import Command
+
+# (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
+LARGEST_F_OVER_M = 0.8
+
+
+class Proportional:
+    """u_d = y_m + f v (3.2) with v = BI(u_d) (2.3): each needs the other.
+
+    On the branch with crossing c the loop has one solution, u_d = m (y_m + f c) / (m - f).
+    The branch counts when the direction of u_d agrees with it. m = f is singular: f is limited
+    to 0.8 m.
+    """
+
+    def control(self, y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
+        """Return u_d and v that satisfy (3.2) and (2.3) together."""
+        m, c_r, c_l = estimate.m, estimate.c_r, estimate.c_l
+        f = min(estimate.f, LARGEST_F_OVER_M * m)
+        right = m * (y_m + f * c_r) / (m - f)
+        left = m * (y_m + f * c_l) / (m - f)
+        right_fits = inverse.direction(right) == Region.RIGHT
+        left_fits = inverse.direction(left) == Region.LEFT
+        if right_fits and left_fits:
+            # Both directions solve the loop: the smaller move is the one a shaft would make.
+            right_fits = abs(right / m + c_r - inverse.v) <= abs(left / m + c_l - inverse.v)
+        if right_fits or left_fits:
+            u_d = right if right_fits else left
+            return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
+        u_d = y_m + f * inverse.v
+        return Command(u_d, inverse.hold(u_d), f)

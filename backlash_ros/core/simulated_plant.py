@@ -1,0 +1,78 @@
+"""The plant the controller does not know in full: backlash, then G(z), then a sensor (3.1)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.transfer_function import TransferFunction
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """What a real plant adds to (3.1).
+
+    output_noise_std: standard deviation of white noise on y [unit of y].
+    output_quantum: step of the sensor, 0 for none [unit of y].
+    input_disturbance: constant added to u [unit of u].
+    rate: drift of (m, c_r, c_l) per second, absolute.
+    jump_time, jump: at jump_time [s] jump is added to (m, c_r, c_l).
+    """
+
+    output_noise_std: float = 0.0
+    output_quantum: float = 0.0
+    input_disturbance: float = 0.0
+    rate: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    jump_time: float = 0.0
+    jump: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class SimulatedPlant:
+    """y = G(z) (B[v] + d), measured with noise and a quantum.
+
+    backlash: its u is the held output at the start. rng: source of the noise.
+    """
+
+    def __init__(
+        self, model: TransferFunction, backlash: Backlash, sample_period: float,
+        rng: np.random.Generator, imperfections: Imperfections | None = None,
+    ) -> None:
+        self.backlash = backlash
+        self.sample = 0
+        self._initial = (backlash.m, backlash.c_r, backlash.c_l)
+        self._a, self._b, _ = model.state_space()
+        self._x = np.zeros(model.order)
+        self._sample_period = sample_period
+        self._rng = rng
+        self._extra = imperfections or Imperfections()
+        self._wears = any(self._extra.rate) or any(self._extra.jump)
+
+    def measure(self) -> float:
+        """y(k) as the sensor shows it; call it once per sample."""
+        y = float(self._x[0])
+        if self._extra.output_noise_std > 0.0:
+            y += self._extra.output_noise_std * float(self._rng.standard_normal())
+        if self._extra.output_quantum > 0.0:
+            y = self._extra.output_quantum * round(y / self._extra.output_quantum)
+        return y
+
+    def step(self, v: float) -> float:
+        """Apply v over one sample period and return u = B[v]."""
+        if self._wears:
+            self._wear()
+        u = self.backlash.step(v)
+        self._x = self._a @ self._x + self._b * (u + self._extra.input_disturbance)
+        self.sample += 1
+        return u
+
+    def _wear(self) -> None:
+        t = self.sample * self._sample_period
+        jumped = self._extra.jump if t >= self._extra.jump_time else (0.0, 0.0, 0.0)
+        m, c_r, c_l = (
+            value + rate * t + jump
+            for value, rate, jump in zip(self._initial, self._extra.rate, jumped, strict=True)
+        )
+        backlash = self.backlash
+        backlash.m, backlash.c_r, backlash.c_l = m, c_r, c_l

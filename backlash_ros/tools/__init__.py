@@ -1,0 +1,1 @@
+"""Command-line tools: they start nodes as processes, simulate, analyse and draw."""

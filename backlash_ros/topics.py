@@ -1,0 +1,18 @@
+"""Topic names and the labels of the array messages: the one place everybody reads them from."""
+
+REFERENCE = 'reference'
+PLANT_OUTPUT = 'plant_output'
+CONTROL = 'control'
+APPLIED_CONTROL = 'applied_control'
+ESTIMATES = 'controller/estimates'
+SIGNALS = 'controller/signals'
+TRUTH = 'plant/truth'
+CLOCK = '/clock'
+DIAGNOSTICS = '/diagnostics'
+
+# `sample` counts the plant outputs from 0 and joins rows of different topics, lost messages or not.
+ESTIMATE_LABELS = ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l', 'std_f', 'sample')
+SIGNAL_LABELS = (
+    'y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'sample', 'latency_s',
+)
+TRUTH_LABELS = ('u', 'm', 'c_r', 'c_l', 'v', 'sample')

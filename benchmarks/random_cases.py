@@ -1,0 +1,85 @@
+"""Random plants, gaps and references for the estimation and tracking benchmarks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.parameters import Parameters
+
+Array = NDArray[np.float64]
+
+PERIODS = 3
+
+
+@dataclass(frozen=True)
+class Case:
+    """One random case: what the package is given, and how long it may take."""
+
+    seed: int
+    parameters: Parameters
+    samples: int  # three periods of the reference
+    kind: str
+
+
+def random_plant(rng: np.random.Generator) -> tuple[Array, Array, str]:
+    """Numerator, denominator and a description of a stable or integrating G of order 1 to 5."""
+    order = int(rng.integers(1, 6))
+    integrating = bool(rng.random() < 0.4)
+    poles: list[complex] = [1.0] if integrating else []
+    while len(poles) < order:
+        if len(poles) + 2 <= order and rng.random() < 0.3:
+            radius, angle = rng.uniform(0.6, 0.97), rng.uniform(0.05, 0.6)
+            poles += [radius * np.exp(1j * angle), radius * np.exp(-1j * angle)]
+        else:
+            poles.append(float(np.exp(-np.exp(rng.uniform(np.log(0.01), np.log(0.5))))))
+    zeros: list[float] = []
+    outside = False
+    for _ in range(int(rng.integers(0, order))):
+        if rng.random() < 0.4:
+            zeros.append(float(rng.choice([-1.0, 1.0]) * rng.uniform(1.15, 4.0)))
+            outside = True
+        else:
+            zeros.append(float(rng.uniform(-0.9, 0.8)))
+    numerator = np.atleast_1d(np.real(np.poly(zeros))) * 10.0 ** rng.uniform(-4.0, 0.0)
+    denominator = np.real(np.poly(poles))
+    kind = f'order {order}{" integrating" if integrating else ""}{" nmp" if outside else ""}'
+    return numerator, denominator, kind
+
+
+def random_case(seed: int, **fixed: object) -> Case:
+    """The case of a seed; `fixed` overrides parameters."""
+    rng = np.random.default_rng([seed, 20])
+    numerator, denominator, kind = random_plant(rng)
+    m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
+    c_r = float(np.exp(rng.uniform(np.log(0.2), np.log(8.0))))
+    c_l = -float(np.exp(rng.uniform(np.log(0.2), np.log(8.0))))
+    factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
+    first = (m * factors[0], c_r * factors[1], c_l * factors[2])
+    samples_per_period = int(rng.integers(40, 200))
+    period = 0.01
+    omega = 2.0 * np.pi / (samples_per_period * period)
+    waveform = str(rng.choice(['sine', 'multisine']))
+    f = 0.22 * m if rng.random() < 0.5 else 0.0
+    # v = y_m / (m - f) + ...: swing v over 1.5 to 4 gaps with the true and with the first slope.
+    slope = max(m, first[0]) - min(f, 0.8 * min(m, first[0]))
+    crest = 1.0 if waveform == 'sine' else 0.5
+    amplitude = float(rng.uniform(1.5, 4.0)) * 0.5 * (c_r - c_l) * slope / crest
+    response = np.polyval(numerator, np.exp(1j * omega * period)) / np.polyval(
+        denominator, np.exp(1j * omega * period)
+    )
+    swing = float(2.0 * abs(response) * amplitude * crest)
+    noise = 0.002 * swing
+    parameters = Parameters({
+        'plant.numerator': numerator.tolist(), 'plant.denominator': denominator.tolist(),
+        'backlash.m': m, 'backlash.c_r': c_r, 'backlash.c_l': c_l,
+        'backlash.initial_u': float(rng.uniform(-1.0, 1.0) * amplitude),
+        'estimator.initial.m': first[0], 'estimator.initial.c_r': first[1],
+        'estimator.initial.c_l': first[2], 'proportional.f': f,
+        'waveform': waveform, 'amplitude': amplitude, 'frequency': float(omega),
+        'sample_period': period, 'output_noise_std': noise,
+        'estimator.output_noise_std': noise, 'seed': seed, **fixed,
+    })
+    return Case(seed, parameters, PERIODS * samples_per_period, f'{kind} {waveform}')
