@@ -15,6 +15,7 @@ Navigation, Wiley 2001, section 11.6 (static multiple models).
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 from math import inf, log, nan
 
@@ -27,6 +28,7 @@ Array = NDArray[np.float64]
 
 # Rounding in the propagation is not symmetric; left alone it would grow.
 SYMMETRISE_EVERY = 16
+ELECT_EVERY = 4  # corrections between two looks for the most likely hypothesis
 NIS_MEMORY = 1.0 / 40.0  # the mean of a true hypothesis is 1, its standard deviation then 0.16
 NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
 
@@ -51,19 +53,20 @@ class GapBank:
     true model would cost per sample, so that early and late starters can be compared.
 
     noise_var: variance R of the noise on y. drift_var: added to the covariance of theta per
-    sample, shape (3, 3), None without drift. with_null: put the hypothesis "v never engaged: u is
+    sample, shape (3, 3), None without drift. tolerance: relative width of g that one hypothesis
+    stands for. with_null: put the hypothesis "v never engaged: u is
     a constant" in front as row 0, for which theta[0] is that constant.
     """
 
     def __init__(
         self, gaps: Array, model: StateModel, prior: Prior, noise_var: float,
-        drift_var: Array | None = None, with_null: bool = False,
+        drift_var: Array | None = None, tolerance: float = 0.0, with_null: bool = False,
     ) -> None:
         if with_null:
             gaps = np.concatenate([[0.0], gaps])
         n, count = model.order, len(gaps)
         self.gaps = gaps.copy()
-        self.noise_var, self.drift_var = noise_var, drift_var
+        self.noise_var, self.drift_var, self.tolerance = noise_var, drift_var, tolerance
         self.mean = np.zeros((count, n + 3))
         self.mean[:, n:] = prior.theta
         variances = np.concatenate([np.full(n, prior.state_std**2), prior.theta_std**2])
@@ -72,7 +75,8 @@ class GapBank:
         # with different priors can be compared.
         self.log_likelihood = np.full(count, n * log(prior.state_std))
         self.active = 0  # hypotheses [:active] have started
-        self.since_engaged = 0  # samples since the leader was last engaged
+        self.since_motion = 0  # samples since u last moved under the leader
+        self.turned = False  # whether the leader engaged the other side with the last step
         self.leader = 0  # most likely hypothesis that has started
         self.innovation = nan  # of the leader
         self.innovation_var = noise_var
@@ -98,33 +102,46 @@ class GapBank:
         """Covariances of theta per hypothesis, shape (H, 3, 3)."""
         return self.cov[:, self._n:, self._n:]
 
-    def score(self, tolerance: float) -> Array:
-        """Log-likelihood of each started hypothesis, its own gap held against its estimate.
+    def elect(self) -> float:
+        """Make the most likely hypothesis the leader and return its log-likelihood.
 
-        A hypothesis g that fits the data with another m (c_r - c_l) than m g contradicts itself.
-        tolerance: relative width of g that one hypothesis stands for.
+        A hypothesis g that fits the data with another m (c_r - c_l) than m g contradicts itself:
+        its own gap counts as one more measurement, m g of theta[1] - theta[2].
         """
         rows = slice(self._first, self.active)
         gaps, theta, cov = self.gaps[rows], self.theta[rows], self.theta_cov[rows]
-        weights = np.stack([-gaps, np.ones_like(gaps), -np.ones_like(gaps)], axis=1)
+        weights = np.empty((len(gaps), 3))
+        weights[:, 0], weights[:, 1], weights[:, 2] = -gaps, 1.0, -1.0
         mismatch = (weights * theta).sum(axis=1)
-        variance = (weights[:, None, :] @ cov @ weights[:, :, None])[:, 0, 0]
-        variance = np.maximum(variance, 0.0) + (tolerance * gaps * theta[:, 0]) ** 2
+        variance = ((weights[:, None, :] @ cov)[:, 0, :] * weights).sum(axis=1)
+        variance = np.maximum(variance, 0.0) + (self.tolerance * gaps * theta[:, 0]) ** 2
         score = self.log_likelihood[:self.active].copy()
         score[rows] -= 0.5 * (mismatch**2 / variance + np.log(variance))
         score[rows][theta[:, 0] <= 0.0] = -inf
-        return score
+        self.leader = int(score.argmax())
+        return float(score[self.leader])
 
     def u_hat(self) -> float:
         """u under the leading hypothesis after the last step."""
         return float(self._phi[self.leader] @ self.theta[self.leader])
+
+    def part(self, first: int, last: int) -> GapBank:
+        """A bank of the started hypotheses [first:last] alone, with all they have learned."""
+        part = copy.copy(self)
+        rows = slice(first, last)
+        for name in (
+            'gaps', 'mean', 'cov', 'log_likelihood', '_transition', '_reach', '_left', '_phi',
+        ):
+            setattr(part, name, getattr(self, name)[rows].copy())
+        part.active, part._first = last - first, 0
+        part.elect()
+        return part
 
     def move_gaps(self, gaps: Array) -> None:
         """Give the hypotheses other gaps (H,), ascending; what they have learned stays."""
         # v_a = q - g of a left engagement must not move with g.
         self._reach += self._left * (gaps - self.gaps)
         self.gaps = gaps
-        self.log_likelihood[:] = 0.0
 
     def predict(self, v: float) -> None:
         """Go from k-1 to k with v applied in between."""
@@ -153,15 +170,15 @@ class GapBank:
         """Move the play operators; phi is that of the last engagement."""
         rows = slice(self._first, count)
         reach, left = self._reach[rows], self._left[rows]
+        before, side = self._reach[self.leader], self._left[self.leader]
         upper = v + self.gaps[rows]
         on_left, on_right = reach >= upper, reach <= v
-        left[on_left] = 1.0
-        left[on_right] = 0.0
-        np.minimum(np.maximum(reach, v, out=reach), upper, out=reach)
-        self._set_phi(rows)
-        index = self.leader - self._first
-        engaged = index >= 0 and bool(on_left[index] or on_right[index])
-        self.since_engaged = 0 if engaged else self.since_engaged + 1
+        if on_left.any() or on_right.any():
+            left[on_left], left[on_right] = 1.0, 0.0
+            np.minimum(np.maximum(reach, v, out=reach), upper, out=reach)
+            self._set_phi(rows)
+        self.since_motion = self.since_motion + 1 if self._reach[self.leader] == before else 0
+        self.turned = bool(self._left[self.leader] != side)
 
     def _set_phi(self, rows: slice) -> None:
         rows = slice(max(rows.start, self._first), rows.stop)
@@ -175,7 +192,7 @@ class GapBank:
         mean, cov = self.mean[:count], self.cov[:count]
         transition[:, :n, n:] = self._model.b[:, None] * self._phi[:count, None, :]
         mean[:] = (transition @ mean[:, :, None])[:, :, 0]
-        cov[:] = transition @ cov @ transition.transpose(0, 2, 1)
+        np.matmul(transition @ cov, transition.transpose(0, 2, 1), out=cov)
         if self.drift_var is not None:
             cov[:, n:, n:] += self.drift_var
 
@@ -189,9 +206,10 @@ class GapBank:
         if not count:
             return True
         mean, cov = self.mean[:count], self.cov[:count]
-        cross = cov[:, :, :n] @ self._model.c
-        variance = cross[:, :n] @ self._model.c + self.noise_var
-        e = y - mean[:, :n] @ self._model.c
+        c = self._model.c
+        cross = c * cov[:, :, 0]
+        variance = c * cross[:, 0] + self.noise_var
+        e = y - c * mean[:, 0]
         leader = self.leader
         self.innovation, self.innovation_var = float(e[leader]), float(variance[leader])
         square = self.innovation**2 / self.innovation_var
@@ -211,5 +229,6 @@ class GapBank:
         if self._corrections % SYMMETRISE_EVERY == 0:
             cov[:] = 0.5 * (cov + cov.transpose(0, 2, 1))
         self.log_likelihood[:count] -= 0.5 * (e * e / variance + np.log(variance))
-        self.leader = int(self.log_likelihood[:count].argmax())
+        if self._corrections % ELECT_EVERY == 0:
+            self.elect()
         return True

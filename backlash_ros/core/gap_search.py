@@ -24,18 +24,19 @@ Array = NDArray[np.float64]
 
 GRID_RATIO = 1.2  # between neighbouring gaps of the coarse grid
 SMALLEST_GAP = 5e-4  # of the widest gap the bounds allow
-# Fine hypotheses in standard deviations of the gap: near ones for precision, far ones for doubt.
-FINE_OFFSETS = np.array([-1.0, 0.0, 1.0])
-BRACKET = np.array([-0.7, -0.35, 0.0, 0.35, 0.7])
 LARGEST_SPREAD = 0.2  # of the gap: the standard deviation is not to be trusted beyond
-CAPACITY = 8192  # samples kept for replays
-REPLAY_SPEED = 4  # recorded samples per new one
-GROWTH = 1.5  # of the record between two replays
+CAPACITY = 16384  # samples kept for replays
+REPLAY_SPEED = 3  # recorded samples per new one
+LAST_REPLAY = CAPACITY * (REPLAY_SPEED - 1) // REPLAY_SPEED  # later ones would not catch up
+GROWTH = 3.0  # of the record after which it is read again in any case
+MISREAD = 2.0  # standard deviations between the gap a record was read with and its estimate
+PAUSE = 5  # samples between two looks for a reason to read the record again
 START_GATE = 8.0  # standard deviations; before the fine bank stands only gross outliers are told
 PATIENCE = 2  # outliers in a row that the coarse bank refuses before it believes them
 NULL_MARGIN = 15.0  # log-likelihood by which a gap must beat "v never engaged"
 COARSE_MARGIN = 10.0  # log-likelihood by which the fine bank may not fall behind the coarse one
 COARSE_TOLERANCE = 0.1  # half of GRID_RATIO - 1
+FINE_TOLERANCE = 1e-6  # keeps the comparison finite when the estimate is exact
 SETTLED = 100  # samples of the fine bank after which the coarse one may rest
 NIS_SETTLED = 1.6  # normalised innovation squared of a fine bank that may be trusted to go alone
 # Without noise the filter still needs some, this far below what one sample of u does to x.
@@ -66,15 +67,26 @@ class GapSearch:
         self._replay: GapBank | None = None
         self._replayed = 0
         self._next_replay = 0
+        self._read_with: Array = np.empty(0)  # gaps with which the fine bank read the record
         self._fine_since = 0
         self._earliest = 0
         self._refused = 0
         self._settled = False
 
     @property
-    def full(self) -> bool:
-        """Whether the record is full, so that nothing can be replayed any more."""
-        return self.samples >= CAPACITY
+    def memory(self) -> int:
+        """Samples after which the plant has forgotten its input."""
+        return self._settings.model.memory
+
+    @property
+    def settled(self) -> bool:
+        """Whether the fine bank has proven to be as good as the coarse one, which then rests."""
+        return self._settled
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the record is used up without a sign of engagement: begin afresh."""
+        return self.samples >= LAST_REPLAY and self.fine is None and not self.excited
 
     @property
     def excited(self) -> bool:
@@ -88,16 +100,18 @@ class GapSearch:
     def add(self, y: float | None, v: float, accepted: bool = True) -> None:
         """Take in a sample; y is None if it was lost, not accepted if it is an outlier."""
         value = nan if y is None or not accepted else y
-        if not self.full:
+        if self.coarse is None and self.samples and v == self._v[0]:
+            self.samples = 0  # at rest nothing is worth a record
+        if self.samples < CAPACITY:
             self._y[self.samples], self._v[self.samples] = value, v
-            self.samples += 1
+        self.samples += 1
         if self.coarse is None:
             self._begin()
         else:
             self._step_coarse(value, v)
         if self._replay is not None:
             self._advance_replay()
-        elif not self.full:
+        else:
             self._plan_replay()
 
     def _begin(self) -> None:
@@ -108,7 +122,9 @@ class GapSearch:
         bounds = self._settings.bounds
         widest = bounds.c_r[1] - bounds.c_l[0]
         steps = ceil(-log(SMALLEST_GAP) / log(GRID_RATIO))
-        self.coarse = self._bank(np.geomspace(SMALLEST_GAP * widest, widest, steps + 1), True)
+        self.coarse = self._bank(
+            np.geomspace(SMALLEST_GAP * widest, widest, steps + 1), with_null=True
+        )
         for y, v in zip(self._y[:count], self._v[:count], strict=True):
             _advance(self.coarse, y, v)
 
@@ -124,7 +140,7 @@ class GapSearch:
             self._refused = 0
         elif self._refused < PATIENCE:
             self._refused += 1
-            if not self.full:
+            if self.samples <= CAPACITY:
                 self._y[self.samples - 1] = nan
         else:
             coarse.correct(y)
@@ -135,28 +151,39 @@ class GapSearch:
     def _behind(self, fine: GapBank) -> bool:
         """Whether the coarse bank explains the data better than the fine one."""
         coarse = self.coarse
-        assert coarse is not None
-        lead = coarse.score(COARSE_TOLERANCE).max() - fine.score(COARSE_TOLERANCE).max()
-        return not self._settled and bool(lead > COARSE_MARGIN)
+        if self._settled or coarse is None:
+            return False
+        return coarse.elect() - fine.elect() > COARSE_MARGIN
 
     def _plan_replay(self) -> None:
         """Start a fine bank around the best estimate there is, when it is worth it."""
-        bank = self.fine
         if self.samples < self._earliest or not self.excited:
             return
+        if self.fine is not None and self.samples >= LAST_REPLAY:
+            return
+        bank, read_with = self.fine, self._read_with
         if bank is None or self._behind(bank):
             bank = self.coarse
-        elif self.samples < self._next_replay:
-            return
-        assert bank is not None
-        best = int(bank.score(COARSE_TOLERANCE).argmax())
+            assert bank is not None
+            read_with = bank.gaps
+        bank.elect()
+        best = bank.leader
+        self._earliest = self.samples + PAUSE
         found = crossings_of(bank.theta[best], bank.theta_cov[best])
         if found is None or not 0.0 < found.std_gap < 0.5 * found.gap:
             return
-        self._next_replay = int(GROWTH * self.samples) + 10
-        self._earliest = self.samples + self.samples // 4
-        gaps = np.union1d(fine_gaps(found), bracket(bank.gaps, best))
-        self._replay, self._replayed = self._bank(gaps, False), 0
+        if self.samples >= LAST_REPLAY:
+            # Too late to read the record again: go on with what the coarse bank knows.
+            self._fine_since = self.samples
+            self.fine = bank.part(max(best - 1, 1), min(best + 2, bank.active))
+            return
+        misread = abs(found.gap - read_with[best]) > MISREAD * found.std_gap
+        if bank is self.fine and not misread and self.samples < self._next_replay:
+            return
+        self._next_replay = int(GROWTH * self.samples)
+        self._earliest = self.samples + self.samples // 4 if not self._settled else self._next_replay
+        gaps = np.union1d(fine_gaps(found, 3), bracket(read_with, best))
+        self._replay, self._replayed = self._bank(gaps, with_null=False), 0
 
     def _advance_replay(self) -> None:
         replay = self._replay
@@ -168,10 +195,12 @@ class GapSearch:
         if end == self.samples:
             if self.fine is None or self._behind(self.fine):
                 self._fine_since = self.samples
+            replay.elect()
             self.fine, self._replay = replay, None
+            self._read_with = replay.gaps
 
     def _bank(self, gaps: Array, with_null: bool) -> GapBank:
-        s, count = self._settings, self.samples
+        s, count = self._settings, min(self.samples, CAPACITY)
         kick = float(np.linalg.norm(s.model.b) * np.abs(self._v[:count]).max()) * s.initial.m
         noise = max(s.noise_std, NOISE_FLOOR * kick)
         seen = np.abs(self._y[:count][np.isfinite(self._y[:count])]).max(initial=0.0)
@@ -182,7 +211,8 @@ class GapSearch:
             STATE_REACH * (seen + noise + kick),
         )
         drift = drift_in_products(i, s.drift_std) if any(s.drift_std) else None
-        return GapBank(gaps, s.model, prior, noise**2, drift, with_null)
+        tolerance = COARSE_TOLERANCE if with_null else FINE_TOLERANCE
+        return GapBank(gaps, s.model, prior, noise**2, drift, tolerance, with_null)
 
 
 def _advance(bank: GapBank, y: float, v: float) -> None:
@@ -195,13 +225,15 @@ def bracket(gaps: Array, leader: int) -> Array:
     """Gaps between the neighbours of the leader, should its estimate of the gap mislead."""
     low = gaps[leader - 1] if leader > 0 and gaps[leader - 1] > 0.0 else 0.9 * gaps[leader]
     high = gaps[leader + 1] if leader + 1 < len(gaps) else 1.1 * gaps[leader]
-    return np.asarray(gaps[leader] + BRACKET * np.where(BRACKET < 0.0, gaps[leader] - low, high - gaps[leader]))
+    shares = np.array([-0.7, -0.35, 0.0, 0.35, 0.7])
+    reach = np.where(shares < 0.0, gaps[leader] - low, high - gaps[leader])
+    return np.asarray(gaps[leader] + shares * reach)
 
 
-def fine_gaps(found: Crossings) -> Array:
-    """Gaps of a fine bank around an estimate, ascending and > 0."""
+def fine_gaps(found: Crossings, count: int) -> Array:
+    """Gaps of a fine bank within one standard deviation of an estimate, ascending and > 0."""
     spread = min(found.std_gap, LARGEST_SPREAD * found.gap)
-    return np.asarray(found.gap + spread * FINE_OFFSETS)
+    return np.asarray(found.gap + spread * np.linspace(-1.0, 1.0, count))
 
 
 def drift_in_products(at: Estimate, std: tuple[float, float, float]) -> Array:

@@ -21,7 +21,7 @@ REFUSED_IN_A_ROW = 5  # outliers in a row that mean a contradiction, not outlier
 NIS_LIMIT = 3.0  # mean normalised innovation squared that contradicts an estimate
 NIS_TRUSTED = 2.0  # mean normalised innovation squared below which an estimate is consistent
 PROVEN = 25  # samples a new search must be consistent for before it replaces an estimate
-UNEXCITED_AFTER = 150  # samples in the gap after which nothing more can be learned
+RESTART_AFTER = 150  # inconsistent samples after which a search begins afresh
 NO_DATA_AFTER = 20  # lost samples in a row that are worth a status
 UNDECIDED_AFTER = 100  # samples after which a search without a sign of engagement says so
 PRECISE_SLOPE, PRECISE_GAP = 0.2, 0.3  # relative deviations below which an estimate is published
@@ -47,9 +47,10 @@ class KalmanEstimator:
         self._settings = SearchSettings(model, bounds, initial, noise_std, drift)
         self._bounds = bounds
         self._drifts = any(drift_std)
-        self._search = _Watched(GapSearch(self._settings))
+        self._search = self._new_search()
         self._challenger: _Watched | None = None
         self._known = False  # an estimate was published
+        self._in_vain = Status.ACQUIRING  # why the last first search ended without an estimate
         self._lost_in_a_row = 0
 
     @property
@@ -70,17 +71,32 @@ class KalmanEstimator:
         watched = self._search
         if not watched.add(y, interval.v):
             self.outliers += 1
-        if self._known and watched.contradicted:
+        if not self._known:
+            self._restart_in_vain(watched)
+        elif watched.contradicted:
             self._challenge(y, interval.v)
-        elif self._challenger is not None and not watched.contradicted:
+        else:
             self._challenger = None
         self._publish()
 
+    def _restart_in_vain(self, watched: _Watched) -> None:
+        """Begin afresh where a first search found nothing, and remember why."""
+        if watched.inconsistent_for >= RESTART_AFTER:
+            self._in_vain = Status.INCONSISTENT
+        elif watched.search.exhausted:
+            self._in_vain = Status.NOT_EXCITED
+        else:
+            return
+        self._search = self._new_search()
+
+    def _new_search(self) -> _Watched:
+        return _Watched(GapSearch(self._settings))
+
     def _challenge(self, y: float | None, v: float) -> None:
         """Search afresh beside an estimate that the data contradict."""
-        if self._challenger is None or self._challenger.hopeless:
-            self._challenger = _Watched(GapSearch(self._settings))
         challenger = self._challenger
+        if challenger is None or challenger.inconsistent_for >= RESTART_AFTER:
+            challenger = self._challenger = self._new_search()
         challenger.add(y, v)
         if challenger.consistent_for >= PROVEN and self._usable(challenger) is not None:
             self._search, self._challenger = challenger, None
@@ -104,7 +120,9 @@ class KalmanEstimator:
 
     def _publish(self) -> None:
         status = self._status()
-        found = None if status.frozen else self._usable(self._search)
+        # A first estimate may come out of an inconsistent start, a later one has to be consistent.
+        frozen = status.frozen and (self._known or status != Status.INCONSISTENT)
+        found = None if frozen else self._usable(self._search)
         if found is None:
             if self.estimate.status != status:
                 self.estimate = replace(self.estimate, status=status)
@@ -126,10 +144,10 @@ class KalmanEstimator:
         if fine is None:
             search = watched.search
             waited = search.samples >= UNDECIDED_AFTER and not search.excited
-            return Status.NOT_EXCITED if waited else Status.ACQUIRING
-        if fine.since_engaged > UNEXCITED_AFTER:
+            return Status.NOT_EXCITED if waited else self._in_vain
+        if fine.since_motion > self._settings.model.memory:
             return Status.NOT_EXCITED
-        return Status.TRACKING if self._known else Status.ACQUIRING
+        return Status.TRACKING if self._known else self._in_vain
 
 
 class _Watched:
@@ -138,51 +156,66 @@ class _Watched:
     def __init__(self, search: GapSearch) -> None:
         self.search = search
         self.consistent_for = 0  # samples
+        self.inconsistent_for = 0  # samples
         self.contradicted = False
         self._proven = False
-        self._refused = 0
+        self._refused = 0  # in a row
+        self._calm: list[float] = []  # normalised innovations squared since a contradiction
 
     @property
     def found(self) -> Crossings | None:
-        """Estimate of the leading hypothesis, None before there is one."""
+        """Estimate of the leading hypothesis, None before there is a consistent one."""
         fine = self.search.fine
         if fine is None or not fine.active or fine.nis > NIS_TRUSTED:
             return None
         return crossings_of(fine.theta[fine.leader], fine.theta_cov[fine.leader])
 
-    @property
-    def hopeless(self) -> bool:
-        """Whether this search has had its chance."""
-        return self.search.samples > 400 and self.consistent_for == 0
-
     def add(self, y: float | None, v: float) -> bool:
         """Take in a sample; return False if y was refused as an outlier."""
-        fine, accepted = self.search.fine, True
+        search = self.search
+        fine, accepted = search.fine, True
         if fine is not None:
             fine.predict(v)
             if y is not None:
-                learn = fine.since_engaged <= UNEXCITED_AFTER and not self.contradicted
+                learn = fine.since_motion <= search.memory and not self.contradicted
                 accepted = fine.correct(y, GATE if self._proven else inf, learn)
                 self._judge(fine, accepted)
-            if self.search.full:
+            if search.settled and fine.turned:
                 self._follow(fine)
-        self.search.add(y, v, accepted)
+        elif search.coarse is not None:
+            self._count(search.coarse.nis < NIS_TRUSTED)
+        search.add(y, v, accepted)
         return accepted
 
     def _judge(self, fine: GapBank, accepted: bool) -> None:
         self._refused = 0 if accepted else self._refused + 1
-        trusted = accepted and fine.nis < NIS_TRUSTED
-        self.consistent_for = self.consistent_for + 1 if trusted else 0
-        self._proven = self._proven or self.consistent_for >= PROVEN
-        if self._refused >= REFUSED_IN_A_ROW or (self._proven and fine.nis > NIS_LIMIT):
+        if self.contradicted:
+            self._recover(fine, accepted)
+        elif self._refused >= REFUSED_IN_A_ROW or (self._proven and fine.nis > NIS_LIMIT):
             self.contradicted = True
-        elif fine.nis < NIS_TRUSTED:
-            self.contradicted = False
+            self._calm.clear()
+        self._count(not self.contradicted and accepted and fine.nis < NIS_TRUSTED)
+
+    def _recover(self, fine: GapBank, accepted: bool) -> None:
+        """End a contradiction when a run of samples fits again: the bad data are over."""
+        if not accepted:
+            self._calm.clear()
+            return
+        self._calm.append(fine.innovation**2 / fine.innovation_var)
+        if len(self._calm) == PROVEN:
+            if sum(self._calm) < NIS_TRUSTED * PROVEN:
+                self.contradicted, fine.nis = False, 1.0
+            self._calm.clear()
+
+    def _count(self, consistent: bool) -> None:
+        self.consistent_for = self.consistent_for + 1 if consistent else 0
+        self.inconsistent_for = 0 if consistent else self.inconsistent_for + 1
+        self._proven = self._proven or (
+            self.search.fine is not None and self.consistent_for >= PROVEN
+        )
 
     def _follow(self, fine: GapBank) -> None:
-        """Let the hypotheses follow the estimate once replays have ended."""
-        if fine.since_engaged == 0:
-            return
+        """Let the hypotheses on the gap follow the estimate of it."""
         found = self.found
         if found is not None and found.gap > 0.0:
-            fine.move_gaps(fine_gaps(found))
+            fine.move_gaps(fine_gaps(found, len(fine.gaps)))

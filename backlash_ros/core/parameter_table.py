@@ -51,8 +51,11 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter(
         'lockstep', False,
         'run as fast as the machine allows: each sample waits for its reference and its control',
-        used_by=(CONTROLLER, PLANT, REFERENCE),
+        used_by=(CONTROLLER, PLANT, REFERENCE, RECORDER),
     ),
+    Parameter('wait_for_subscribers', 0,
+              'start only when the main topic has this many listeners', low=0,
+              used_by=(CONTROLLER, PLANT, REFERENCE)),
     Parameter(
         'estimator.law', 'kalman', 'law that learns m, c_r, c_l',
         choices=('kalman', 'lms', 'printed'),
@@ -113,6 +116,7 @@ PARAMETERS: tuple[Parameter, ...] = (
               used_by=(PLANT,)),
     Parameter('input_disturbance', 0.0, 'simulated constant added to u', 'u', used_by=(PLANT,)),
     Parameter('seed', 1, 'seed of the simulated noise', low=0, used_by=(PLANT,)),
+    Parameter('samples', 0, 'outputs to simulate, 0 for no end', low=0, used_by=(PLANT,)),
     Parameter('waveform', 'sine', 'shape of y_m',
               choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'),
               used_by=(REFERENCE,)),
@@ -128,7 +132,10 @@ PARAMETERS: tuple[Parameter, ...] = (
               used_by=(REFERENCE,)),
     Parameter('storage', 'mcap', 'format of the bag', choices=('mcap', 'sqlite3'),
               used_by=(RECORDER,)),
-    Parameter('bag', '', 'folder of the bag, must not exist yet', used_by=(RECORDER,)),
+    Parameter('bag', '', 'folder of the bag, must not exist yet; empty for none',
+              used_by=(RECORDER,)),
+    Parameter('wait_for_publishers', False,
+              'listen to plant_output only once all other nodes are heard', used_by=(RECORDER,)),
 )
 
 BY_NAME: dict[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}

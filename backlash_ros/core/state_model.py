@@ -10,12 +10,15 @@ from backlash_ros.core.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
+SHORTEST_MEMORY, LONGEST_MEMORY = 150, 5000  # samples
+
 
 class StateModel:
-    """x(k+1) = A x + B u, y = C x with observability Gramian I over a finite horizon.
+    """x(k+1) = A x + B u, y = c x_0 with observability Gramian I over a finite horizon.
 
     A unit state in any direction then shows with the same energy in y, so that one number tells
     how unknown x is, and covariances stay well scaled however close the poles of G lie to 1.
+    Only the first state shows in y at once: its factor c is all there is of C.
     """
 
     def __init__(self, model: TransferFunction) -> None:
@@ -27,12 +30,23 @@ class StateModel:
             row = row @ a
         # R of the observability matrix: R' R is its Gramian, without squaring the condition.
         r = linalg.qr(np.array(rows), mode='r')[0][: self.order]
-        self.to_observer = linalg.inv(r)
-        self.a: Array = r @ a @ self.to_observer
-        self.b: Array = r @ b
-        self.c: Array = c @ self.to_observer
+        # A rotation keeps the Gramian and turns C onto the first axis.
+        rotation, triangle = linalg.qr(linalg.solve(r.T, c)[:, None])
+        to_state = rotation.T @ r
+        self.to_observer: Array = linalg.inv(to_state)
+        self.a: Array = to_state @ a @ self.to_observer
+        self.b: Array = to_state @ b
+        self.c = float(triangle[0, 0])
+        self.memory = _memory(model)
 
 
 def _horizon(model: TransferFunction) -> int:
     """Samples within which the slow dynamics show, bounded for integrators."""
     return max(10 * model.order, 50)
+
+
+def _memory(model: TransferFunction) -> int:
+    """Samples after which the slowest stable mode of G has died out, within reason."""
+    stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - 1e-6]
+    slowest = max(stable, default=0.0)
+    return int(min(max(3.0 / (1.0 - slowest), SHORTEST_MEMORY), LONGEST_MEMORY))
