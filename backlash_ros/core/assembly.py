@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -10,10 +11,12 @@ import numpy as np
 from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.controller import AdaptiveController, Limits
 from backlash_ros.core.estimator import Bounds, Estimate, Estimator
+from backlash_ros.core.fixed import FixedBacklash
 from backlash_ros.core.input_reconstruction import InputReconstruction
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.lms import NormalisedLms
+from backlash_ros.core.lq_preview import preview_gains
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.printed_law import PrintedLaw
 from backlash_ros.core.proportional import Proportional
@@ -21,12 +24,18 @@ from backlash_ros.core.reference_signal import ReferenceSignal
 from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import Structure
+from backlash_ros.core.tracking import Tracking
 from backlash_ros.core.transfer_function import TransferFunction
+
+# Until the backlash is known, half of the motion of u may not be what the first guess says.
+DOUBT_OF_FIRST_GUESS = 0.5
+CAREFUL = 1e4  # times the input weight while the backlash is unknown
 
 
 def build_model(p: Parameters) -> TransferFunction:
-    """G(z)."""
-    return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator'))
+    """G(z), and the delay between control and its effect as poles at 0."""
+    delay = (0.0,) * p.integer('control.delay_samples')
+    return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator') + delay)
 
 
 def build_controller(p: Parameters) -> AdaptiveController:
@@ -91,9 +100,16 @@ def _reconstruction(p: Parameters) -> InputReconstruction:
 
 
 def _kalman(p: Parameters) -> Estimator:
+    observer = None
+    if p.word('structure') != 'proportional':
+        gapless = replace(_initial(p), c_r=0.0, c_l=0.0)
+        observer = FixedBacklash(
+            gapless, StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+            DOUBT_OF_FIRST_GUESS,
+        )
     return KalmanEstimator(
         _initial(p), _bounds(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
-        p.triple('estimator.drift_std'), p.real('sample_period'),
+        p.triple('estimator.drift_std'), p.real('sample_period'), observer,
     )
 
 
@@ -108,11 +124,33 @@ def _printed(p: Parameters) -> Estimator:
     return PrintedLaw(_initial(p), _bounds(p), p.pair('proportional.bounds'), _reconstruction(p))
 
 
+def _fixed(p: Parameters) -> Estimator:
+    return FixedBacklash(
+        _initial(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+        p.real('fixed.doubt'),
+    )
+
+
 def _proportional(p: Parameters) -> Structure:
     return Proportional()
 
 
+def _tracking(p: Parameters) -> Structure:
+    model = build_model(p)
+    z = np.exp(1j * np.pi / 10.0)
+    scale = float(abs(model.response(np.array([z]))[0])) ** 2
+    state = StateModel(model)
+    weight = p.real('tracking.input_weight') * scale
+    gains = preview_gains(
+        state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview')
+    )
+    careful = preview_gains(state, CAREFUL * weight, 0.0, 0)
+    return Tracking(state, gains, careful.state, p.real('inverse.caution'))
+
+
 ESTIMATORS: dict[str, Callable[[Parameters], Estimator]] = {
-    'kalman': _kalman, 'lms': _lms, 'printed': _printed,
+    'kalman': _kalman, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
 }
-STRUCTURES: dict[str, Callable[[Parameters], Structure]] = {'proportional': _proportional}
+STRUCTURES: dict[str, Callable[[Parameters], Structure]] = {
+    'proportional': _proportional, 'tracking': _tracking,
+}

@@ -1,4 +1,4 @@
-"""The adaptive backlash inverse controller: estimator, structure, inverse and limits in one step."""
+"""The adaptive backlash inverse controller: estimator, structure, inverse and limits."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from math import inf, isfinite
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Estimate, Estimator, Interval
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.structure import Structure
+from backlash_ros.core.structure import Situation, Structure
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,8 @@ class AdaptiveController:
             estimator.update(y, interval)
         inverse = self.inverse
         v_before = inverse.v
-        command = self.structure.control(y_m, estimator.estimate, inverse)
+        situation = Situation(y_m, y, estimator.estimate, estimator.x_hat, estimator.x_cov)
+        command = self.structure.control(situation, inverse)
         v = self.limits.apply(command.v, v_before)
         inverse.applied(v)
         self._interval = Interval(v, y_m, command.u_d, command.f)

@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from backlash_ros.core.errors import ParameterError
 
 
@@ -94,6 +97,14 @@ class Estimator(Protocol):
     @property
     def u_hat(self) -> float:
         """Newest reconstruction of u, `lag` samples old."""
+
+    @property
+    def x_hat(self) -> NDArray[np.float64]:
+        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
+
+    @property
+    def x_cov(self) -> NDArray[np.float64] | None:
+        """Covariance of x_hat, shape (n, n); None where the law has none."""
 
     @property
     def innovation(self) -> float:

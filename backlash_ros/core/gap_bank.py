@@ -22,6 +22,7 @@ from math import inf, log, nan
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.crossings import Crossings, crossings_of
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -78,6 +79,7 @@ class GapBank:
         self.since_motion = 0  # samples since u last moved under the leader
         self.turned = False  # whether the leader engaged the other side with the last step
         self.leader = 0  # most likely hypothesis that has started
+        self.doubt = np.zeros((3, 3))  # covariance of theta that comes from not knowing the gap
         self.innovation = nan  # of the leader
         self.innovation_var = noise_var
         self.nis = 1.0  # running mean of the leader's normalised innovation squared
@@ -106,7 +108,8 @@ class GapBank:
         """Make the most likely hypothesis the leader and return its log-likelihood.
 
         A hypothesis g that fits the data with another m (c_r - c_l) than m g contradicts itself:
-        its own gap counts as one more measurement, m g of theta[1] - theta[2].
+        its own gap counts as one more measurement, m g of theta[1] - theta[2]. How far the
+        estimates of likely hypotheses lie apart is kept as `doubt`.
         """
         rows = slice(self._first, self.active)
         gaps, theta, cov = self.gaps[rows], self.theta[rows], self.theta_cov[rows]
@@ -118,8 +121,16 @@ class GapBank:
         score = self.log_likelihood[:self.active].copy()
         score[rows] -= 0.5 * (mismatch**2 / variance + np.log(variance))
         score[rows][theta[:, 0] <= 0.0] = -inf
-        self.leader = int(score.argmax())
-        return float(score[self.leader])
+        self.leader = leader = int(score.argmax())
+        if leader >= self._first and score[leader] > -inf:
+            share = np.exp(score[rows] - score[leader])
+            apart = theta - theta[leader - self._first]
+            self.doubt = (apart.T * (share / share.sum())) @ apart
+        return float(score[leader])
+
+    def found(self) -> Crossings | None:
+        """Estimate of the leader, the doubt about the gap included; None unless m > 0."""
+        return crossings_of(self.theta[self.leader], self.theta_cov[self.leader] + self.doubt)
 
     def u_hat(self) -> float:
         """u under the leading hypothesis after the last step."""
@@ -208,7 +219,8 @@ class GapBank:
         mean, cov = self.mean[:count], self.cov[:count]
         c = self._model.c
         cross = c * cov[:, :, 0]
-        variance = c * cross[:, 0] + self.noise_var
+        # Rounding may leave an all but certain x with a variance below 0.
+        variance = np.maximum(c * cross[:, 0], 0.0) + self.noise_var
         e = y - c * mean[:, 0]
         leader = self.leader
         self.innovation, self.innovation_var = float(e[leader]), float(variance[leader])

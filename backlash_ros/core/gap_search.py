@@ -15,7 +15,7 @@ from math import ceil, inf, isnan, log, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.crossings import Crossings, crossings_of
+from backlash_ros.core.crossings import Crossings
 from backlash_ros.core.estimator import Bounds, Estimate
 from backlash_ros.core.gap_bank import GapBank, Prior
 from backlash_ros.core.state_model import StateModel
@@ -24,12 +24,16 @@ Array = NDArray[np.float64]
 
 GRID_RATIO = 1.2  # between neighbouring gaps of the coarse grid
 SMALLEST_GAP = 5e-4  # of the widest gap the bounds allow
-LARGEST_SPREAD = 0.2  # of the gap: the standard deviation is not to be trusted beyond
+FINE = 7  # hypotheses of a fine bank
+REACH = 2.0  # standard deviations of the gap that a fine bank reaches to either side
+LARGEST_SPREAD = 0.3  # of the gap: the standard deviation is not to be trusted beyond
+LOST = 3.0  # standard deviations between read and estimated gap from which both are tried
 CAPACITY = 16384  # samples kept for replays
 REPLAY_SPEED = 3  # recorded samples per new one
 LAST_REPLAY = CAPACITY * (REPLAY_SPEED - 1) // REPLAY_SPEED  # later ones would not catch up
-GROWTH = 3.0  # of the record after which it is read again in any case
-MISREAD = 2.0  # standard deviations between the gap a record was read with and its estimate
+GROWTH_EARLY, GROWTH_LATE = 1.3, 3.0  # of the record between two replays
+EARLY = 400  # samples during which a misread record still shows in the estimate
+MISREAD = 0.5  # standard deviations between the gap a record was read with and its estimate
 PAUSE = 5  # samples between two looks for a reason to read the record again
 START_GATE = 8.0  # standard deviations; before the fine bank stands only gross outliers are told
 PATIENCE = 2  # outliers in a row that the coarse bank refuses before it believes them
@@ -66,7 +70,6 @@ class GapSearch:
         self._y, self._v = np.empty(CAPACITY), np.empty(CAPACITY)
         self._replay: GapBank | None = None
         self._replayed = 0
-        self._next_replay = 0
         self._read_with: Array = np.empty(0)  # gaps with which the fine bank read the record
         self._fine_since = 0
         self._earliest = 0
@@ -169,7 +172,7 @@ class GapSearch:
         bank.elect()
         best = bank.leader
         self._earliest = self.samples + PAUSE
-        found = crossings_of(bank.theta[best], bank.theta_cov[best])
+        found = bank.found()
         if found is None or not 0.0 < found.std_gap < 0.5 * found.gap:
             return
         if self.samples >= LAST_REPLAY:
@@ -178,11 +181,13 @@ class GapSearch:
             self.fine = bank.part(max(best - 1, 1), min(best + 2, bank.active))
             return
         misread = abs(found.gap - read_with[best]) > MISREAD * found.std_gap
-        if bank is self.fine and not misread and self.samples < self._next_replay:
+        if bank is self.fine and not misread:
             return
-        self._next_replay = int(GROWTH * self.samples)
-        self._earliest = self.samples + self.samples // 4 if not self._settled else self._next_replay
-        gaps = np.union1d(fine_gaps(found, 3), bracket(read_with, best))
+        growth = GROWTH_EARLY if self.samples < EARLY else GROWTH_LATE
+        self._earliest = int(growth * self.samples)
+        gaps = fine_gaps(found, FINE)
+        if abs(found.gap - read_with[best]) > LOST * found.std_gap:
+            gaps = np.union1d(gaps, bracket(read_with, best))
         self._replay, self._replayed = self._bank(gaps, with_null=False), 0
 
     def _advance_replay(self) -> None:
@@ -231,8 +236,8 @@ def bracket(gaps: Array, leader: int) -> Array:
 
 
 def fine_gaps(found: Crossings, count: int) -> Array:
-    """Gaps of a fine bank within one standard deviation of an estimate, ascending and > 0."""
-    spread = min(found.std_gap, LARGEST_SPREAD * found.gap)
+    """Gaps of a fine bank around an estimate, ascending and > 0."""
+    spread = min(REACH * found.std_gap, LARGEST_SPREAD * found.gap)
     return np.asarray(found.gap + spread * np.linspace(-1.0, 1.0, count))
 
 

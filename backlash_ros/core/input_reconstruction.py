@@ -13,10 +13,14 @@ from __future__ import annotations
 from math import nan
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
 
 INPUT_STEP_STD = 1.0  # of w: only its ratio to the noise of y matters
 # Without noise on y the smoother still needs some: this far below the weakest response of y to w.
@@ -33,10 +37,11 @@ class InputReconstruction:
     def __init__(self, model: TransferFunction, noise_std: float, lag: int) -> None:
         self.lag = lag
         self.innovation = nan
-        n = model.order
-        a, b, c = model.state_space()
-        transition = np.block([[a, b[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
-        output = np.append(c, 0.0)
+        state = StateModel(model)
+        n = state.order
+        transition = np.block([[state.a, state.b[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
+        output = np.zeros(n + 1)
+        output[0] = self._c = state.c
         process = np.zeros((n + 1, n + 1))
         process[n, n] = INPUT_STEP_STD**2
         noise = max(noise_std, NOISE_FLOOR * _weakest_response(model)) ** 2
@@ -51,14 +56,14 @@ class InputReconstruction:
                 'G(z) must have no zero at z = 1 and no hidden unstable pole',
             ) from None
         variance = float(output @ p @ output) + noise
-        gain = transition @ p @ output / variance
-        self._closed = transition - np.outer(gain, output)
-        self._gain, self._transition, self._output = gain, transition, output
+        self._gain = p @ output / variance
+        self._transition = transition
+        closed = transition - transition @ np.outer(self._gain, output)
         # Smoothing gains of u(k - i), i = 0 .. lag: cross covariance with the present error.
         rows = np.empty((lag + 1, n + 1))
         rows[0] = p[n]
         for i in range(lag):
-            rows[i + 1] = rows[i] @ self._closed.T
+            rows[i + 1] = rows[i] @ closed.T
         self._lag_gain = rows @ output / variance
         removed = np.cumsum((rows @ output) ** 2 / variance)
         self.std = float(np.sqrt(max(p[n, n] - removed[-1], 0.0)))
@@ -71,24 +76,34 @@ class InputReconstruction:
         """u_hat(k - lag) given y(..k)."""
         return float(self._window[-1])
 
+    def newer(self, samples: int) -> float:
+        """u_hat(k - lag + samples) given y(..k)."""
+        return float(self._window[-1 - samples])
+
     @property
     def ready(self) -> bool:
         """Whether enough samples came in for the lag and for the start to be forgotten."""
         return self.samples > 2 * self.lag
 
+    @property
+    def x_hat(self) -> Array:
+        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
+        return self._x[:-1]
+
     def update(self, y: float | None) -> float:
         """Take in y(k), None if it was lost, and return u_hat(k - lag)."""
         window = self._window
         window[1:] = window[:-1].copy()
-        window[0] = self._x[-1]
+        x = self._transition @ self._x
+        window[0] = x[-1]
         if y is None:
-            self._x = self._transition @ self._x
             self.innovation = nan
         else:
-            e = y - float(self._x[0])
+            e = y - self._c * float(x[0])
             window += self._lag_gain * e
-            self._x = self._closed @ self._x + self._gain * y
+            x += self._gain * e
             self.innovation = e
+        self._x = x
         self.samples += 1
         return float(window[-1])
 

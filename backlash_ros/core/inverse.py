@@ -1,4 +1,4 @@
-"""Backlash inverse, equations (2.2) and (2.3), with a direction band and a slope-limited take-up."""
+"""Backlash inverse, equations (2.2) and (2.3), with a direction band and a slow take-up."""
 
 from math import inf
 
@@ -24,10 +24,16 @@ class BacklashInverse:
         if not take_up > 0.0:
             raise ParameterError('inverse.take_up_rate', take_up, 'must be > 0')
         self.direction_band, self.take_up = direction_band, take_up
+        self._least_band = direction_band
+        self.limited = False  # whether the last v could not be applied as it was
         self.v = 0.0
         self.side = Region.GAP  # line in use; GAP until u_d moves for the first time
         self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
         self._taking_up = False
+
+    def widen_band(self, band: float) -> None:
+        """Use this band while it is wider than the one set: the noise of u_d may vary."""
+        self.direction_band = max(self._least_band, band)
 
     def direction(self, u_d: float) -> Region:
         """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held.
@@ -68,4 +74,5 @@ class BacklashInverse:
 
     def applied(self, v: float) -> None:
         """Say which v was really applied (limits), so that the next move starts from there."""
+        self.limited = v != self.v
         self.v = v

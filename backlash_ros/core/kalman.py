@@ -10,8 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 from math import inf, nan
 
-from backlash_ros.core.crossings import Crossings, crossings_of
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.crossings import Crossings
 from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.fixed import FixedBacklash
 from backlash_ros.core.gap_bank import GapBank
 from backlash_ros.core.gap_search import GapSearch, SearchSettings, fine_gaps
 from backlash_ros.core.state_model import StateModel
@@ -31,14 +35,14 @@ class KalmanEstimator:
     """Learns (m, c_r, c_l) from y alone with a bank of Kalman filters over the gap width.
 
     noise_std: standard deviation of the noise on y. drift_std: random walk of m, c_r, c_l per
-    square root of a second. Nothing else needs tuning.
+    square root of a second. Nothing else needs tuning. observer: gives the state of G until the
+    bank can, for structures that want it.
     """
-
-    lag = 1
 
     def __init__(
         self, initial: Estimate, bounds: Bounds, model: StateModel, noise_std: float,
         drift_std: tuple[float, float, float], sample_period: float,
+        observer: FixedBacklash | None = None,
     ) -> None:
         self.estimate = initial
         self.outliers = 0
@@ -46,7 +50,7 @@ class KalmanEstimator:
         drift = (drift_std[0] * root, drift_std[1] * root, drift_std[2] * root)
         self._settings = SearchSettings(model, bounds, initial, noise_std, drift)
         self._bounds = bounds
-        self._drifts = any(drift_std)
+        self._observer, self._no_state = observer, np.zeros(model.order)
         self._search = self._new_search()
         self._challenger: _Watched | None = None
         self._known = False  # an estimate was published
@@ -60,6 +64,25 @@ class KalmanEstimator:
         return fine.u_hat() if fine is not None else nan
 
     @property
+    def x_hat(self) -> NDArray[np.float64]:
+        """State of G: from the bank while it may be trusted, otherwise from the first guess."""
+        fine = self._trusted
+        if fine is not None:
+            return fine.mean[fine.leader, :self._settings.model.order]
+        return self._observer.x_hat if self._observer is not None else self._no_state
+
+    @property
+    def x_cov(self) -> NDArray[np.float64] | None:
+        """Covariance of x_hat; None while the bank cannot be trusted."""
+        fine, n = self._trusted, self._settings.model.order
+        return fine.cov[fine.leader, :n, :n] if fine is not None else None
+
+    @property
+    def _trusted(self) -> GapBank | None:
+        known = self._known and not self._search.contradicted
+        return self._search.search.fine if known else None
+
+    @property
     def innovation(self) -> float:
         """y(k) minus its prediction; nan where y(k) was lost or nothing is known yet."""
         fine = self._search.search.fine
@@ -69,6 +92,8 @@ class KalmanEstimator:
         """Take in y(k), None if it was lost, and v of the interval before it."""
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         watched = self._search
+        if self._observer is not None:
+            self._observer.update(y, interval)
         if not watched.add(y, interval.v):
             self.outliers += 1
         if not self._known:
@@ -168,7 +193,7 @@ class _Watched:
         fine = self.search.fine
         if fine is None or not fine.active or fine.nis > NIS_TRUSTED:
             return None
-        return crossings_of(fine.theta[fine.leader], fine.theta_cov[fine.leader])
+        return fine.found()
 
     def add(self, y: float | None, v: float) -> bool:
         """Take in a sample; return False if y was refused as an outlier."""

@@ -13,12 +13,19 @@ Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the
 
 from __future__ import annotations
 
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
 from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
 from backlash_ros.core.history import History
 from backlash_ros.core.input_reconstruction import InputReconstruction
 
-# A side is engaged when the reconstructed u moves by more than this many standard deviations.
-MOTION_THRESHOLD = 4.0
+# A side is engaged when the reconstructed u moves on in one direction over this many samples to
+# either side, by more than so many standard deviations of its error: smoothing rounds the corners.
+STROKE = 8
+MOTION_THRESHOLD = 2.0
 
 
 class NormalisedLms:
@@ -38,13 +45,23 @@ class NormalisedLms:
         self._reconstruction = reconstruction
         self._history = History(reconstruction.lag)
         self._threshold = MOTION_THRESHOLD * reconstruction.std
-        self._u_before = 0.0
+        self._past: deque[float] = deque(maxlen=STROKE + 1)
         self._v_max = 0.0
 
     @property
     def u_hat(self) -> float:
         """Reconstruction of u, `lag` samples old."""
         return self._reconstruction.u_hat
+
+    @property
+    def x_hat(self) -> NDArray[np.float64]:
+        """State of G in the coordinates of StateModel, shape (n,)."""
+        return self._reconstruction.x_hat
+
+    @property
+    def x_cov(self) -> None:
+        """No covariance."""
+        return None
 
     @property
     def innovation(self) -> float:
@@ -54,15 +71,19 @@ class NormalisedLms:
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""
         u = self._reconstruction.update(y)
-        motion, self._u_before = u - self._u_before, u
+        self._past.append(u)
         past = self._history.push(interval)
-        if past is None or not self._reconstruction.ready or abs(motion) <= self._threshold:
+        if past is None or not self._reconstruction.ready:
+            return
+        ahead = self._reconstruction.newer(STROKE) - u
+        behind = u - self._past[0]
+        if min(abs(ahead), abs(behind)) <= self._threshold or (ahead > 0.0) != (behind > 0.0):
             return
         old = self.estimate
         m, c_r, c_l = old.m, old.c_r, old.c_l
         v = past.v
         self._v_max = max(self._v_max, abs(v))
-        rising = motion > 0.0
+        rising = ahead > 0.0
         e = u - m * (v - (c_r if rising else c_l))
         weight = 1.0 / self._v_max**2 if self._v_max > 0.0 else 0.0
         gain = self.step * e / (weight * v * v + 1.0)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
-from math import isfinite, isnan
+from collections.abc import Iterable, Iterator, Mapping
+from math import hypot, isfinite, isnan, sqrt
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter, Value
+
+
+NOISE = 'estimator.output_noise_std'
 
 
 class Parameters(Mapping[str, Value]):
@@ -21,11 +24,17 @@ class Parameters(Mapping[str, Value]):
             p.name: check_value(p, given[p.name]) if p.name in given else p.default
             for p in PARAMETERS
         }
+        if NOISE not in given:
+            # Whoever simulates noise means the estimator to know it, unless told otherwise.
+            simulated = hypot(
+                self.real('output_noise_std'), self.real('output_quantum') / sqrt(12.0)
+            )
+            self._values[NOISE] = max(self.real(NOISE), simulated)
 
     def __getitem__(self, name: str) -> Value:
         return self._values[name]
 
-    def __iter__(self):  # type: ignore[no-untyped-def]
+    def __iter__(self) -> Iterator[str]:
         return iter(self._values)
 
     def __len__(self) -> int:

@@ -12,6 +12,9 @@ from __future__ import annotations
 
 from math import isfinite, nan
 
+import numpy as np
+from numpy.typing import NDArray
+
 from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
 from backlash_ros.core.history import History
 from backlash_ros.core.input_reconstruction import InputReconstruction
@@ -63,6 +66,16 @@ class PrintedLaw:
     def u_hat(self) -> float:
         """Reconstruction of u, `lag` samples old."""
         return self._reconstruction.u_hat
+
+    @property
+    def x_hat(self) -> NDArray[np.float64]:
+        """State of G in the coordinates of StateModel, shape (n,)."""
+        return self._reconstruction.x_hat
+
+    @property
+    def x_cov(self) -> None:
+        """No covariance."""
+        return None
 
     @property
     def innovation(self) -> float:

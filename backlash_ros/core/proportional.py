@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from math import hypot, isnan
+
 from backlash_ros.core.backlash import Region
 from backlash_ros.core.estimator import Estimate
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.structure import Command
+from backlash_ros.core.structure import Command, Situation
 
 # (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
 LARGEST_F_OVER_M = 0.8
+
+
+# Turns of u_d smaller than this many of its standard deviations are noise of the estimates.
+NOISE_BAND = 3.0
 
 
 class Proportional:
@@ -19,8 +25,12 @@ class Proportional:
     to 0.8 m.
     """
 
-    def control(self, y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
+    delay = 0
+
+    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
+        y_m, estimate = situation.y_m, situation.estimate
+        inverse.widen_band(NOISE_BAND * _deviation(y_m, estimate))
         m, c_r, c_l = estimate.m, estimate.c_r, estimate.c_l
         f = min(estimate.f, LARGEST_F_OVER_M * m)
         right = m * (y_m + f * c_r) / (m - f)
@@ -35,3 +45,14 @@ class Proportional:
             return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
         u_d = y_m + f * inverse.v
         return Command(u_d, inverse.hold(u_d), f)
+
+
+def _deviation(y_m: float, estimate: Estimate) -> float:
+    """Standard deviation of u_d that comes from the estimates, 0 where they have none."""
+    if isnan(estimate.std_m):
+        return 0.0
+    m, c = estimate.m, estimate.c_r
+    f = min(estimate.f, LARGEST_F_OVER_M * m)
+    by_m = f * (y_m + f * c) / (m - f) ** 2
+    by_c = m * f / (m - f)
+    return hypot(by_m * estimate.std_m, by_c * max(estimate.std_c_r, estimate.std_c_l))

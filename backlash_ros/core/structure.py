@@ -5,8 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from backlash_ros.core.estimator import Estimate
 from backlash_ros.core.inverse import BacklashInverse
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What is known at a sample: reference, output, estimate and state of G with its covariance.
+
+    x_hat (n,) and x_cov (n, n) are in the coordinates of StateModel; x_cov is None where the
+    estimator has none.
+    """
+
+    y_m: float
+    y: float
+    estimate: Estimate
+    x_hat: NDArray[np.float64]
+    x_cov: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -21,5 +39,9 @@ class Command:
 class Structure(Protocol):
     """Makes u_d from the reference and drives the inverse with it."""
 
-    def control(self, y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
+    @property
+    def delay(self) -> int:
+        """Samples by which y is meant to follow y_m."""
+
+    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""

@@ -1,0 +1,90 @@
+"""No learning: a backlash measured by hand, or none, is taken as it is.
+
+The state of G comes from a Kalman filter that knows the backlash and allows for a slow
+disturbance d of u, which takes up what the fixed constants get wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.estimator import Estimate, Interval, Status
+from backlash_ros.core.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+STATE_REACH = 1e3  # prior of x in units of the first output and of the noise
+
+
+class FixedBacklash:
+    """The estimates stay what they are given as; only the state of G is estimated.
+
+    noise_std: of y. doubt: how much d may move per sample, as a share of the motion of u that
+    the constants predict; 0 trusts them fully.
+    """
+
+    def __init__(
+        self, initial: Estimate, model: StateModel, noise_std: float, doubt: float,
+    ) -> None:
+        self.estimate = replace(
+            initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING
+        )
+        self.innovation = nan
+        n = model.order
+        # A gap of exactly 0 has c_l = c_r, which (2.1) does not know: then u = m (v - c).
+        gapless = initial.c_r == initial.c_l
+        self._backlash = None if gapless else Backlash(initial.m, initial.c_r, initial.c_l)
+        self._model, self._c = model, model.c
+        self._transition = np.eye(n + 1)
+        self._transition[:n, :n], self._transition[:n, n] = model.a, model.b
+        self._input = np.append(model.b, 0.0)
+        self._noise_var = max(noise_std, 1e-12) ** 2
+        self._doubt = doubt
+        self._x, self._p = np.zeros(n + 1), np.zeros((n + 1, n + 1))
+        self._u = 0.0
+        self._started = False
+
+    @property
+    def u_hat(self) -> float:
+        """u of the given backlash plus the estimated disturbance."""
+        return self._u + float(self._x[-1])
+
+    @property
+    def x_hat(self) -> Array:
+        """State of G in the coordinates of StateModel, shape (n,)."""
+        return self._x[:-1]
+
+    @property
+    def x_cov(self) -> Array:
+        """Covariance of x_hat, shape (n, n)."""
+        return self._p[:-1, :-1]
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k), None if it was lost, and v of the interval before it."""
+        e = self.estimate
+        backlash = self._backlash
+        before = self._u
+        self._u = e.m * (interval.v - e.c_r) if backlash is None else backlash.step(interval.v)
+        x = self._transition @ self._x + self._input * self._u
+        p = self._transition @ self._p @ self._transition.T
+        p[-1, -1] += (self._doubt * (self._u - before)) ** 2
+        if y is None:
+            self.innovation = nan
+        else:
+            if not self._started:
+                reach = STATE_REACH * (abs(y) + self._noise_var**0.5)
+                p[:-1, :-1] += reach**2 * np.eye(len(x) - 1)
+                self._started = True
+            cross = self._c * p[:, 0]
+            variance = self._c * cross[0] + self._noise_var
+            self.innovation = y - self._c * float(x[0])
+            gain = cross / variance
+            x = x + gain * self.innovation
+            p -= np.outer(gain, cross)
+            p = 0.5 * (p + p.T)
+        self._x, self._p = x, p

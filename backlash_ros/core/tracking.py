@@ -1,0 +1,103 @@
+"""The structure in which y follows y_m: an ideal trajectory and feedback that holds y on it."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import isnan, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.lq_preview import PreviewGains
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Command, Situation
+
+Array = NDArray[np.float64]
+
+# Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
+# that the feedback has to hurry afterwards, and cross the gap more often, not less.
+NOISE_BAND = 0.5
+
+
+class Tracking:
+    """u_d = u* - K (x - x*) - K_q (q - q*) around the ideal trajectory u*, x*, q* of G alone.
+
+    The trajectory is what the LQ preview controller does without backlash, for the reference r,
+    which is y_m delayed by the preview window: the delay is what the preview costs. Before the
+    first reference has passed the window r is the output at the start, so that nothing jumps.
+    While the backlash is unknown, `careful` replaces K: little feedback cannot destabilise a loop
+    whose gain is unknown, and the trajectory itself excites it.
+    caution: standard deviations by which the crossings are shrunk before they are inverted.
+    """
+
+    def __init__(
+        self, model: StateModel, gains: PreviewGains, careful: Array, caution: float,
+    ) -> None:
+        self.delay = len(gains.preview) - 1
+        self._model, self._gains = model, gains
+        self._careful, self._caution = careful, caution
+        self._window: deque[float] = deque(maxlen=self.delay + 1)  # r(k) .. r(k + delay)
+        self._x = np.zeros(model.order)  # x* and q* of the trajectory
+        self._q = 0.0
+        self._integral = 0.0
+
+    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+        """Return u_d and v = BI(u_d)."""
+        self._take_in(situation)
+        gains = self._gains
+        window = np.fromiter(self._window, np.float64, self.delay + 1)
+        ideal = -float(gains.state @ self._x) - gains.integral * self._q
+        ideal -= float(gains.preview @ window)
+        deviation = situation.x_hat - self._x
+        trusted = _trusted(situation.estimate)
+        if trusted:
+            u_d = ideal - float(gains.state @ deviation)
+            u_d -= gains.integral * (self._integral - self._q)
+        else:
+            u_d = ideal - float(self._careful @ deviation)
+        if situation.x_cov is not None:
+            variance = float(gains.state @ situation.x_cov @ gains.state)
+            inverse.widen_band(NOISE_BAND * sqrt(max(variance, 0.0)))
+        c_r, c_l = cautious_crossings(situation.estimate, self._caution)
+        v = inverse.step(u_d, situation.estimate.m, c_r, c_l)
+        self._advance(ideal, situation.y, trusted, inverse.limited)
+        return Command(u_d, v, 0.0)
+
+    def _take_in(self, situation: Situation) -> None:
+        if not self._window:
+            self._window.extend([situation.y] * (self.delay + 1))
+            self._x = situation.x_hat.copy()
+        self._window.append(situation.y_m)
+
+    def _advance(self, ideal: float, y: float, trusted: bool, limited: bool) -> None:
+        r = self._window[0]
+        if not trusted:
+            self._integral = self._q
+        elif not limited:
+            # A saturated actuator cannot follow: integrating on would only wind up.
+            self._integral += r - y
+        self._q += r - self._model.c * float(self._x[0])
+        self._x = self._model.a @ self._x + self._model.b * ideal
+
+
+def _trusted(estimate: Estimate) -> bool:
+    return not isnan(estimate.std_m) and estimate.status != Status.INCONSISTENT
+
+
+def cautious_crossings(estimate: Estimate, deviations: float) -> tuple[float, float]:
+    """Crossings shrunk towards each other by their uncertainty; both 0 while nothing is known.
+
+    Over-compensation drives past the gap and starts a limit cycle, under-compensation only
+    leaves a rest of the backlash: in a loop around y the smaller gap is the safe one.
+    """
+    if deviations == 0.0:
+        return estimate.c_r, estimate.c_l
+    if isnan(estimate.std_c_r):
+        return 0.0, 0.0
+    middle = 0.5 * (estimate.c_r + estimate.c_l)
+    return (
+        max(estimate.c_r - deviations * estimate.std_c_r, middle),
+        min(estimate.c_l + deviations * estimate.std_c_l, middle),
+    )

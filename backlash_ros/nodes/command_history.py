@@ -1,0 +1,62 @@
+"""Which v the plant had over each sample interval, as far as the controller can know."""
+
+from __future__ import annotations
+
+from collections import deque
+
+# Commands that may be under way: more than a stall of the controller can leave behind.
+REMEMBERED = 256
+
+
+class CommandHistory:
+    """Published commands by time, and applied ones where the driver reports them.
+
+    The driver applies over an interval the newest v it has when the interval ends with the next
+    sample. So a v published after that sample was taken came too late, and the one before it
+    was in use. Times are those of one clock [ns].
+    """
+
+    def __init__(self, sample_period_s: float) -> None:
+        self.late = 0  # commands that missed their sample
+        self.unreported = 0  # outputs without a matching report of the applied v
+        self._period_ns = sample_period_s * 1e9
+        self._published: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
+        self._reported: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
+
+    def publish(self, v: float, stamp_ns: int) -> None:
+        """Note a command and when it left."""
+        self._published.append((stamp_ns, v))
+
+    def report(self, v: float, stamp_ns: int) -> None:
+        """Note an applied v and when the driver said so, just before the output it led to."""
+        self._reported.append((stamp_ns, v))
+
+    def over(self, intervals: int, end_ns: int) -> list[float]:
+        """v over each of the newest `intervals`, oldest first; the last one ended at end_ns.
+
+        Empty before the first command.
+        """
+        if not self._published:
+            return []
+        newest_ns, newest = self._published[-1]
+        first_end = end_ns - (intervals - 1) * self._period_ns
+        if newest_ns < first_end:
+            return [newest] * intervals
+        self.late += 1
+        return [self._at(end_ns - i * self._period_ns) for i in reversed(range(intervals))]
+
+    def reported_over(self, intervals: int, end_ns: int) -> list[float]:
+        """Reports since the last output; empty, and counted, unless there is one per interval."""
+        reports = []
+        while self._reported and self._reported[0][0] <= end_ns:
+            reports.append(self._reported.popleft()[1])
+        if len(reports) == intervals:
+            return reports
+        self.unreported += 1
+        return []
+
+    def _at(self, time_ns: float) -> float:
+        for stamp_ns, v in reversed(self._published):
+            if stamp_ns < time_ns:
+                return v
+        return self._published[0][1]

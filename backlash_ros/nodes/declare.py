@@ -1,0 +1,127 @@
+"""Parameters of a node from the one table: overrides checked, descriptors filled in, live ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import isfinite
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter
+from backlash_ros.core.parameters import Parameters
+
+# Declared by rclpy itself in every node.
+ROS_OWN = {'use_sim_time', 'start_type_description_service'}
+
+
+def declare_parameters(node: Node, executable: str) -> Parameters:
+    """Declare what the table says this executable uses; return the complete, checked set.
+
+    node: created with automatically_declare_parameters_from_overrides, the public way to learn
+    which names were given: rclpy ignores a given name that nobody declares. Raises ParameterError.
+    """
+    given: dict[str, Any] = {
+        name: parameter.value for name, parameter in _declared(node).items() if name not in ROS_OWN
+    }
+    parameters = Parameters(given)
+    for name in given:
+        node.undeclare_parameter(name)
+    node.declare_parameters('', [
+        (p.name, _ros_value(parameters[p.name]), describe(p))
+        for p in PARAMETERS if executable in p.used_by
+    ], ignore_override=True)
+    return parameters
+
+
+def describe(parameter: Parameter) -> ParameterDescriptor:
+    """What tools like rqt and `ros2 param describe` show."""
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    descriptor = ParameterDescriptor(
+        name=parameter.name, description=parameter.description + unit,
+        additional_constraints=_constraints(parameter), read_only=not parameter.live,
+    )
+    if isfinite(parameter.low) and isfinite(parameter.high):
+        if isinstance(parameter.default, float):
+            descriptor.floating_point_range = [
+                FloatingPointRange(from_value=parameter.low, to_value=parameter.high, step=0.0)
+            ]
+        elif isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(
+                from_value=int(parameter.low), to_value=int(parameter.high), step=1
+            )]
+    return descriptor
+
+
+class LiveParameters:
+    """Lets parameters change in a running node, all or nothing.
+
+    check(old, new): raises ParameterError for what the node cannot take up. apply(new): takes it
+    up.
+    """
+
+    def __init__(
+        self, node: Node, parameters: Parameters, check: Callable[[Parameters, Parameters], None],
+        apply: Callable[[Parameters], None],
+    ) -> None:
+        self.parameters = parameters
+        self._check, self._apply = check, apply
+        node.add_pre_set_parameters_callback(_as_declared)
+        node.add_on_set_parameters_callback(self._on_set)
+        node.add_post_set_parameters_callback(self._post_set)
+
+    def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
+        try:
+            self._check(self.parameters, self._with(changes))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _post_set(self, changes: list[RosParameter]) -> None:
+        self.parameters = self._with(changes)
+        self._apply(self.parameters)
+
+    def _with(self, changes: list[RosParameter]) -> Parameters:
+        return self.parameters.replaced(
+            {change.name: change.value for change in changes if change.name in BY_NAME}
+        )
+
+
+def _declared(node: Node) -> dict[str, RosParameter]:
+    # rclpy annotates the values of this dictionary as plain values; they are Parameters.
+    declared: dict[str, Any] = dict(node.get_parameters_by_prefix(''))
+    return declared
+
+
+def _ros_value(value: object) -> object:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def _constraints(parameter: Parameter) -> str:
+    if parameter.choices:
+        return 'one of ' + ', '.join(parameter.choices)
+    rules = []
+    if isfinite(parameter.low):
+        rules.append(f'{">" if parameter.above else ">="} {parameter.low:g}')
+    if isfinite(parameter.high):
+        rules.append(f'<= {parameter.high:g}')
+    return ' and '.join(rules)
+
+
+def _as_declared(changes: list[RosParameter]) -> list[RosParameter]:
+    """Turn whole numbers given for a float into floats, which rclpy alone would refuse."""
+    return [
+        RosParameter(change.name, value=float(change.value))
+        if change.type_ == RosParameter.Type.INTEGER
+        and change.name in BY_NAME and isinstance(BY_NAME[change.name].default, float)
+        else change
+        for change in changes
+    ]

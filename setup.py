@@ -1,0 +1,39 @@
+"""Build description read by colcon (ament_python) and by pip."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'backlash_ros'
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    description='Adaptive backlash inverse control: learns an unknown backlash and cancels it',
+    author='backlash_ros developers',
+    maintainer='backlash_ros developers',
+    maintainer_email='maintainers@backlash-ros.org',
+    license='Apache-2.0',
+    packages=find_packages(exclude=['test*']),
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
+    ],
+    zip_safe=True,
+    python_requires='>=3.10',
+    # rclpy is not listed: a ROS machine has it under another name than the package index.
+    install_requires=['matplotlib', 'numpy', 'PyYAML', 'rosbags', 'scipy', 'tqdm'],
+    extras_require={'test': ['hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout']},
+    entry_points={
+        'console_scripts': [
+            f'controller = {PACKAGE}.nodes.controller:main',
+            f'plant = {PACKAGE}.nodes.plant:main',
+            f'reference = {PACKAGE}.nodes.reference:main',
+            f'recorder = {PACKAGE}.nodes.recorder:main',
+            f'bringup = {PACKAGE}.tools.bringup:main',
+            f'simulate = {PACKAGE}.tools.simulate:main',
+            f'report = {PACKAGE}.tools.report:main',
+        ],
+    },
+)

@@ -1,0 +1,160 @@
+"""Helpers for tests with real nodes: processes, and a node of the test among them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+# Before rclpy reads it.
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+from backlash_ros.tools.processes import child_environment, free_domain
+
+DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
+
+
+def wait_until(condition: Callable[[], object], what: str, wait: Callable[[], None]) -> None:
+    """Return once condition holds; wait() passes a moment."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
+        wait()
+
+
+class NodeProcess:
+    """A node started as a process; its events can be waited for, its stderr read."""
+
+    def __init__(
+        self, executable: str, arguments: list[str], folder: Path, environment: dict[str, str],
+    ) -> None:
+        self.executable = executable
+        number = len(list(folder.glob('*.stderr')))
+        self._stdout, self._stderr = (
+            folder / f'{number}-{executable}.{kind}' for kind in ('stdout', 'stderr')
+        )
+        with self._stdout.open('wb') as out, self._stderr.open('wb') as err:
+            self.process = subprocess.Popen(
+                [sys.executable, '-m', f'backlash_ros.nodes.{executable}', *arguments],
+                stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=environment,
+            )
+
+    @property
+    def stderr(self) -> str:
+        """What the node has logged."""
+        return self._stderr.read_text()
+
+    def events(self, kind: str) -> list[dict[str, Any]]:
+        """Events of this kind so far."""
+        # The last piece may be a line that is still being written.
+        lines = self._stdout.read_text().split('\n')[:-1]
+        return [event for event in map(json.loads, lines) if event['event'] == kind]
+
+    def wait_for(self, kind: str) -> dict[str, Any]:
+        """The first event of this kind."""
+        wait_until(
+            lambda: self.events(kind) or self.process.poll() is not None,
+            f'{kind} of {self.executable}', lambda: time.sleep(0.02),
+        )
+        events = self.events(kind)
+        assert events, f'{self.executable} ended without {kind}:\n{self.stderr}'
+        return events[0]
+
+    def send(self, number: signal.Signals) -> None:
+        """Send a signal to this process alone."""
+        self.process.send_signal(number)
+
+    def stop(self, number: signal.Signals = signal.SIGINT) -> int:
+        """Signal it and return its exit code."""
+        self.send(number)
+        return self.wait()
+
+    def wait(self) -> int:
+        """Exit code of a node that ends by itself."""
+        return self.process.wait(DEADLINE_S)
+
+    def kill(self) -> None:
+        """Make sure that nothing is left."""
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+
+
+class Probe:
+    """A node of the test: it publishes, and keeps what it hears."""
+
+    def __init__(self, domain: int) -> None:
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain)
+        self.node = Node('probe', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+
+    def collect(self, topic: str, message_type: type[Any]) -> list[Any]:
+        """A list that grows with every message of the topic."""
+        heard: list[Any] = []
+        self.node.create_subscription(message_type, topic, heard.append, 1000)
+        return heard
+
+    def publisher(self, topic: str, message_type: type[Any]) -> Publisher:
+        """A publisher with deep history."""
+        return self.node.create_publisher(message_type, topic, 1000)
+
+    def wait_until(self, condition: Callable[[], object], what: str) -> None:
+        """Listen until condition holds."""
+        wait_until(condition, what, lambda: self._executor.spin_once(timeout_sec=0.02))
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+class RosWorld:
+    """A domain of its own with the nodes of one test in it."""
+
+    def __init__(self, folder: Path, domain: int, stack: ExitStack) -> None:
+        self.folder = folder
+        self._domain, self._stack = domain, stack
+        self._environment = child_environment(folder, domain)
+
+    def start(
+        self, executable: str, parameters: Mapping[str, object] | None = None, *arguments: str,
+    ) -> NodeProcess:
+        """Start a node with parameters, and further arguments as they are."""
+        ros_arguments = ['--ros-args'] if parameters else []
+        for name, value in (parameters or {}).items():
+            text = value if isinstance(value, str) else json.dumps(value)
+            ros_arguments += ['-p', f'{name}:={text}']
+        process = NodeProcess(
+            executable, [*ros_arguments, *arguments], self.folder, self._environment
+        )
+        self._stack.callback(process.kill)
+        return process
+
+    def probe(self) -> Probe:
+        """A node of the test."""
+        probe = Probe(self._domain)
+        self._stack.callback(probe.close)
+        return probe
+
+
+@contextmanager
+def ros_world(folder: Path) -> Iterator[RosWorld]:
+    """Nodes that nobody else hears; all are gone when the context is left."""
+    with free_domain() as domain, ExitStack() as stack:
+        yield RosWorld(folder, domain, stack)

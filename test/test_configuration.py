@@ -1,0 +1,210 @@
+"""Parameter files and settings: what is accepted, how mistakes are answered."""
+
+from __future__ import annotations
+
+from math import inf
+from pathlib import Path
+
+import pytest
+
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools.configuration import (
+    effective_parameters,
+    find_config,
+    load_config,
+    parse_setting,
+    read_reference,
+    reference_samples,
+    shipped_configs,
+    write_config,
+)
+from backlash_ros.tools.errors import InputError
+
+SHIPPED = sorted((Path(__file__).resolve().parents[1] / 'config').glob('*.yaml'))
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    return tmp_path / 'my.yaml'
+
+
+def test_paper_example_says_what_the_table_says() -> None:
+    example = load_config(shipped_configs() / 'paper_example.yaml')
+    defaults = Parameters()
+    assert example == {name: defaults[name] for name in example}
+    assert effective_parameters(None) == defaults
+
+
+@pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.name)
+def test_shipped_file_loads_and_runs(path: Path) -> None:
+    parameters = effective_parameters(path)
+    assert build_closed_loop(parameters).run(50).samples == 50
+
+
+def test_shipped_file_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_config(Path('geared_motor.yaml')).is_file()
+    here = written(tmp_path / 'geared_motor.yaml', 'a file of that name here goes first')
+    assert find_config(Path('geared_motor.yaml')).resolve() == here
+
+
+def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
+    parameters = Parameters({
+        'plant.numerator': [1 / 3, 1e-300], 'control.min': -0.1, 'control.rate_max': 5.5,
+        'lockstep': True, 'file': "it's a: file.csv", 'seed': 7, 'backlash.jump': [0.0, 1e22, -0.5],
+    })
+    write_config(parameters, config)
+    assert Parameters(load_config(config)) == parameters
+    assert len(load_config(config)) == len(parameters)
+
+
+def test_written_infinity_is_one_for_ros_as_well(config: Path) -> None:
+    write_config(Parameters(), config)
+    text = config.read_text()
+    assert 'max: .inf\n' in text
+    assert 'min: -.inf\n' in text
+    assert load_config(config)['control.max'] == inf
+
+
+def test_misspelt_key_is_answered_with_the_nearest_one_and_the_file(config: Path) -> None:
+    written(config, '/**: {ros__parameters: {estimator: {lwa: lms}}}')
+    with pytest.raises(ParameterError) as caught:
+        load_config(config)
+    assert str(caught.value).startswith(f'{config}: estimator.lwa=')
+    assert 'did you mean estimator.law?' in str(caught.value)
+
+
+def test_bad_value_is_answered_with_rule_and_file(config: Path) -> None:
+    written(config, '/**: {ros__parameters: {sample_period: -1}}')
+    with pytest.raises(ParameterError, match=r'my\.yaml: sample_period=-1\.0 must be > 0 s'):
+        load_config(config)
+
+
+def test_whole_number_and_bare_exponent_are_floats(config: Path) -> None:
+    # YAML 1.1 reads 1e-5 as a text.
+    written(config, '/**: {ros__parameters: {amplitude: 3, plant.numerator: [1e-5, 4]}}')
+    values = load_config(config)
+    assert values == {'amplitude': 3.0, 'plant.numerator': (1e-5, 4.0)}
+    assert isinstance(values['amplitude'], float)
+
+
+@pytest.mark.parametrize('section', ['/**', '/controller', 'controller', '/**/controller'])
+def test_section_of_a_node_is_accepted(config: Path, section: str) -> None:
+    written(config, f'{section}: {{ros__parameters: {{estimator: {{law: lms}}}}}}')
+    assert load_config(config) == {'estimator.law': 'lms'}
+
+
+def test_section_of_a_node_goes_before_that_of_all(config: Path) -> None:
+    written(
+        config,
+        '/plant: {ros__parameters: {seed: 5}}\n/**: {ros__parameters: {seed: 4, amplitude: 2.0}}',
+    )
+    assert load_config(config) == {'seed': 5, 'amplitude': 2.0}
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('/robot: {ros__parameters: {seed: 1}}', "section '/robot' is none of"),
+        ('/plant: {ros__parameters: {seed: 1}}\nplant: {ros__parameters: {seed: 2}}',
+         'seed has two values, 1 and 2'),
+        ('/controller: {ros__parameters: {seed: 1}}', 'is not a parameter of controller'),
+        ('/**: {ros__parameters: {seed: 1, seed: 2}}', "line 1: 'seed' is given twice"),
+        ('/**: {seed: 1}', 'must hold ros__parameters'),
+        ('/**: {ros__parameters: }', 'must hold "name: value" lines'),
+        ('/**: {ros__parameters: {seed: [}}', 'line 1:'),
+        ('seed', 'must hold'),
+        ('', 'must hold'),
+        ('/**: {ros__parameters: {5: 1}}', '5='),
+    ],
+)
+def test_mistake_in_a_file_is_one_line_that_names_the_file(
+    config: Path, text: str, message: str,
+) -> None:
+    written(config, text)
+    with pytest.raises((InputError, ParameterError)) as caught:
+        load_config(config)
+    assert str(caught.value).startswith(f'{config}:')
+    assert message in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'nothing\.yaml: cannot be read: No such file'):
+        load_config(tmp_path / 'nothing.yaml')
+    binary = tmp_path / 'binary.yaml'
+    binary.write_bytes(b'\xff\xfe\x00')
+    with pytest.raises(InputError, match='not a text file'):
+        load_config(binary)
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('seed=3', ('seed', 3)),
+        ('amplitude=1e1', ('amplitude', 10.0)),
+        ('control.max=.inf', ('control.max', inf)),
+        ('lockstep=true', ('lockstep', True)),
+        ('plant.numerator=[1, 2e-3]', ('plant.numerator', (1.0, 2e-3))),
+        ('file=2024', ('file', '2024')),
+        ('file=', ('file', '')),
+        ('estimator.law=lms', ('estimator.law', 'lms')),
+    ],
+)
+def test_setting_is_read_like_a_line_of_yaml(text: str, expected: tuple[str, object]) -> None:
+    assert parse_setting(text) == expected
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('seed', 'must be KEY=VALUE'),
+        ('sed=1', 'did you mean seed'),
+        ('seed=x', 'must be a number'),
+        ('seed=[', 'is not a value in YAML'),
+        ('seed=', 'must be a number'),
+        ('structure=square', 'must be one of'),
+    ],
+)
+def test_bad_setting_is_refused(text: str, message: str) -> None:
+    with pytest.raises((InputError, ParameterError), match=message):
+        parse_setting(text)
+
+
+def test_settings_go_before_the_file_and_the_seed_before_both(config: Path) -> None:
+    written(config, '/**: {ros__parameters: {seed: 2, amplitude: 2.0, bias: 2.0}}')
+    parameters = effective_parameters(config, ['amplitude=3', 'seed=3'], seed=4)
+    assert (parameters['bias'], parameters['amplitude'], parameters['seed']) == (2.0, 3.0, 4)
+
+
+def test_reference_file_is_read(tmp_path: Path) -> None:
+    path = written(tmp_path / 'y_m.csv', 't,y_m\n0,1\n0.01,-2.5\n0.020000001,3e-1\n')
+    assert read_reference(path, 0.01) == (1.0, -2.5, 0.3)
+    parameters = Parameters({'waveform': 'file', 'file': str(path)})
+    assert reference_samples(parameters) == (1.0, -2.5, 0.3)
+    assert reference_samples(Parameters({'file': str(path)})) == ()
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('0,1\n', 'line 1: must be the header t,y_m'),
+        ('t,y_m\n', 'holds no sample'),
+        ('t,y_m\n0,1\n0.02,2\n', r'line 3: t=0\.02 must be 0\.01'),
+        ('t,y_m\n0,nan\n', 'line 2: y_m=nan must be finite'),
+        ('t,y_m\n0,1,2\n', 'line 2: must hold two numbers'),
+        ('t,y_m\n0,a\n', 'line 2: must hold two numbers'),
+    ],
+)
+def test_mistake_in_a_reference_file_names_the_line(
+    tmp_path: Path, text: str, message: str,
+) -> None:
+    with pytest.raises(InputError, match=message):
+        read_reference(written(tmp_path / 'y_m.csv', text), 0.01)

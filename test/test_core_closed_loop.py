@@ -1,0 +1,176 @@
+"""The whole loop in one process: what the project promises."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from strategies import paper_example, plants
+
+from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
+from backlash_ros.core.controller import AdaptiveController, ControlStep
+from backlash_ros.core.lms import NormalisedLms
+from backlash_ros.core.metrics import control_error_rms, settling_time
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import RunRecord
+from backlash_ros.core.transfer_function import TransferFunction
+
+TEN_SECONDS = 1000
+NAMES = ('m', 'c_r', 'c_l')
+
+
+def settled(run: RunRecord) -> list[float | None]:
+    """When m, c_r and c_l came within 1 % of the truth for good."""
+    return [
+        settling_time(run.column('t'), run.column(name), run.column(f'true_{name}'))
+        for name in NAMES
+    ]
+
+
+def assert_settled_within(run: RunRecord, seconds: float) -> None:
+    for name, time in zip(NAMES, settled(run), strict=True):
+        assert time is not None, f'{name} ends at {run.column(name)[-1]}'
+        assert time <= seconds, name
+
+
+class DeafController(AdaptiveController):
+    """What a controller without lost-sample handling does."""
+
+    def step(
+        self, y: float, y_m: float, lost: int = 0, applied: float | None = None,
+    ) -> ControlStep:
+        return super().step(y, y_m, 0, applied)
+
+
+def deafened(loop: ClosedLoop) -> ClosedLoop:
+    c = loop.controller
+    loop.controller = DeafController(c.estimator, c.structure, c.inverse, c.limits)
+    return loop
+
+
+def every(period: int, burst: int = 1) -> Callable[[], bool]:
+    """A pattern that loses the last `burst` outputs of each period."""
+    count = 0
+
+    def lose() -> bool:
+        nonlocal count
+        count += 1
+        return count % period >= period - burst
+
+    return lose
+
+
+def test_lms_learns_the_papers_backlash_to_1_percent_within_5_s() -> None:
+    run = build_closed_loop(paper_example()).run(TEN_SECONDS)
+    assert_settled_within(run, 5.0)
+    error = control_error_rms(run)
+    assert error is not None
+    assert error < 1e-3
+
+
+def test_lms_does_so_with_the_defaults_of_all_other_parameters() -> None:
+    """The defaults are the paper's example."""
+    run = build_closed_loop(Parameters({'estimator.law': 'lms'})).run(TEN_SECONDS)
+    assert_settled_within(run, 5.0)
+
+
+@pytest.mark.parametrize('waveform', ['triangle', 'multisine', 'chirp'])
+def test_lms_learns_from_other_references_that_swing_past_the_gap(waveform: str) -> None:
+    run = build_closed_loop(paper_example(waveform=waveform)).run(TEN_SECONDS)
+    assert_settled_within(run, 8.0)
+
+
+@settings(max_examples=25)
+@given(model=plants())
+def test_lms_learns_behind_any_plant(model: TransferFunction) -> None:
+    run = build_closed_loop(paper_example(
+        plant__numerator=model.numerator.tolist(), plant__denominator=model.denominator.tolist(),
+    )).run(TEN_SECONDS)
+    assert_settled_within(run, 8.0)
+
+
+def test_lms_with_the_wrong_sign_learns_nothing() -> None:
+    loop = build_closed_loop(paper_example())
+    assert isinstance(loop.controller.estimator, NormalisedLms)
+    loop.controller.estimator.step *= -1.0
+    assert None in settled(loop.run(TEN_SECONDS))
+
+
+@pytest.mark.parametrize(('period', 'burst'), [(50, 1), (20, 1), (40, 3)])
+def test_lms_learns_although_outputs_are_lost(period: int, burst: int) -> None:
+    """The plant goes on with the held v through every loss."""
+    loop = build_closed_loop(paper_example())
+    loop.lose = every(period, burst)
+    run = loop.run(TEN_SECONDS)
+    assert run.lost_samples == TEN_SECONDS - run.samples > 0
+    assert_settled_within(run, 8.0)
+
+
+@pytest.mark.parametrize('period', [50, 20])
+def test_lms_learns_nothing_where_losses_are_overlooked(period: int) -> None:
+    loop = deafened(build_closed_loop(paper_example()))
+    loop.lose = every(period)
+    assert None in settled(loop.run(TEN_SECONDS))
+
+
+@pytest.mark.parametrize('loss', [0.05, 0.1])
+def test_lms_learns_with_outputs_lost_at_random(loss: float) -> None:
+    run = build_closed_loop(paper_example(output_loss=loss)).run(2 * TEN_SECONDS)
+    share = run.lost_samples / (2 * TEN_SECONDS)
+    assert share == pytest.approx(loss, rel=0.25)
+    assert_settled_within(run, 15.0)
+
+
+def test_lms_learns_from_the_v_that_the_limits_let_through() -> None:
+    run = build_closed_loop(paper_example(control__min=-9.0, control__max=9.0)).run(TEN_SECONDS)
+    assert np.abs(run.column('v')).max() == 9.0
+    assert_settled_within(run, 8.0)
+
+
+def test_printed_law_stays_finite_and_does_not_identify() -> None:
+    run = build_closed_loop(paper_example(estimator__law='printed')).run(TEN_SECONDS)
+    assert np.isfinite(run.column('v')).all()
+    assert settled(run) == [None, None, None]
+
+
+def test_row_holds_the_signals_of_one_sample() -> None:
+    loop = build_closed_loop(paper_example())
+    run = loop.run(300)
+    t, y_m, u_d, v, u = (run.column(name) for name in ('t', 'y_m', 'u_d', 'v', 'u'))
+    np.testing.assert_allclose(t, 0.01 * np.arange(300))
+    np.testing.assert_allclose(y_m, 10.0 * np.sin(12.6 * t))
+    np.testing.assert_allclose(u_d, y_m + run.column('f') * v, atol=1e-9)  # (3.2)
+    assert (u <= 1.3 * (v + 3.0) + 1e-9).all()
+    assert (u >= 1.3 * (v - 3.0) - 1e-9).all()
+    model = TransferFunction((1e-5, 4e-5, 1e-5), (1.0, -2.88504, 2.77196, -0.88692))
+    np.testing.assert_allclose(run.column('y'), model.simulate(u), atol=1e-9)
+    assert run.has_truth
+
+
+def test_one_seed_gives_one_run_to_the_last_bit() -> None:
+    def rows(seed: int) -> np.ndarray:
+        p = paper_example(seed=seed, output_noise_std=1e-3, output_loss=0.1)
+        return build_closed_loop(p).run(200).rows
+
+    assert np.array_equal(rows(3), rows(3), equal_nan=True)
+    assert rows(3).shape != rows(4).shape or not np.array_equal(rows(3), rows(4), equal_nan=True)
+
+
+def test_every_sample_is_announced_and_every_loss_counted() -> None:
+    loop = build_closed_loop(paper_example())
+    loop.lose = every(10, burst=2)
+    announced: list[int] = []
+    run = loop.run(100, announced.append)
+    assert announced == list(range(100))
+    assert run.samples + run.lost_samples == 100
+    received = np.round(run.column('t') / 0.01).astype(int)
+    assert not set(received) & {k for k in range(1, 100) if k % 10 >= 8}
+
+
+def test_first_output_always_arrives() -> None:
+    loop = build_closed_loop(paper_example())
+    loop.lose = lambda: True
+    run = loop.run(50)
+    assert (run.samples, run.lost_samples) == (1, 49)

@@ -1,0 +1,221 @@
+"""One step of the controller: who sees what, in which order, and within which limits."""
+
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError, replace
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import signals
+
+from backlash_ros.core.controller import AdaptiveController, Limits
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimator import Bounds, Estimate, Interval
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.proportional import Proportional
+
+PAPER = Estimate(1.3, 3.0, -3.0, 0.22)
+
+
+class Notebook:
+    """An estimator that writes down what it is told; each update adds 0.1 to c_r."""
+
+    def __init__(self, estimate: Estimate = PAPER, learns: float = 0.0) -> None:
+        self.estimate = estimate
+        self.learns = learns
+        self.u_hat = 0.5
+        self.innovation = 0.25
+        self.x_hat = np.zeros(1)
+        self.x_cov = None
+        self.updates: list[tuple[float | None, Interval]] = []
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        self.updates.append((y, interval))
+        self.estimate = replace(self.estimate, c_r=self.estimate.c_r + self.learns)
+
+
+def controller(
+    estimator: Notebook, limits: Limits | None = None, inverse: BacklashInverse | None = None,
+) -> AdaptiveController:
+    return AdaptiveController(
+        estimator, Proportional(), inverse or BacklashInverse(), limits or Limits()
+    )
+
+
+def test_first_output_follows_from_nothing_that_is_known() -> None:
+    estimator = Notebook()
+    controller(estimator).step(7.0, 1.0, lost=3)
+    assert estimator.updates == []
+
+
+def test_output_is_paired_with_what_was_applied_before_it() -> None:
+    estimator = Notebook()
+    c = controller(estimator)
+    first = c.step(0.0, 1.0)
+    second = c.step(0.1, 2.0)
+    c.step(0.2, 3.0)
+    assert estimator.updates == [
+        (0.1, Interval(first.v, 1.0, first.u_d, 0.22)),
+        (0.2, Interval(second.v, 2.0, second.u_d, 0.22)),
+    ]
+
+
+def test_command_uses_the_estimate_that_the_same_output_has_improved() -> None:
+    c = controller(Notebook(replace(PAPER, f=0.0), learns=0.1))
+    c.step(0.0, 1.0)
+    step = c.step(0.1, 2.0)
+    assert step.estimate.c_r == pytest.approx(3.1)
+    assert step.v == pytest.approx(2.0 / 1.3 + 3.1)
+
+
+def test_step_reports_what_went_in_and_came_out() -> None:
+    step = controller(Notebook()).step(0.75, 2.0)
+    assert (step.y, step.y_m, step.u_hat, step.innovation) == (0.75, 2.0, 0.5, 0.25)
+    assert step.u_d == pytest.approx(2.0 + 0.22 * step.v)
+
+
+@given(losses=st.lists(st.integers(0, 5), min_size=2, max_size=20))
+def test_lost_samples_are_stepped_over_with_the_held_v(losses: list[int]) -> None:
+    estimator = Notebook()
+    c = controller(estimator)
+    expected: list[tuple[float | None, float]] = []
+    v = None
+    for k, lost in enumerate(losses):
+        if v is not None:
+            expected += [(None, v)] * lost + [(float(k), v)]
+        v = c.step(float(k), float(k), lost).v
+    assert [(y, interval.v) for y, interval in estimator.updates] == expected
+    assert c.lost_samples == sum(losses[1:])
+
+
+def test_control_that_was_really_applied_replaces_the_own_command() -> None:
+    estimator = Notebook()
+    c = controller(estimator)
+    c.step(0.0, 1.0)
+    c.step(0.1, 2.0, lost=1, applied=0.75)
+    assert [interval.v for _, interval in estimator.updates] == [0.75, 0.75]
+
+
+@given(signal=signals(), low=st.floats(-20.0, -1.0), high=st.floats(1.0, 20.0),
+       move=st.one_of(st.just(inf), st.floats(0.1, 10.0)))
+def test_limits_hold_and_the_estimator_is_told_the_limited_v(
+    signal: list[float], low: float, high: float, move: float,
+) -> None:
+    estimator = Notebook()
+    c = controller(estimator, Limits(low, high, move))
+    published = [0.0]
+    for y_m in signal:
+        v = c.step(0.0, y_m).v
+        assert low <= v <= high
+        assert abs(v - published[-1]) <= move + 1e-9
+        published.append(v)
+    assert [interval.v for _, interval in estimator.updates] == published[1:-1]
+
+
+@given(move=st.floats(0.1, 3.0), y_m=st.floats(-20.0, 20.0), f=st.sampled_from([0.0, 0.22]),
+       band=st.sampled_from([0.0, 0.5]))
+def test_rate_limit_delays_v_but_does_not_stop_it_on_its_way(
+    move: float, y_m: float, f: float, band: float,
+) -> None:
+    estimate = replace(PAPER, f=f)
+    target = controller(Notebook(estimate), inverse=BacklashInverse(band)).step(0.0, y_m).v
+    limited = controller(Notebook(estimate), Limits(move=move), BacklashInverse(band))
+    for _ in range(int(abs(target) / move) + 2):
+        v = limited.step(0.0, y_m).v
+    assert v == pytest.approx(target)
+
+
+@given(take_up=st.floats(0.1, 3.0), y_m=st.floats(-20.0, 20.0), f=st.sampled_from([0.0, 0.22]))
+def test_take_up_of_the_gap_ends_although_the_reference_rests(
+    take_up: float, y_m: float, f: float,
+) -> None:
+    estimate = replace(PAPER, f=f)
+    target = controller(Notebook(estimate)).step(0.0, y_m).v
+    gentle = controller(Notebook(estimate), inverse=BacklashInverse(take_up=take_up))
+    for _ in range(int(abs(target) / take_up) + 2):
+        v = gentle.step(0.0, y_m).v
+    assert v == pytest.approx(target)
+
+
+def test_saturated_v_comes_back_as_soon_as_the_command_allows() -> None:
+    c = controller(Notebook(replace(PAPER, f=0.0)), Limits(high=5.0))
+    assert c.step(0.0, 10.0).v == 5.0
+    assert c.step(0.0, 11.0).v == 5.0
+    assert c.step(0.0, 5.0).v == pytest.approx(5.0 / 1.3 - 3.0)
+
+
+@pytest.mark.parametrize('bad', [nan, inf, -inf])
+@pytest.mark.parametrize('name', ['y', 'y_m', 'applied'])
+def test_input_that_is_not_finite_is_refused_and_changes_nothing(name: str, bad: float) -> None:
+    estimator, untouched = Notebook(), Notebook()
+    disturbed, reference = controller(estimator), controller(untouched)
+    for c in (disturbed, reference):
+        c.step(0.0, 1.0)
+    values: dict[str, float] = {'y': 0.1, 'y_m': 2.0, 'applied': 1.0, name: bad}
+    with pytest.raises(ValueError, match='must be finite'):
+        disturbed.step(values['y'], values['y_m'], applied=values['applied'])
+    assert estimator.updates == []
+    assert disturbed.step(0.2, 3.0) == reference.step(0.2, 3.0)
+
+
+def test_negative_number_of_lost_samples_is_refused() -> None:
+    c = controller(Notebook())
+    c.step(0.0, 1.0)
+    with pytest.raises(ValueError, match='lost'):
+        c.step(0.1, 2.0, lost=-1)
+    assert c.lost_samples == 0
+
+
+@pytest.mark.parametrize('limits', [(1.0, 1.0), (2.0, 1.0), (nan, 1.0), (0.0, nan)])
+def test_limits_without_room_are_refused(limits: tuple[float, float]) -> None:
+    with pytest.raises(ParameterError):
+        Limits(*limits)
+
+
+@pytest.mark.parametrize(
+    ('intervals', 'name'),
+    [
+        (((0.0, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
+        (((1.0, 0.5), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
+        (((nan, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
+        (((0.5, 1.0), (-0.1, 1.0), (-1.0, 0.0)), 'estimator.bounds.c_r'),
+        (((0.5, 1.0), (0.0, 1.0), (-1.0, 0.1)), 'estimator.bounds.c_l'),
+        (((0.5, 1.0), (0.0, 1.0), (-1.0, nan)), 'estimator.bounds.c_l'),
+    ],
+)
+def test_invalid_bounds_are_refused_and_named(
+    intervals: tuple[tuple[float, float], ...], name: str,
+) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        Bounds(*intervals)
+    assert refusal.value.name == name
+
+
+@given(values=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
+def test_projection_is_the_nearest_point_within_the_bounds(
+    values: tuple[float, float, float],
+) -> None:
+    bounds = Bounds((0.5, 2.0), (0.0, 4.0), (-4.0, -1.0))
+    projected = bounds.project(*values)
+    for value, result, (low, high) in zip(
+        values, projected, (bounds.m, bounds.c_r, bounds.c_l), strict=True
+    ):
+        assert low <= result <= high
+        assert result == value or result == (low if value < low else high)
+    assert bounds.project(*projected) == projected
+
+
+@pytest.mark.parametrize(
+    ('record', 'field'),
+    [(PAPER, 'm'), (Interval(1.0, 2.0, 3.0, 0.2), 'v'), (Limits(), 'low'), (Bounds(), 'm'),
+     (controller(Notebook()).step(0.0, 1.0), 'v')],
+    ids=lambda x: type(x).__name__,
+)
+def test_records_cannot_be_changed_behind_the_back_of_their_reader(
+    record: object, field: str,
+) -> None:
+    with pytest.raises(FrozenInstanceError):
+        setattr(record, field, 1.0)

@@ -1,0 +1,183 @@
+"""u reconstructed from y alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.input_reconstruction import InputReconstruction
+from backlash_ros.core.transfer_function import TransferFunction
+
+Array = np.ndarray
+LAG = 30
+PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
+
+
+def play_output(samples: int = 400) -> Array:
+    """A sine with the flat tops that a backlash leaves, amplitude 10."""
+    return np.clip(14.0 * np.sin(0.126 * np.arange(samples)), -10.0, 10.0)
+
+
+def reconstructed(
+    reconstruction: InputReconstruction, y: Array, lost: tuple[int, ...] = (),
+) -> Array:
+    """u_hat, shifted so that element k belongs to u(k); nan where y is too short."""
+    lagged = [reconstruction.update(None if k in lost else float(y[k])) for k in range(len(y))]
+    result = np.full(len(y), np.nan)
+    result[: len(y) - reconstruction.lag] = lagged[reconstruction.lag:]
+    return result
+
+
+def error(model: TransferFunction, noise_std: float = 0.0, lag: int = LAG,
+          lost: tuple[int, ...] = (), samples: int = 400) -> Array:
+    """u_hat(k) - u(k) from k = 2 lag on, as long as y reaches."""
+    u = play_output(samples)
+    u_hat = reconstructed(InputReconstruction(model, noise_std, lag), model.simulate(u), lost)
+    return (u_hat - u)[2 * lag: samples - lag]
+
+
+@given(model=plants())
+def test_u_is_exact_after_the_lag_without_noise(model: TransferFunction) -> None:
+    assert np.abs(error(model)).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ('numerator', 'denominator'),
+    [
+        pytest.param(PAPER_NUMERATOR, PAPER_DENOMINATOR, id='paper, zero at -3.73'),
+        pytest.param([0.1], [1.0, -0.9], id='first order'),
+        pytest.param([0.01], [1.0, -1.0], id='integrator'),
+        pytest.param([0.1, 0.2], [1.0, -1.2, 0.35], id='zero at -2'),
+        pytest.param([0.1, -0.2], [1.0, -1.2, 0.35], id='zero at +2'),
+        pytest.param([0.02], [1.0, -1.5, 0.7, 0.0, 0.0], id='delay of four samples'),
+        pytest.param([5e-5, 5e-5], [1.0, -2.0, 1.0], id='double integrator, zero at -1'),
+        pytest.param([0.1, 0.1], [1.0, -1.7, 0.7], id='integrator and lag, zero at -1'),
+        pytest.param([1.0, 1.0], [1.0, -0.5, 0.1], id='fast poles, zero at -1'),
+        pytest.param([0.1, 0.0, 0.1], [1.0, -0.5, 0.1, 0.0], id='zeros at +i and -i'),
+        pytest.param([1.0], np.poly([0.9, 0.8, 0.5, 0.3, 0.1]).tolist(), id='fifth order'),
+    ],
+)
+def test_u_is_exact_for_typical_plants(numerator: list[float], denominator: list[float]) -> None:
+    # A double zero on the unit circle is seen through a small floor of noise.
+    assert np.abs(error(TransferFunction(numerator, denominator))).max() < 1e-2
+
+
+@pytest.mark.parametrize('unit', [1e-9, 1e-6, 1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize(
+    ('numerator', 'denominator', 'noise_std'),
+    [(PAPER_NUMERATOR, PAPER_DENOMINATOR, 0.0), (PAPER_NUMERATOR, PAPER_DENOMINATOR, 1e-5),
+     ([1.0], [1.0, -0.9, 0.1], 0.0)],
+)
+def test_unit_of_y_does_not_matter(
+    numerator: list[float], denominator: list[float], noise_std: float, unit: float,
+) -> None:
+    u = play_output()
+    original, scaled = (
+        (InputReconstruction(model, factor * noise_std, LAG), model.simulate(u))
+        for factor in (1.0, unit)
+        for model in [TransferFunction([factor * b for b in numerator], denominator)]
+    )
+    assert scaled[0].std == pytest.approx(original[0].std, rel=1e-2)
+    np.testing.assert_allclose(
+        reconstructed(*scaled)[: -LAG], reconstructed(*original)[: -LAG], atol=1e-3
+    )
+
+
+@given(model=plants(), lost=st.sets(st.integers(100, 140), max_size=10))
+def test_lost_samples_do_not_put_it_out_of_step(model: TransferFunction, lost: set[int]) -> None:
+    late = error(model, lost=tuple(lost), samples=600)[300:]
+    assert np.abs(late).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    'lost', [(100,), (100, 120, 140), (100, 101), (99, 101, 103)], ids=str,
+)
+def test_a_lost_sample_costs_hardly_any_accuracy(lost: tuple[int, ...]) -> None:
+    """y before and after it still determine u to well below 1 % of its amplitude of 10."""
+    u = 10.0 * np.sin(0.126 * np.arange(400))
+    u_hat = reconstructed(InputReconstruction(PAPER, 0.0, LAG), PAPER.simulate(u), lost)
+    assert np.abs(u_hat - u)[2 * LAG: -LAG].max() < 0.05
+
+
+@pytest.mark.parametrize('noise_std', [1e-4, 1e-3])
+def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: float) -> None:
+    """Against one batch solution over all samples, which knows no recursion."""
+    samples, lag = 200, 20
+    rng = np.random.default_rng(3)
+    y = PAPER.simulate(np.cumsum(rng.standard_normal(samples)))
+    y += noise_std * rng.standard_normal(samples)
+    impulse = PAPER.simulate(np.eye(1, samples)[0])
+    response = np.array([[impulse[i - j] if i >= j else 0.0 for j in range(samples)]
+                         for i in range(samples)])
+    walk = np.eye(samples) - np.eye(samples, k=-1)
+    batch, *_ = np.linalg.lstsq(
+        np.vstack([response / noise_std, walk]), np.append(y / noise_std, np.zeros(samples)),
+        rcond=None,
+    )
+    recursion = InputReconstruction(PAPER, noise_std, lag)
+    for value in y:
+        recursion.update(float(value))
+    assert recursion.u_hat == pytest.approx(batch[samples - 1 - lag], abs=1e-3)
+
+
+@pytest.mark.parametrize('noise_std', [1e-4, 1e-3])
+def test_std_is_the_spread_of_the_error_for_a_random_walk(noise_std: float) -> None:
+    rng = np.random.default_rng(4)
+    u = np.cumsum(rng.standard_normal(4000))
+    y = PAPER.simulate(u) + noise_std * rng.standard_normal(4000)
+    reconstruction = InputReconstruction(PAPER, noise_std, LAG)
+    spread = np.nanstd((reconstructed(reconstruction, y) - u)[200:])
+    assert reconstruction.std == pytest.approx(spread, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ('numerator', 'denominator'),
+    [
+        pytest.param([1.0, -1.0], [1.0, -0.5, 0.1], id='zero at 1'),
+        pytest.param([2.0, -2.0], [1.0, -1.3, 0.4], id='zero at 1, gain 2'),
+        pytest.param([1e-3, -1e-3], [1.0, -1.9, 0.9025], id='zero at 1, slow poles'),
+        pytest.param([1.0, -1.5, 0.5], [1.0, -0.5, 0.1, 0.02], id='zeros at 1 and 0.5'),
+        pytest.param([1.0, -3.0, 2.0], [1.0, -1.3, 0.4, 0.0], id='zeros at 1 and 2'),
+        pytest.param([1.0, 0.0, -1.0], [1.0, -0.5, 0.1, 0.02], id='zeros at 1 and -1'),
+        pytest.param([1.0, -2.0, 1.0], [1.0, -0.5, 0.1, 0.02], id='double zero at 1'),
+    ],
+)
+@pytest.mark.parametrize('noise_std', [0.0, 1e-4, 1e-2])
+def test_zero_at_one_is_refused(
+    numerator: list[float], denominator: list[float], noise_std: float,
+) -> None:
+    """A constant u leaves no trace in y then."""
+    with pytest.raises(ParameterError) as refusal:
+        InputReconstruction(TransferFunction(numerator, denominator), noise_std, LAG)
+    assert refusal.value.name == 'plant.numerator'
+
+
+def test_lag_shorter_than_the_delay_of_the_plant_is_refused() -> None:
+    """y(k) cannot tell u(k - 3) yet when it takes u five samples to reach y."""
+    model = TransferFunction([1.0], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    with pytest.raises(ParameterError) as refusal:
+        InputReconstruction(model, 0.0, 3)
+    assert refusal.value.name == 'estimator.lag'
+    InputReconstruction(model, 0.0, 5)
+
+
+def test_innovation_is_small_for_a_known_input_and_nan_for_a_lost_sample() -> None:
+    reconstruction = InputReconstruction(PAPER, 0.0, LAG)
+    for value in PAPER.simulate(np.full(300, 2.0)):
+        reconstruction.update(float(value))
+    assert reconstruction.innovation == pytest.approx(0.0, abs=1e-6)
+    reconstruction.update(None)
+    assert np.isnan(reconstruction.innovation)
+
+
+def test_it_is_ready_only_after_its_start_is_forgotten() -> None:
+    reconstruction = InputReconstruction(PAPER, 0.0, 5)
+    ready = []
+    for _ in range(12):
+        reconstruction.update(0.0)
+        ready.append(reconstruction.ready)
+    assert ready == [False] * 10 + [True] * 2

@@ -1,0 +1,159 @@
+"""Backlash inverse, equations (2.2) and (2.3)."""
+
+from __future__ import annotations
+
+from math import ceil, nan
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import Play, plays, signals, usual_plays
+
+from backlash_ros.core.backlash import Backlash, Region
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.inverse import BacklashInverse
+
+
+def as_printed(
+    u_d: float, u_d_before: float, v_before: float, m: float, c_r: float, c_l: float,
+) -> float:
+    """The three cases of (2.3), word for word."""
+    if u_d == u_d_before:
+        return v_before
+    if u_d < u_d_before:
+        return u_d / m + c_l
+    return u_d / m + c_r
+
+
+@given(play=plays(), signal=signals())
+def test_exact_inverse_cancels_a_backlash_at_rest_from_the_first_sample(
+    play: Play, signal: list[float],
+) -> None:
+    backlash, inverse = Backlash(play.m, play.c_r, play.c_l), BacklashInverse()
+    for u_d in signal:
+        v = inverse.step(u_d, play.m, play.c_r, play.c_l)
+        if inverse.side == Region.GAP:
+            continue  # u_d has not moved yet, and nothing drives the backlash
+        assert backlash.step(v) == pytest.approx(u_d, abs=play.rounding(u_d))
+
+
+@given(play=plays(), u=st.floats(-100.0, 100.0), signal=signals())
+def test_exact_inverse_cancels_any_backlash_after_the_first_engagement(
+    play: Play, u: float, signal: list[float],
+) -> None:
+    backlash, inverse = Backlash(play.m, play.c_r, play.c_l, u), BacklashInverse()
+    engaged = False
+    for u_d in signal:
+        u = backlash.step(inverse.step(u_d, play.m, play.c_r, play.c_l))
+        engaged = engaged or (inverse.side != Region.GAP and backlash.region == inverse.side)
+        if engaged:
+            assert u == pytest.approx(u_d, abs=play.rounding(u_d))
+
+
+@given(play=plays())
+def test_a_swing_wider_than_the_held_output_engages(play: Play) -> None:
+    backlash, inverse = Backlash(play.m, play.c_r, play.c_l, 5.0), BacklashInverse()
+    for u_d in (7.0, -7.0, 2.0):
+        u = backlash.step(inverse.step(u_d, play.m, play.c_r, play.c_l))
+    assert u == pytest.approx(2.0, abs=play.rounding(7.0))
+
+
+@given(samples=st.lists(st.tuples(plays(), st.floats(-100.0, 100.0)), min_size=1, max_size=40))
+def test_adaptive_inverse_equals_the_three_printed_cases(
+    samples: list[tuple[Play, float]],
+) -> None:
+    inverse = BacklashInverse()
+    u_d_before, v_before = 0.0, 0.0
+    for play, u_d in samples:
+        v = inverse.step(u_d, play.m, play.c_r, play.c_l)
+        assert v == as_printed(u_d, u_d_before, v_before, play.m, play.c_r, play.c_l)
+        u_d_before, v_before = u_d, v
+
+
+@given(play=usual_plays(), signal=signals())
+def test_asking_for_the_direction_changes_nothing(play: Play, signal: list[float]) -> None:
+    asked, untouched = BacklashInverse(1.0), BacklashInverse(1.0)
+    for u_d in signal:
+        asked.direction(-u_d)
+        assert asked.step(u_d, play.m, play.c_r, play.c_l) == untouched.step(
+            u_d, play.m, play.c_r, play.c_l
+        )
+
+
+@given(
+    play=usual_plays(), band=st.floats(0.1, 10.0), sign=st.sampled_from([1.0, -1.0]),
+    noise=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60), slope=st.floats(0.0, 1.0),
+)
+def test_noise_within_the_direction_band_never_turns_v(
+    play: Play, band: float, sign: float, noise: list[float], slope: float,
+) -> None:
+    inverse = BacklashInverse(direction_band=band)
+    v_before = inverse.step(sign * 2.0 * band, play.m, play.c_r, play.c_l)
+    for k, share in enumerate(noise):
+        u_d = sign * (2.0 * band + slope * k - 0.99 * share * band)
+        v = inverse.step(u_d, play.m, play.c_r, play.c_l)
+        assert inverse.side == sign
+        assert sign * (v - v_before) >= 0.0
+        v_before = v
+
+
+@given(
+    play=usual_plays(), band=st.floats(0.1, 10.0), sign=st.sampled_from([1.0, -1.0]),
+    peak=st.floats(11.0, 50.0),
+)
+def test_a_turn_beyond_the_direction_band_changes_the_line(
+    play: Play, band: float, sign: float, peak: float,
+) -> None:
+    inverse = BacklashInverse(direction_band=band)
+    far = play.c_l if sign > 0.0 else play.c_r
+    top = inverse.step(sign * peak, play.m, play.c_r, play.c_l)
+    assert inverse.step(sign * (peak - 0.9 * band), play.m, play.c_r, play.c_l) == top
+    u_d = sign * (peak - 1.1 * band)
+    assert inverse.step(u_d, play.m, play.c_r, play.c_l) == u_d / play.m + far
+    u_d -= sign * 0.01 * band  # going on is not a turn: the band does not delay it
+    assert inverse.step(u_d, play.m, play.c_r, play.c_l) == u_d / play.m + far
+
+
+@given(play=usual_plays(), take_up=st.floats(0.1, 10.0), u_d=st.floats(0.5, 50.0))
+def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(
+    play: Play, take_up: float, u_d: float,
+) -> None:
+    inverse = BacklashInverse(take_up=take_up)
+    backlash = Backlash(play.m, play.c_r, play.c_l)
+    v_before = 0.0
+    for target in (u_d, -u_d, u_d):
+        line = play.c_r if target > 0.0 else play.c_l
+        # The signal stays on its value while v crosses: taking up must go on by itself.
+        for _ in range(ceil(abs(target / play.m + line - v_before) / take_up) + 1):
+            v_last, v = inverse.v, inverse.step(target, play.m, play.c_r, play.c_l)
+            assert abs(v - v_last) <= take_up * (1.0 + 1e-9)
+            u = backlash.step(v)
+        assert v == target / play.m + line
+        assert u == pytest.approx(target, abs=play.rounding(target))
+        v_before = v
+
+
+@given(play=usual_plays(), u_d=st.floats(0.5, 50.0), growth=st.floats(1.01, 5.0))
+def test_take_up_does_not_slow_v_once_the_gap_is_crossed(
+    play: Play, u_d: float, growth: float,
+) -> None:
+    inverse = BacklashInverse(take_up=0.1)
+    while inverse.step(u_d, play.m, play.c_r, play.c_l) != u_d / play.m + play.c_r:
+        pass
+    onward = growth * u_d
+    assert inverse.step(onward, play.m, play.c_r, play.c_l) == onward / play.m + play.c_r
+
+
+@pytest.mark.parametrize(
+    ('options', 'name'),
+    [
+        ({'direction_band': -1.0}, 'inverse.direction_band'),
+        ({'direction_band': nan}, 'inverse.direction_band'),
+        ({'take_up': 0.0}, 'inverse.take_up_rate'),
+        ({'take_up': nan}, 'inverse.take_up_rate'),
+    ],
+)
+def test_invalid_options_are_refused_and_named(options: dict[str, float], name: str) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        BacklashInverse(**options)
+    assert refusal.value.name == name

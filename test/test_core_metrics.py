@@ -1,0 +1,94 @@
+"""Figures of merit, on runs whose figures are known."""
+
+from __future__ import annotations
+
+from math import exp, nan, sqrt
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.metrics import control_error_rms, settling_time, tracking_error_rms
+from backlash_ros.core.run_record import COLUMNS, RunRecord
+
+T = np.arange(1000) * 0.01
+ONES = np.ones(1000)
+
+
+def run(samples: int = 1000, **signals: object) -> RunRecord:
+    rows = np.full((samples, len(COLUMNS)), nan)
+    rows[:, COLUMNS.index('t')] = T[:samples]
+    for name, values in signals.items():
+        rows[:, COLUMNS.index(name)] = values
+    return RunRecord(rows, 0.01)
+
+
+def test_settling_time_of_an_exponential_is_when_it_reaches_one_percent() -> None:
+    estimate = 3.0 * (1.0 + np.exp(-T))
+    assert exp(-4.61) < 0.01 < exp(-4.60)
+    assert settling_time(T, estimate, 3.0 * ONES) == pytest.approx(4.61)
+    assert settling_time(T, -estimate, -3.0 * ONES) == pytest.approx(4.61)
+
+
+def test_settling_time_counts_from_the_last_excursion() -> None:
+    estimate = ONES.copy()
+    estimate[700] = 1.02
+    assert settling_time(T, estimate, ONES) == pytest.approx(7.01)
+
+
+def test_settling_time_follows_a_truth_that_moves() -> None:
+    truth = 1.0 + 0.1 * T
+    assert settling_time(T, 1.009 * truth, truth) == 0.0
+    assert settling_time(T, ONES, truth) is None
+
+
+def test_estimate_that_ends_outside_never_settles() -> None:
+    estimate = ONES.copy()
+    estimate[-1] = 1.02
+    assert settling_time(T, estimate, ONES) is None
+
+
+def test_estimate_that_is_not_a_number_is_not_settled() -> None:
+    assert settling_time(T, nan * ONES, ONES) is None
+    partly = ONES.copy()
+    partly[:300] = nan
+    assert settling_time(T, partly, ONES) == pytest.approx(3.0)
+
+
+def test_control_error_is_taken_over_the_last_second() -> None:
+    u = np.where(T > 8.995, 2.0, 50.0)
+    assert control_error_rms(run(u=u, u_d=0.0)) == pytest.approx(2.0)
+
+
+def test_control_error_of_a_sine_is_its_amplitude_over_root_two() -> None:
+    u_d = np.cos(T)
+    u = u_d + 3.0 * np.sin(2.0 * np.pi * 5.0 * T)
+    assert control_error_rms(run(u=u, u_d=u_d)) == pytest.approx(3.0 / sqrt(2.0), rel=1e-2)
+
+
+def test_control_error_without_the_true_u_is_none() -> None:
+    assert control_error_rms(run(u_d=1.0)) is None
+
+
+def test_tracking_error_is_relative_and_taken_over_the_last_half() -> None:
+    y_m = 10.0 * np.sin(12.6 * T)
+    y = np.where(T < 5.0, 99.0, 1.03 * y_m)
+    assert tracking_error_rms(run(y=y, y_m=y_m)) == pytest.approx(0.03)
+
+
+def test_tracking_error_against_a_reference_at_zero_is_none() -> None:
+    assert tracking_error_rms(run(y=1.0, y_m=0.0)) is None
+
+
+def test_run_without_samples_has_no_figures() -> None:
+    nothing = run(samples=0)
+    assert nothing.samples == 0
+    assert not nothing.has_truth
+    assert control_error_rms(nothing) is None
+    assert tracking_error_rms(nothing) is None
+    assert settling_time(T[:0], ONES[:0], ONES[:0]) is None
+
+
+def test_truth_is_known_only_if_it_is_known_throughout() -> None:
+    assert run(true_m=1.3).has_truth
+    assert not run().has_truth
+    assert not run(true_m=np.where(T < 1.0, nan, 1.3)).has_truth

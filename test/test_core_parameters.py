@@ -1,0 +1,260 @@
+"""The parameter table and the check of values against it."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter
+from backlash_ros.core.parameters import Parameters, check_value
+
+NUMBERS = [p for p in PARAMETERS if isinstance(p.default, (int, float))
+           and not isinstance(p.default, bool)]
+LISTS = [p for p in PARAMETERS if isinstance(p.default, tuple)]
+REALS = [p for p in NUMBERS if isinstance(p.default, float)]
+WHOLE = [p for p in NUMBERS if isinstance(p.default, int)]
+
+
+def named(parameters: list[Parameter]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize('parameter', parameters, ids=lambda p: p.name)
+
+
+def refusal_of(name: str, value: object) -> str:
+    """The message, which must be one line that names parameter and value."""
+    with pytest.raises(ParameterError) as refusal:
+        Parameters({name: value})
+    message = str(refusal.value)
+    assert refusal.value.name == name
+    assert message.startswith(f'{name}=')
+    assert '\n' not in message
+    return message
+
+
+def something_valid(parameter: Parameter) -> float:
+    """A value of the parameter, or of an element of it, well inside its bounds."""
+    if parameter.low > -inf:
+        return min(parameter.low + 1.0, 0.5 * (parameter.low + parameter.high))
+    return parameter.high - 1.0 if parameter.high < inf else 1.0
+
+
+def build_everything(values: dict[str, object]) -> None:
+    p = Parameters(values)
+    build_reference(p)
+    build_plant(p)
+    build_controller(p)
+
+
+@named(list(PARAMETERS))
+def test_default_obeys_its_own_rules(parameter: Parameter) -> None:
+    value = check_value(parameter, parameter.default)
+    assert value == parameter.default
+    assert type(value) is type(parameter.default)
+
+
+def test_names_are_unique() -> None:
+    assert len(BY_NAME) == len(PARAMETERS)
+
+
+@pytest.mark.parametrize(
+    ('misspelt', 'meant'),
+    [
+        ('plant.numerater', 'plant.numerator'), ('estimator.intial.m', 'estimator.initial.m'),
+        ('backlash.cr', 'backlash.c_r'), ('sample_periode', 'sample_period'),
+        ('Structure', 'structure'), ('estimator.bound.c_l', 'estimator.bounds.c_l'),
+    ],
+)
+def test_unknown_name_is_refused_with_the_nearest_valid_one(misspelt: str, meant: str) -> None:
+    assert f'did you mean {meant}?' in refusal_of(misspelt, 1.0)
+
+
+@given(name=st.text(max_size=30).filter(lambda name: name not in BY_NAME))
+def test_any_unknown_name_is_refused_with_a_valid_one(name: str) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        Parameters({name: 1.0})
+    assert str(refusal.value).rsplit('did you mean ', 1)[1].rstrip('?') in BY_NAME
+
+
+@given(parameter=st.sampled_from(PARAMETERS), data=st.data())
+def test_name_with_a_letter_missing_is_refused(parameter: Parameter, data: st.DataObject) -> None:
+    cut = data.draw(st.integers(0, len(parameter.name) - 1))
+    misspelt = parameter.name[:cut] + parameter.name[cut + 1:]
+    if misspelt not in BY_NAME:
+        assert 'did you mean ' in refusal_of(misspelt, parameter.default)
+
+
+@named([p for p in NUMBERS + LISTS if p.low > -inf])
+def test_value_below_its_bound_is_refused(parameter: Parameter) -> None:
+    for value in (parameter.low - 1.0, parameter.low - 1e9):
+        count = len(parameter.default) if isinstance(parameter.default, tuple) else 0
+        message = refusal_of(parameter.name, [value] * count if count else value)
+        assert f'must be {">" if parameter.above else ">="} {parameter.low:g}' in message
+
+
+@named([p for p in NUMBERS + LISTS if p.high < inf])
+def test_value_above_its_bound_is_refused(parameter: Parameter) -> None:
+    count = len(parameter.default) if isinstance(parameter.default, tuple) else 0
+    value = parameter.high + 1.0
+    message = refusal_of(parameter.name, [value] * count if count else value)
+    assert f'must be <= {parameter.high:g}' in message
+
+
+@named([p for p in NUMBERS if p.low > -inf])
+def test_the_bound_itself_is_allowed_unless_excluded(parameter: Parameter) -> None:
+    if parameter.above:
+        refusal_of(parameter.name, parameter.low)
+    else:
+        assert Parameters({parameter.name: parameter.low})[parameter.name] == parameter.low
+
+
+@named(NUMBERS)
+def test_nan_is_never_a_value(parameter: Parameter) -> None:
+    assert 'must be finite' in refusal_of(parameter.name, nan)
+    assert 'must be finite' in refusal_of(parameter.name, 'nan')
+
+
+@named([p for p in NUMBERS if not p.infinite])
+def test_infinity_is_refused_where_it_has_no_meaning(parameter: Parameter) -> None:
+    for value in (inf, -inf, 'inf'):
+        assert 'must be' in refusal_of(parameter.name, value)
+
+
+@named([p for p in NUMBERS if p.infinite])
+def test_infinity_means_no_limit_where_it_is_allowed(parameter: Parameter) -> None:
+    value = parameter.default
+    assert value in (inf, -inf)
+    assert Parameters({parameter.name: value})[parameter.name] == value
+    assert Parameters({parameter.name: str(value)})[parameter.name] == value
+
+
+@named(REALS)
+def test_whole_number_is_taken_as_a_float(parameter: Parameter) -> None:
+    low = parameter.low + 0.5 * parameter.above
+    whole = next(i for i in (1, -1, 0) if low <= i <= parameter.high)
+    value = Parameters({parameter.name: whole})[parameter.name]
+    assert type(value) is float
+    assert value == whole
+
+
+@named(WHOLE)
+def test_float_without_fraction_is_taken_as_a_whole_number(parameter: Parameter) -> None:
+    value = Parameters({parameter.name: 3.0})[parameter.name]
+    assert type(value) is int
+    assert value == 3
+    assert 'must be a whole number' in refusal_of(parameter.name, 3.5)
+
+
+@named([p for p in WHOLE if p.high == inf])
+def test_large_whole_number_keeps_its_last_digit(parameter: Parameter) -> None:
+    large = 2**53 + 1
+    assert Parameters({parameter.name: large})[parameter.name] == large
+
+
+@pytest.mark.parametrize('name', ['seed', 'bias', 'control.max'])
+def test_number_too_large_for_a_float_is_refused(name: str) -> None:
+    refusal_of(name, 10**400)
+
+
+@named(NUMBERS)
+@pytest.mark.parametrize('value', [True, None, [1.0], 'ten', '', {}], ids=repr)
+def test_what_is_no_number_is_refused(parameter: Parameter, value: object) -> None:
+    assert 'must be a number' in refusal_of(parameter.name, value)
+
+
+def test_yaml_text_without_a_point_is_a_number() -> None:
+    p = Parameters({'plant.numerator': ['1e-5', '4e-5', 1e-5], 'lms.step': '5e-1', 'seed': '7'})
+    assert p.reals('plant.numerator') == (1e-5, 4e-5, 1e-5)
+    assert p.real('lms.step') == 0.5
+    assert p.integer('seed') == 7
+
+
+@pytest.mark.parametrize(
+    'value', [[1, 2], (1.0, 2.0), '[1, 2]', '1,2', ' [1e0, 2e0] ', ['1', 2]], ids=repr,
+)
+def test_list_is_taken_as_a_list_or_as_text(value: object) -> None:
+    assert Parameters({'plant.numerator': value})['plant.numerator'] == (1.0, 2.0)
+
+
+@named(LISTS)
+@pytest.mark.parametrize('value', [3.0, True, None, [], [True], ['x'], 'x', [nan], [[1.0]]],
+                         ids=repr)
+def test_what_is_no_list_of_numbers_is_refused(parameter: Parameter, value: object) -> None:
+    refusal_of(parameter.name, value)
+
+
+@named([p for p in LISTS if p.length is not None])
+def test_list_of_another_length_is_refused(parameter: Parameter) -> None:
+    assert parameter.length is not None
+    for count in (parameter.length - 1, parameter.length + 1):
+        message = refusal_of(parameter.name, [something_valid(parameter)] * count)
+        assert f'must have {parameter.length} numbers' in message
+
+
+@named([p for p in PARAMETERS if p.choices])
+def test_word_outside_the_choices_is_refused_and_they_are_listed(parameter: Parameter) -> None:
+    assert ', '.join(parameter.choices) in refusal_of(parameter.name, 'no such word')
+    for word in parameter.choices:
+        assert Parameters({parameter.name: word})[parameter.name] == word
+
+
+@named([p for p in PARAMETERS if isinstance(p.default, str)])
+def test_word_must_be_a_text(parameter: Parameter) -> None:
+    assert 'must be a text' in refusal_of(parameter.name, 1.0)
+
+
+@named([p for p in PARAMETERS if isinstance(p.default, bool)])
+def test_flag_is_true_or_false(parameter: Parameter) -> None:
+    for given_value, flag in ((True, True), ('False', False), ('true', True)):
+        assert Parameters({parameter.name: given_value}).flag(parameter.name) is flag
+    for value in (1, 0.0, 'yes', None):
+        assert 'must be true or false' in refusal_of(parameter.name, value)
+
+
+def test_message_names_parameter_value_rule_and_unit() -> None:
+    with pytest.raises(ParameterError) as refusal:
+        Parameters({'sample_period': -0.01})
+    assert str(refusal.value) == 'sample_period=-0.01 must be > 0 s'
+
+
+@pytest.mark.parametrize(
+    ('changes', 'name'),
+    [
+        ({'control.min': 2.0, 'control.max': 1.0}, 'control.min'),
+        ({'control.min': 2.0, 'control.max': 2.0}, 'control.min'),
+        ({'estimator.bounds.m': [2.0, 1.0]}, 'estimator.bounds.m'),
+        ({'estimator.bounds.c_r': [2.0, 2.0]}, 'estimator.bounds.c_r'),
+        ({'estimator.bounds.c_l': [-1.0, -2.0]}, 'estimator.bounds.c_l'),
+        ({'proportional.bounds': [0.5, -0.5]}, 'proportional.bounds'),
+        ({'estimator.initial.m': 3.0, 'estimator.bounds.m': [0.1, 2.0]}, 'estimator.initial.m'),
+        ({'estimator.initial.c_r': 6.0, 'estimator.bounds.c_r': [0.0, 5.0]},
+         'estimator.initial.c_r'),
+        ({'estimator.initial.c_l': -0.1, 'estimator.bounds.c_l': [-5.0, -0.5]},
+         'estimator.initial.c_l'),
+        ({'backlash.c_r': -4.0}, 'backlash.c_l'),
+        ({'plant.numerator': [1.0] * 4}, 'plant.numerator'),
+        ({'plant.denominator': [0.0, 1.0]}, 'plant.denominator'),
+        ({'waveform': 'file'}, 'file'),
+    ],
+)
+@pytest.mark.parametrize('law', ['lms', 'printed'])
+def test_values_that_contradict_each_other_are_refused_before_anything_runs(
+    changes: dict[str, object], name: str, law: str,
+) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        build_everything({'estimator.law': law, **changes})
+    assert refusal.value.name == name
+
+
+def test_set_of_parameters_is_complete_and_keeps_what_is_not_changed() -> None:
+    p = Parameters({'lms.step': 0.5})
+    assert len(p) == len(PARAMETERS)
+    assert set(p) == set(BY_NAME)
+    changed = p.replaced({'seed': 9})
+    assert (changed.real('lms.step'), changed.integer('seed')) == (0.5, 9)
+    assert p.integer('seed') == BY_NAME['seed'].default
+    with pytest.raises(ParameterError, match='did you mean seed'):
+        p.replaced({'sed': 9})

@@ -1,0 +1,183 @@
+"""The printed law (3.11) and what follows from it."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from math import isfinite, isnan
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from strategies import KnownInput, Play, eighths, usual_plays
+
+from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.printed_law import PrintedLaw, printed_c, printed_f, printed_m
+from backlash_ros.core.proportional import Proportional
+from backlash_ros.core.reference_signal import ReferenceSignal
+from backlash_ros.core.structure import Command, Situation
+
+WIDE = Bounds((1e-9, 1e9), (0.0, 1e9), (-1e9, 0.0))
+WIDE_F = (-1e9, 1e9)
+START = Estimate(0.696, 0.5, -0.5, 0.22)
+SMALL = eighths(-80, 80)
+
+
+def law(initial: Estimate = START, bounds: Bounds = WIDE,
+        f_bounds: tuple[float, float] = WIDE_F) -> PrintedLaw:
+    return PrintedLaw(initial, bounds, f_bounds, KnownInput())  # type: ignore[arg-type]
+
+
+def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
+    return Proportional().control(Situation(y_m, 0.0, estimate, np.zeros(1)), inverse)
+
+
+def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:
+    estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0, f=estimator.estimate.f))
+    return estimator.estimate
+
+
+@given(u=SMALL, y_m=SMALL, m=eighths(1, 80), w=SMALL)
+def test_printed_f_reduces_to_the_solution_of_e_equal_0(
+    u: float, y_m: float, m: float, w: float,
+) -> None:
+    assume(y_m + m * w != 0.0 and u + m * w != 0.0)
+    reduced = Fraction(m) * (Fraction(u) - Fraction(y_m)) / (Fraction(u) + Fraction(m * w))
+    assert printed_f(u, y_m, m, w) == float(reduced)
+
+
+@given(u=SMALL, y_m=SMALL, f=eighths(-80, 80), w=SMALL)
+def test_printed_m_reduces_to_the_solution_of_e_equal_0(
+    u: float, y_m: float, f: float, w: float,
+) -> None:
+    assume(f != 0.0 and y_m + f * w != 0.0 and u - y_m - f * w != 0.0)
+    assert printed_m(u, y_m, f, w) == float(Fraction(u) * Fraction(f) / Fraction(u - y_m - f * w))
+
+
+@given(u=SMALL, y_m=SMALL, f=eighths(-80, 80), m=eighths(1, 80))
+def test_printed_c_reduces_to_the_solution_of_e_equal_0(
+    u: float, y_m: float, f: float, m: float,
+) -> None:
+    assume(f != 0.0)
+    reduced = (Fraction(u) - Fraction(y_m)) / Fraction(f) - Fraction(u) / Fraction(m)
+    assert printed_c(u, y_m, f, m) == float(reduced)
+
+
+@given(u=SMALL, y_m=SMALL, m=eighths(1, 80), w=SMALL, f=eighths(1, 80))
+def test_each_quotient_makes_the_control_error_zero(
+    u: float, y_m: float, m: float, w: float, f: float,
+) -> None:
+    for new_f, new_m, new_w in (
+        (printed_f(u, y_m, m, w), m, w), (f, printed_m(u, y_m, f, w), w),
+        (f, m, printed_c(u, y_m, f, m)),
+    ):
+        if isfinite(new_f) and isfinite(new_m) and isfinite(new_w):
+            terms = (u * new_m, u * new_f, new_m * y_m, new_m * new_f * new_w)
+            e = terms[0] - terms[1] - terms[2] - terms[3]
+            assert e == pytest.approx(0.0, abs=1e-12 * (1.0 + max(map(abs, terms))))
+
+
+@given(y_m=SMALL, m=eighths(1, 80), w=SMALL)
+def test_f_of_zero_divides_by_zero(y_m: float, m: float, w: float) -> None:
+    assert isnan(printed_m(1.0, y_m, 0.0, w))
+    assert isnan(printed_c(1.0, y_m, 0.0, m))
+
+
+def test_u_of_zero_gives_a_slope_of_zero() -> None:
+    assert printed_m(0.0, 2.0, 0.22, 0.5) == 0.0
+
+
+def test_zero_denominator_of_f_is_not_a_number() -> None:
+    assert isnan(printed_f(-1.0, 2.0, 2.0, 0.5))
+
+
+def test_unguarded_law_is_not_finite_by_the_second_sample_of_the_papers_example() -> None:
+    reference = ReferenceSignal('sine', 10.0, 12.6)
+    plant, inverse = Backlash(1.3, 3.0, -3.0), BacklashInverse()
+    estimate = START
+    finite = []
+    for k in range(2):
+        y_m = reference(k * 0.01)
+        u = plant.step(control(y_m, estimate, inverse).v)
+        w = estimate.c_r
+        f = printed_f(u, y_m, estimate.m, w)
+        m = printed_m(u, y_m, f, w)
+        c = printed_c(u, y_m, f, m)
+        finite.append(all(map(isfinite, (f, m, c))))
+        estimate = Estimate(m, c, estimate.c_l, f)
+    assert not all(finite)
+
+
+@given(data=st.lists(st.tuples(st.floats(-20.0, 20.0), st.floats(-20.0, 20.0)), max_size=40))
+def test_guarded_law_stays_finite_and_within_its_bounds(data: list[tuple[float, float]]) -> None:
+    bounds = Bounds()
+    estimator = law(bounds=bounds, f_bounds=(-0.5, 0.5))
+    for u, y_m in [(0.0, 0.0), *data]:
+        e = feed(estimator, u, y_m)
+        assert bounds.m[0] <= e.m <= bounds.m[1]
+        assert bounds.c_r[0] <= e.c_r <= bounds.c_r[1]
+        assert bounds.c_l[0] <= e.c_l <= bounds.c_l[1]
+        assert -0.5 <= e.f <= 0.5
+        assert e.status == Status.TRACKING
+    # The paper's first sample, u = y_m = 0, leads to 0/0 in m and c.
+    assert estimator.skipped >= 1
+
+
+@given(play=usual_plays(), u=st.floats(0.5, 20.0), y_m=st.floats(-20.0, 20.0))
+def test_after_f_the_other_three_do_not_move(play: Play, u: float, y_m: float) -> None:
+    """One equation, four unknowns: f alone makes e = 0 (consequence 1)."""
+    f = play.m * (u - y_m) / (u + play.m * play.c_r)
+    assume(abs(f) > 1e-3 and abs(y_m + f * play.c_r) > 1e-3)
+    assume(abs(y_m + play.m * play.c_r) > 1e-3)
+    old = Estimate(play.m, play.c_r, play.c_l, 0.22)
+    new = feed(law(old), u, y_m)
+    assert new.f == pytest.approx(f, rel=1e-6)
+    assert new.m == pytest.approx(old.m, rel=1e-5)
+    assert new.c_r == pytest.approx(old.c_r, rel=1e-5, abs=1e-5)
+    assert new.c_l == old.c_l
+
+
+@given(
+    play=usual_plays(), share=st.floats(0.1, 0.7), size=st.floats(1e-6, 1e-3),
+    sign=st.sampled_from([-1.0, 1.0]),
+)
+def test_law_for_c_multiplies_the_error_by_m_over_f(
+    play: Play, share: float, size: float, sign: float,
+) -> None:
+    """In the loop u depends on the estimate, which the law overlooks (consequence 3)."""
+    f = share * play.m
+    plant, inverse = Backlash(play.m, play.c_r, play.c_l), BacklashInverse()
+    c_r, y_m, errors = play.c_r + sign * size * play.c_r, 0.0, []
+    for _ in range(2):
+        y_m += 10.0 * (1.0 + play.m * play.gap)  # rises fast enough to stay on the right line
+        command = control(y_m, Estimate(play.m, c_r, play.c_l, f), inverse)
+        u = plant.step(command.v)
+        errors.append(u - command.u_d)
+        c_r = printed_c(u, y_m, f, play.m)
+    assert errors[1] / errors[0] == pytest.approx(play.m / f, rel=1e-3)
+
+
+def test_rising_u_moves_c_r_only_and_falling_u_moves_c_l_only() -> None:
+    """f and m at their bounds leave the rest of e to the crossing of the active side."""
+    narrow = Bounds((0.69, 0.7), (0.0, 50.0), (-50.0, 0.0))
+    estimator = law(bounds=narrow, f_bounds=(0.2, 0.3))
+    first = feed(estimator, 5.0, 3.0)
+    assert (first.c_r != START.c_r, first.c_l) == (True, START.c_l)
+    second = feed(estimator, 4.0, 6.0)
+    assert (second.c_r, second.c_l != first.c_l) == (first.c_r, True)
+
+
+def test_in_the_gap_the_side_of_before_stays() -> None:
+    narrow = Bounds((0.69, 0.7), (0.0, 50.0), (-50.0, 0.0))
+    estimator = law(bounds=narrow, f_bounds=(0.2, 0.3))
+    for y_m in (3.0, 3.5, 3.8):
+        assert feed(estimator, 5.0, y_m).c_l == START.c_l
+
+
+def test_equal_crossings_do_not_confuse_the_side() -> None:
+    narrow = Bounds((0.69, 0.7), (0.0, 50.0), (-50.0, 0.0))
+    estimator = law(Estimate(0.696, 0.0, 0.0, 0.22), narrow, (0.2, 0.3))
+    assert feed(estimator, -5.0, 3.0).c_r == 0.0
+    assert estimator.estimate.c_l < 0.0

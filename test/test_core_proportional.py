@@ -1,0 +1,147 @@
+"""Structure (3.2) with its algebraic loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import isfinite
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import Play, signals, usual_plays
+
+from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.proportional import LARGEST_F_OVER_M, Proportional
+from backlash_ros.core.structure import Command, Situation
+
+LARGEST_SHARE = 0.8  # of m that f may have
+
+
+def estimate_of(play: Play, f_over_m: float) -> Estimate:
+    return Estimate(play.m, play.c_r, play.c_l, f_over_m * play.m)
+
+
+def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
+    """The structure looks at the reference and the estimate alone."""
+    return Proportional().control(Situation(y_m, 0.0, estimate, np.zeros(1)), inverse)
+
+
+def tolerance(play: Play, y_m: float, u_d: float) -> float:
+    return 10.0 * (play.rounding(u_d) + 1e-12 * abs(y_m))
+
+
+@given(
+    samples=st.lists(
+        st.tuples(usual_plays(), st.floats(-0.8, LARGEST_SHARE), st.floats(-100.0, 100.0)),
+        min_size=1, max_size=40,
+    ),
+)
+def test_u_d_equals_y_m_plus_f_v_for_any_estimate_and_signal(
+    samples: list[tuple[Play, float, float]],
+) -> None:
+    inverse = BacklashInverse()
+    for play, share, y_m in samples:
+        command = control(y_m, estimate_of(play, share), inverse)
+        assert command.f == pytest.approx(share * play.m)
+        assert command.u_d == pytest.approx(
+            y_m + command.f * command.v, abs=tolerance(play, y_m, command.u_d)
+        )
+        assert command.v == inverse.v
+
+
+@given(
+    samples=st.lists(
+        st.tuples(usual_plays(), st.floats(0.0, LARGEST_SHARE), st.floats(-100.0, 100.0)),
+        min_size=1, max_size=40,
+    ),
+)
+def test_v_satisfies_the_printed_inverse_at_the_same_time(
+    samples: list[tuple[Play, float, float]],
+) -> None:
+    inverse = BacklashInverse()
+    u_d_before, v_before = 0.0, 0.0
+    for play, share, y_m in samples:
+        command = control(y_m, estimate_of(play, share), inverse)
+        slack = tolerance(play, y_m, command.u_d)
+        on_right = command.u_d / play.m + play.c_r
+        on_left = command.u_d / play.m + play.c_l
+        fits_printed = (
+            (command.u_d > u_d_before - slack and abs(command.v - on_right) <= slack / play.m)
+            or (command.u_d < u_d_before + slack and abs(command.v - on_left) <= slack / play.m)
+            or (abs(command.u_d - u_d_before) <= slack and command.v == v_before)
+        )
+        assert fits_printed
+        u_d_before, v_before = command.u_d, command.v
+
+
+@given(play=usual_plays(), share=st.floats(0.0, LARGEST_SHARE), signal=signals())
+def test_of_two_branches_that_agree_the_smaller_move_is_taken(
+    play: Play, share: float, signal: list[float],
+) -> None:
+    inverse = BacklashInverse()
+    estimate = estimate_of(play, share)
+    u_d_before, v_before = 0.0, 0.0
+    for y_m in signal:
+        command = control(y_m, estimate, inverse)
+        for c, sign in ((play.c_r, 1.0), (play.c_l, -1.0)):
+            solution = play.m * (y_m + estimate.f * c) / (play.m - estimate.f)
+            if sign * (solution - u_d_before) > 0.0:
+                other = abs(solution / play.m + c - v_before)
+                slack = tolerance(play, y_m, solution) / play.m
+                assert abs(command.v - v_before) <= other + slack
+        u_d_before, v_before = command.u_d, command.v
+
+
+def test_both_branches_agree_and_the_near_one_wins() -> None:
+    """Up to y_m = 5 the shaft rests on the right; at 4.9 both directions would solve the loop."""
+    inverse, estimate = BacklashInverse(), Estimate(1.3, 3.0, -3.0, 0.22)
+    at_five = control(5.0, estimate, inverse)
+    onward = control(5.1, estimate, inverse)
+    assert 0.0 < onward.v - at_five.v < 0.2
+
+
+@given(
+    play=usual_plays(), share=st.floats(-0.8, LARGEST_SHARE), y_m=st.floats(-100.0, 100.0),
+    band=st.sampled_from([0.0, 0.5]),
+)
+def test_a_constant_reference_holds_v(play: Play, share: float, y_m: float, band: float) -> None:
+    """Holding is a solution of (3.2) and (2.3) as well, and the smallest move of all."""
+    inverse = BacklashInverse(direction_band=band)
+    estimate = estimate_of(play, share)
+    first = control(y_m, estimate, inverse)
+    for _ in range(5):
+        again = control(y_m, estimate, inverse)
+        assert again.v == pytest.approx(first.v, abs=tolerance(play, y_m, first.u_d))
+
+
+@given(play=usual_plays(), y_m=st.floats(-100.0, 100.0),
+       share=st.one_of(st.just(1.0), st.floats(0.99, 1.01), st.floats(0.8, 100.0)))
+def test_f_near_or_beyond_m_is_limited(play: Play, y_m: float, share: float) -> None:
+    command = control(y_m, estimate_of(play, share), BacklashInverse())
+    assert command.f == pytest.approx(LARGEST_SHARE * play.m)
+    assert isfinite(command.u_d)
+    assert command.u_d == pytest.approx(
+        y_m + command.f * command.v, abs=tolerance(play, y_m, command.u_d)
+    )
+    assert LARGEST_F_OVER_M == LARGEST_SHARE
+
+
+@given(play=usual_plays(), share=st.floats(-0.8, -0.1), y_m=st.floats(1.0, 100.0))
+def test_v_is_held_where_no_branch_agrees(play: Play, share: float, y_m: float) -> None:
+    """With f < 0 the two solutions lie the other way round and leave a range between them."""
+    inverse, estimate = BacklashInverse(), estimate_of(play, share)
+    top = control(1000.0, estimate, inverse)
+    right_less_left = play.m * estimate.f * play.gap / (play.m - estimate.f)
+    little_less = 1000.0 + 0.5 * right_less_left * (play.m - estimate.f) / play.m
+    held = control(little_less, estimate, inverse)
+    assert held.v == top.v
+    assert held.u_d == pytest.approx(little_less + held.f * held.v)
+
+
+def test_without_feedback_u_d_is_the_reference() -> None:
+    estimate = replace(Estimate(1.3, 3.0, -3.0, 0.22), f=0.0)
+    inverse = BacklashInverse()
+    for y_m in (1.0, 2.0, -4.0, -4.0):
+        assert control(y_m, estimate, inverse).u_d == pytest.approx(y_m)

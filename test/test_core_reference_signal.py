@@ -1,0 +1,109 @@
+"""Reference signals y_m(t)."""
+
+from __future__ import annotations
+
+from math import pi, sin
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.reference_signal import SHAPES, ReferenceSignal
+
+OMEGA = 2.0 * pi  # a period of one second
+
+
+@given(t=st.floats(0.0, 100.0), amplitude=st.floats(0.0, 10.0), bias=st.floats(-10.0, 10.0),
+       waveform=st.sampled_from([w for w in SHAPES if w != 'file']))
+def test_every_waveform_stays_within_amplitude_around_bias(
+    t: float, amplitude: float, bias: float, waveform: str,
+) -> None:
+    y_m = ReferenceSignal(waveform, amplitude, OMEGA, bias)(t)
+    assert abs(y_m - bias) <= amplitude + 1e-9
+
+
+@given(t=st.floats(0.0, 10.0),
+       waveform=st.sampled_from(['sine', 'triangle', 'multisine']))
+def test_periodic_waveforms_repeat_after_one_period(t: float, waveform: str) -> None:
+    reference = ReferenceSignal(waveform, 2.0, OMEGA)
+    assert reference(t + 1.0) == pytest.approx(reference(t), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ('waveform', 't', 'value'),
+    [
+        ('sine', 0.0, 1.0), ('sine', 0.25, 3.0), ('sine', 0.75, -1.0),
+        ('step', 0.0, 1.0), ('step', 0.49, 1.0), ('step', 0.51, 3.0), ('step', 7.0, 3.0),
+        ('square', 0.1, 3.0), ('square', 0.6, -1.0), ('square', 1.1, 3.0),
+        ('triangle', 0.0, 1.0), ('triangle', 0.125, 2.0), ('triangle', 0.25, 3.0),
+        ('triangle', 0.375, 2.0), ('triangle', 0.75, -1.0),
+    ],
+)
+def test_shape_of(waveform: str, t: float, value: float) -> None:
+    assert ReferenceSignal(waveform, 2.0, OMEGA, 1.0)(t) == pytest.approx(value)
+
+
+def test_papers_reference() -> None:
+    reference = ReferenceSignal('sine', 10.0, 12.6)
+    assert reference(0.37) == pytest.approx(10.0 * sin(12.6 * 0.37))
+
+
+def test_multisine_excites_several_harmonics_at_a_low_crest() -> None:
+    values = [ReferenceSignal('multisine', 1.0, OMEGA)(k / 1000.0) for k in range(1000)]
+    rms = (sum(v * v for v in values) / 1000.0) ** 0.5
+    assert max(map(abs, values)) / rms < 2.5
+    for harmonic in (1, 2, 3, 5):
+        amount = sum(
+            v * complex(sin(OMEGA * harmonic * k / 1000.0), sin(OMEGA * harmonic * k / 1000.0
+                                                                + pi / 2))
+            for k, v in enumerate(values)
+        )
+        assert abs(amount) / 500.0 == pytest.approx(0.25, rel=1e-6)
+
+
+def test_chirp_sweeps_its_frequency_and_starts_again() -> None:
+    chirp = ReferenceSignal('chirp', 1.0, 20.0, frequency_start=2.0, sweep_time=10.0)
+    step = 1e-4
+
+    def frequency(t: float) -> float:
+        """From the phase: y_m^2 + (y_m'/omega)^2 = 1."""
+        slope = (chirp(t + step) - chirp(t - step)) / (2.0 * step)
+        return abs(slope) / (1.0 - chirp(t) ** 2) ** 0.5
+
+    for t, omega in ((0.1, 2.18), (5.0, 11.0), (9.9, 19.82)):
+        assert frequency(t) == pytest.approx(omega, rel=0.01)
+    assert chirp(13.3) == pytest.approx(chirp(3.3))
+
+
+@given(k=st.integers(0, 20000), period=st.sampled_from([0.001, 0.01, 0.02, 0.1, 1.0 / 3.0]))
+def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(
+    k: int, period: float,
+) -> None:
+    reference = ReferenceSignal(
+        'file', sample_period=period, samples=tuple(float(i) for i in range(20001))
+    )
+    assert reference(k * period) == float(k)
+
+
+def test_file_holds_its_last_sample() -> None:
+    reference = ReferenceSignal('file', 2.0, bias=1.0, sample_period=0.1, samples=(5.0, 7.0))
+    assert [reference(t) for t in (0.0, 0.1, 0.2, 99.0)] == pytest.approx([11.0, 15.0, 15.0, 15.0])
+
+
+def test_unknown_waveform_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"waveform='sin' must be one of sine, "):
+        ReferenceSignal('sin')
+
+
+def test_file_without_samples_is_refused() -> None:
+    with pytest.raises(ParameterError, match='at least one sample'):
+        ReferenceSignal('file')
+
+
+def test_the_table_offers_exactly_the_waveforms_there_are() -> None:
+    for waveform in SHAPES:
+        assert Parameters({'waveform': waveform})['waveform'] == waveform
+    with pytest.raises(ParameterError, match='must be one of ' + ', '.join(SHAPES)):
+        Parameters({'waveform': 'sawtooth'})

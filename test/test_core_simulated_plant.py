@@ -1,0 +1,116 @@
+"""The simulated plant: backlash, G(z), sensor (3.1)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import Play, paper_example, plants, signals, usual_plays
+
+from backlash_ros.core.assembly import build_plant
+from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.transfer_function import TransferFunction
+
+SLOW = TransferFunction([0.1], [1.0, -0.9])
+
+
+def plant(
+    extra: Imperfections | None = None, model: TransferFunction = SLOW, seed: int = 1,
+    period: float = 0.01,
+) -> SimulatedPlant:
+    return SimulatedPlant(
+        model, Backlash(1.3, 3.0, -3.0), period, np.random.default_rng(seed), extra
+    )
+
+
+def outputs(simulated: SimulatedPlant, control: list[float]) -> list[float]:
+    result = []
+    for v in control:
+        result.append(simulated.measure())
+        simulated.step(v)
+    return result
+
+
+@given(model=plants(), play=usual_plays(), control=signals(), disturbance=st.floats(-5.0, 5.0))
+def test_y_is_g_of_the_backlash_output_plus_the_disturbance(
+    model: TransferFunction, play: Play, control: list[float], disturbance: float,
+) -> None:
+    simulated = SimulatedPlant(
+        model, Backlash(play.m, play.c_r, play.c_l), 0.01, np.random.default_rng(0),
+        Imperfections(input_disturbance=disturbance),
+    )
+    backlash = Backlash(play.m, play.c_r, play.c_l)
+    u = np.array([backlash.step(v) for v in control])
+    expected = model.simulate(u + disturbance)
+    np.testing.assert_allclose(
+        outputs(simulated, control), expected, atol=1e-9 * (1.0 + np.abs(expected).max())
+    )
+
+
+def test_v_acts_on_the_next_output_and_not_on_this_one() -> None:
+    simulated = plant()
+    assert simulated.measure() == 0.0
+    u = simulated.step(10.0)
+    assert u == pytest.approx(1.3 * 7.0)
+    assert simulated.measure() == pytest.approx(0.1 * u)
+    assert simulated.measure() == pytest.approx(0.1 * u)
+
+
+def test_noise_has_the_given_spread_and_follows_the_seed() -> None:
+    noisy = Imperfections(output_noise_std=0.2)
+    y = outputs(plant(noisy), [0.0] * 4000)
+    assert np.std(y) == pytest.approx(0.2, rel=0.05)
+    assert np.mean(y) == pytest.approx(0.0, abs=0.02)
+    assert outputs(plant(noisy), [0.0] * 50) == y[:50]
+    assert outputs(plant(noisy, seed=2), [0.0] * 50) != y[:50]
+
+
+@given(control=signals(), quantum=st.floats(0.001, 1.0))
+def test_quantised_output_is_the_nearest_multiple(control: list[float], quantum: float) -> None:
+    exact = outputs(plant(), control)
+    coarse = outputs(plant(Imperfections(output_quantum=quantum)), control)
+    for y, shown in zip(exact, coarse, strict=True):
+        assert abs(shown - y) <= 0.5 * quantum * (1.0 + 1e-9)
+        assert shown / quantum == pytest.approx(round(shown / quantum), abs=1e-6)
+
+
+def test_wear_moves_the_backlash_with_time_and_the_jump_comes_at_its_time() -> None:
+    simulated = plant(
+        Imperfections(rate=(0.1, 1.0, -2.0), jump_time=0.5, jump=(0.0, 1.0, 0.0)), period=0.1
+    )
+    seen = []
+    for _ in range(11):
+        simulated.step(0.0)
+        seen.append((simulated.backlash.m, simulated.backlash.c_r, simulated.backlash.c_l))
+    assert seen[0] == pytest.approx((1.3, 3.0, -3.0))
+    assert seen[4] == pytest.approx((1.34, 3.4, -3.8))
+    assert seen[5] == pytest.approx((1.35, 4.5, -4.0))
+    assert seen[10] == pytest.approx((1.4, 5.0, -5.0))
+
+
+@pytest.mark.parametrize(
+    'changes',
+    [
+        {'backlash__jump': [-2.0, 0.0, 0.0]}, {'backlash__jump': [0.0, -3.0, 3.0]},
+        {'backlash__rate': [-1.0, 0.0, 0.0]},
+    ],
+    ids=['jump to m < 0', 'jump to c_l = c_r', 'm falls below 0 after 1.3 s'],
+)
+def test_wear_never_ends_in_an_invalid_backlash(changes: dict[str, list[float]]) -> None:
+    """It is refused at the start, or when it gets there, but never simulated."""
+    with pytest.raises(ParameterError) as refusal:
+        outputs(build_plant(paper_example(**changes)), [0.0] * 400)
+    assert refusal.value.name.startswith('backlash.')
+
+
+def test_parameters_reach_the_plant() -> None:
+    simulated = build_plant(paper_example(
+        backlash__m=2.0, backlash__c_r=1.0, backlash__c_l=-0.5, backlash__initial_u=0.25,
+        input_disturbance=3.0, plant__numerator=[0.5], plant__denominator=[1.0, -0.5],
+    ))
+    assert simulated.step(0.5) == 0.25
+    assert simulated.measure() == pytest.approx(0.5 * 3.25)
+    assert simulated.step(2.0) == pytest.approx(2.0)

@@ -1,0 +1,89 @@
+"""G(z) and its state space, against scipy.signal."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import signal
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.transfer_function import TransferFunction
+
+
+@given(model=plants(), seed=st.integers(0, 1000))
+def test_state_space_and_simulation_agree_with_scipy(model: TransferFunction, seed: int) -> None:
+    u = np.random.default_rng(seed).uniform(-1.0, 1.0, 60)
+    _, expected = signal.dlsim((np.trim_zeros(model.numerator, 'f'), model.denominator, 1.0), u)
+    a, b, c = model.state_space()
+    x, by_states = np.zeros(model.order), []
+    for value in u:
+        by_states.append(c @ x)
+        x = a @ x + b * value
+    size = np.abs(expected).max() + 1.0
+    np.testing.assert_allclose(by_states, expected[:, 0], atol=1e-8 * size)
+    np.testing.assert_allclose(model.simulate(u), expected[:, 0], atol=1e-8 * size)
+
+
+@given(model=plants())
+def test_output_is_the_first_state(model: TransferFunction) -> None:
+    a, b, c = model.state_space()
+    assert (a.shape, b.shape) == ((model.order, model.order), (model.order,))
+    assert c.tolist() == [1.0] + [0.0] * (model.order - 1)
+
+
+@given(model=plants())
+def test_frequency_response_agrees_with_scipy(model: TransferFunction) -> None:
+    w, expected = signal.freqz(model.numerator, model.denominator, np.linspace(0.1, 3.1, 30))
+    np.testing.assert_allclose(model.response(np.exp(1j * w)), expected, rtol=1e-6, atol=1e-12)
+
+
+def test_poles_and_zeros_of_the_papers_example() -> None:
+    model = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
+    assert sorted(model.poles.real) == pytest.approx([0.90478, 0.98026, 1.0], abs=1e-4)
+    assert sorted(model.zeros.real) == pytest.approx([-3.73205, -0.26795], abs=1e-5)
+    assert model.order == 3
+    assert model.delay == 1
+
+
+@given(scale=st.floats(0.01, 100.0))
+def test_common_factor_of_both_polynomials_cancels(scale: float) -> None:
+    model = TransferFunction([2.0 * scale, scale], [4.0 * scale, -2.0 * scale, 0.5 * scale])
+    assert model.denominator == pytest.approx([1.0, -0.5, 0.125])
+    assert model.numerator == pytest.approx([0.0, 0.5, 0.25])
+
+
+@pytest.mark.parametrize(
+    ('numerator', 'delay'), [([1.0, 0.5], 1), ([0.0, 0.0, 3.0, 1.0], 1), ([0.0, 2.0], 2)],
+)
+def test_leading_zeros_of_the_numerator_are_delay(numerator: list[float], delay: int) -> None:
+    model = TransferFunction(numerator, [1.0, -0.5, 0.1])
+    assert model.delay == delay
+    impulse = model.simulate(np.eye(1, 10)[0])
+    assert np.flatnonzero(impulse)[0] == delay
+
+
+@pytest.mark.parametrize(
+    ('numerator', 'denominator', 'name'),
+    [
+        ([1.0, 0.0], [1.0, 0.5], 'plant.numerator'),
+        ([1.0, 0.0, 0.0], [1.0, 0.5], 'plant.numerator'),
+        ([1.0], [1.0], 'plant.numerator'),
+        ([0.0, 0.0], [1.0, 0.5], 'plant.numerator'),
+        ([], [1.0, 0.5], 'plant.numerator'),
+        ([nan], [1.0, 0.5], 'plant.numerator'),
+        ([1.0], [0.0, 1.0, 0.5], 'plant.denominator'),
+        ([1.0], [1.0, inf], 'plant.denominator'),
+        ([1.0], [], 'plant.denominator'),
+    ],
+)
+def test_invalid_polynomials_are_refused_and_named(
+    numerator: list[float], denominator: list[float], name: str,
+) -> None:
+    with pytest.raises(ParameterError) as refusal:
+        TransferFunction(numerator, denominator)
+    assert refusal.value.name == name

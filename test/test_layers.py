@@ -1,0 +1,108 @@
+"""Layers: core <- nodes, core <- tools; ROS is imported in nodes only."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = 'backlash_ros'
+SHARED = {PACKAGE, f'{PACKAGE}.topics'}
+NUMERIC = {'numpy', 'scipy'}
+ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
+ROS_PREFIXES = ('rclpy', 'rosidl', 'launch')
+SOURCES = sorted((ROOT / PACKAGE).rglob('*.py'))
+
+
+def imported_modules(source: str, module: str, is_package: bool) -> Iterator[str]:
+    """Yield the absolute names of all modules that `source`, the text of `module`, imports."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ''
+            if node.level:
+                parts = module.split('.')
+                parts = parts[: len(parts) - node.level + is_package]
+                base = '.'.join([*parts, base] if base else parts)
+            # `from backlash_ros import nodes` imports a module too.
+            yield from (
+                [f'{base}.{alias.name}' for alias in node.names]
+                if base in (PACKAGE, f'{PACKAGE}.core', f'{PACKAGE}.nodes', f'{PACKAGE}.tools')
+                else [base]
+            )
+
+
+def is_ros(module: str) -> bool:
+    top = module.split('.')[0]
+    return top.startswith(ROS_PREFIXES) or top.endswith(ROS_SUFFIXES)
+
+
+def within(module: str, layer: str) -> bool:
+    return module == f'{PACKAGE}.{layer}' or module.startswith(f'{PACKAGE}.{layer}.')
+
+
+def is_allowed(module: str, imported: str) -> bool:
+    """Return whether the layers let `module` import `imported`."""
+    top = imported.split('.')[0]
+    if within(module, 'core'):
+        return top in sys.stdlib_module_names | NUMERIC or within(imported, 'core')
+    if within(module, 'nodes'):
+        return not within(imported, 'tools')
+    if within(module, 'tools'):
+        return not is_ros(imported) and not within(imported, 'nodes')
+    return top in sys.stdlib_module_names or imported in SHARED
+
+
+def violations(source: str, module: str, is_package: bool = False) -> list[str]:
+    imports = imported_modules(source, module, is_package)
+    return [name for name in imports if not is_allowed(module, name)]
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_module_imports_only_what_its_layer_may(path: Path) -> None:
+    parts = path.relative_to(ROOT).with_suffix('').parts
+    is_package = parts[-1] == '__init__'
+    module = '.'.join(parts[:-1] if is_package else parts)
+    assert violations(path.read_text(), module, is_package) == []
+
+
+def test_every_layer_is_looked_at() -> None:
+    layers = {path.relative_to(ROOT / PACKAGE).parts[0] for path in SOURCES}
+    assert {'core', 'nodes', 'tools', 'topics.py'} <= layers
+
+
+@pytest.mark.parametrize(
+    ('module', 'source', 'found'),
+    [
+        ('core.plant', 'import rclpy', 'rclpy'),
+        ('core.plant', 'def f():\n    import yaml', 'yaml'),
+        ('core.plant', 'from ..nodes import plant', 'backlash_ros.nodes.plant'),
+        ('core.plant', 'from backlash_ros import topics', 'backlash_ros.topics'),
+        ('tools.report', 'from rclpy.node import Node', 'rclpy.node'),
+        ('tools.report', 'from std_msgs.msg import Float64', 'std_msgs.msg'),
+        ('tools.report', 'import backlash_ros.nodes.plant', 'backlash_ros.nodes.plant'),
+        ('tools.report', 'from ..nodes.plant import main', 'backlash_ros.nodes.plant'),
+        ('nodes.plant', 'from backlash_ros.tools import report', 'backlash_ros.tools.report'),
+        ('topics', 'import numpy', 'numpy'),
+    ],
+)
+def test_import_across_layers_is_found(module: str, source: str, found: str) -> None:
+    assert violations(source, f'{PACKAGE}.{module}') == [found]
+
+
+@pytest.mark.parametrize(
+    ('module', 'source'),
+    [
+        ('core.plant', 'from math import pi\nimport numpy as np\nimport scipy.linalg'),
+        ('core.plant', 'from .backlash import Backlash\nfrom . import inverse'),
+        ('nodes.plant', 'import rclpy\nfrom ..core import plant\nfrom backlash_ros import topics'),
+        ('tools.report', 'import matplotlib\nimport rosbags\nfrom ..core import metrics'),
+    ],
+)
+def test_import_within_a_layer_is_let_through(module: str, source: str) -> None:
+    assert violations(source, f'{PACKAGE}.{module}') == []

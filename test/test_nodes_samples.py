@@ -1,0 +1,131 @@
+"""Which sample a message holds, and which v the plant had: the bookkeeping of the controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.command_history import CommandHistory
+from backlash_ros.nodes.reference_file import read_reference_file
+from backlash_ros.nodes.sample_counter import SampleCounter
+
+PERIOD_S, PERIOD_NS = 0.01, 10_000_000
+START_NS = 1_800_000_000_000_000_000
+
+gaps = st.lists(st.integers(0, 40), min_size=1, max_size=60)
+delays = st.lists(st.floats(0.0, 0.08), min_size=61, max_size=61)  # of a period
+
+
+def stamps_of(gaps: list[int], delays: list[float]) -> list[int]:
+    """Time stamps of samples 0, 1 + gaps[0], ... that leave with some delay."""
+    samples = [0]
+    for gap in gaps:
+        samples.append(samples[-1] + 1 + gap)
+    return [
+        START_NS + int((sample + delay) * PERIOD_NS)
+        for sample, delay in zip(samples, delays, strict=False)
+    ]
+
+
+@given(gaps, delays)
+def test_time_stamps_alone_tell_every_missing_sample(gaps: list[int], delays: list[float]) -> None:
+    counter = SampleCounter(PERIOD_S)
+    counted = [counter.count(stamp) for stamp in stamps_of(gaps, delays)]
+    assert counted == [0, *gaps]
+    assert counter.index == sum(gaps) + len(gaps)
+
+
+@given(gaps, delays)
+def test_outputs_never_published_show_in_time_though_the_numbers_have_no_gap(
+    gaps: list[int], delays: list[float],
+) -> None:
+    counter = SampleCounter(PERIOD_S)
+    stamps = stamps_of(gaps, delays)
+    assert [counter.count(stamp, 1 + i) for i, stamp in enumerate(stamps)] == [0, *gaps]
+
+
+@given(gaps)
+def test_a_gap_in_the_numbers_counts_though_messages_come_in_a_burst(gaps: list[int]) -> None:
+    counter = SampleCounter(PERIOD_S)
+    sequence, counted = 7, [counter.count(START_NS, 7)]
+    for gap in gaps:
+        sequence += 1 + gap
+        counted.append(counter.count(START_NS, sequence))
+    assert counted == [0, *gaps]
+    assert counter.index == sequence - 1
+
+
+@given(st.lists(st.floats(0.0, 0.8), min_size=2, max_size=200))
+def test_jitter_below_a_period_is_no_loss(delays: list[float]) -> None:
+    counter = SampleCounter(PERIOD_S)
+    stamps = [START_NS + int((k + delay) * PERIOD_NS) for k, delay in enumerate(delays)]
+    assert sum(counter.count(stamp) for stamp in stamps) == 0
+
+
+@given(st.floats(0.995, 1.005))
+def test_a_sender_with_a_slightly_wrong_clock_loses_nothing(ratio: float) -> None:
+    counter = SampleCounter(PERIOD_S)
+    stamps = [START_NS + int(k * PERIOD_NS * ratio) for k in range(1000)]
+    assert sum(counter.count(stamp, 1 + k) for k, stamp in enumerate(stamps)) == 0
+
+
+def test_a_sender_that_was_started_anew_is_counted_by_time() -> None:
+    counter = SampleCounter(PERIOD_S)
+    counter.count(START_NS, 500)
+    assert counter.count(START_NS + 5 * PERIOD_NS, 1) == 4
+
+
+def test_a_command_in_time_is_applied_over_all_intervals_after_it() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.publish(1.0, START_NS + 1)
+    assert commands.over(3, START_NS + 3 * PERIOD_NS) == [1.0, 1.0, 1.0]
+    assert commands.late == 0
+
+
+def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.publish(1.0, START_NS + 1)
+    commands.publish(2.0, START_NS + PERIOD_NS + int(1.5 * PERIOD_NS))
+    # y(1) was answered one and a half periods later; y(2) and y(3) are lost, y(4) arrives.
+    assert commands.over(3, START_NS + 4 * PERIOD_NS) == [1.0, 2.0, 2.0]
+    assert commands.late == 1
+
+
+def test_reported_controls_count_only_if_there_is_one_per_interval() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.report(1.0, START_NS + PERIOD_NS)
+    commands.report(2.0, START_NS + 2 * PERIOD_NS)
+    assert commands.reported_over(2, START_NS + 2 * PERIOD_NS) == [1.0, 2.0]
+    assert commands.reported_over(1, START_NS + 3 * PERIOD_NS) == []
+    assert commands.unreported == 1
+
+
+@pytest.mark.parametrize(
+    ('text', 'complaint'),
+    [
+        ('', 'header t,y_m'),
+        ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
+        ('t,y_m\n0,1\n0.02,2\n', 'line 3 must hold t=0.01'),
+        ('t,y_m\n0,nan\n', 'finite y_m'),
+    ],
+)
+def test_a_reference_file_is_refused_with_its_line(
+    tmp_path: Path, text: str, complaint: str,
+) -> None:
+    file = tmp_path / 'reference.csv'
+    file.write_text(text)
+    parameters = Parameters({'waveform': 'file', 'file': str(file)})
+    with pytest.raises(ParameterError, match=complaint):
+        read_reference_file(parameters)
+
+
+def test_a_reference_file_gives_one_value_per_period(tmp_path: Path) -> None:
+    file = tmp_path / 'reference.csv'
+    file.write_text('t,y_m\n0,1\n0.01,-2.5\n')
+    parameters = Parameters({'waveform': 'file', 'file': str(file)})
+    assert read_reference_file(parameters) == (1.0, -2.5)

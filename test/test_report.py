@@ -1,0 +1,393 @@
+"""`report`: what a page holds, from simulations, bags and saved files."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from math import nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from backlash_ros import topics
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.tools import analysis, figures, report
+from backlash_ros.tools.bag_reading import read_bag
+from backlash_ros.tools.configuration import write_config
+from backlash_ros.tools.errors import InputError
+from backlash_ros.tools.results import write_run, write_summary
+
+PARAMETERS = Parameters({'estimator.law': 'lms', 'output_noise_std': 1e-4})
+LATENCY_S = 0.0004
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
+
+
+@pytest.fixture(scope='module')
+def run() -> RunRecord:
+    return build_closed_loop(PARAMETERS).run(120)
+
+
+def multi_array(labels: tuple[str, ...], values: list[float]) -> bytes:
+    dimension = TYPES.types['std_msgs/msg/MultiArrayDimension']
+    layout = TYPES.types['std_msgs/msg/MultiArrayLayout'](
+        dim=[dimension(label=label, size=1, stride=0) for label in labels], data_offset=0
+    )
+    message = TYPES.types[MULTI_ARRAY](layout=layout, data=np.array(values, dtype=np.float64))
+    return bytes(TYPES.serialize_cdr(message, MULTI_ARRAY))
+
+
+def rows_of(
+    run: RunRecord, labels: tuple[str, ...], skipped: frozenset[int], prefix: str = '',
+) -> Iterator[tuple[int, bytes]]:
+    """Sample count and message of each row, sample 0 having been missed by the recorder."""
+    for k in range(run.samples):
+        if k in skipped:
+            continue
+        known = dict(zip(COLUMNS, run.rows[k].tolist(), strict=True))
+        known |= {'sample': float(k + 1), 'latency_s': LATENCY_S, 'std_f': nan}
+        values = [known.get(prefix + label, known.get(label, nan)) for label in labels]
+        yield k, multi_array(labels, values)
+
+
+def write_bag(
+    path: Path, run: RunRecord, storage: StoragePlugin = StoragePlugin.MCAP, *,
+    truth: bool = True, lost: frozenset[int] = frozenset(), namespace: str = '',
+    unpaired: frozenset[int] = frozenset(),
+) -> Path:
+    """Write a bag as the recorder does; the last sample has no truth, its v was never applied."""
+    period_ns = round(run.sample_period * 1e9)
+    with Writer(path, version=9, storage_plugin=storage) as writer:
+        sources = [
+            (topics.SIGNALS, topics.SIGNAL_LABELS, lost, ''),
+            (topics.ESTIMATES, topics.ESTIMATE_LABELS, lost | unpaired, ''),
+        ]
+        if truth:
+            never_applied = frozenset({run.samples - 1})
+            sources.append((topics.TRUTH, topics.TRUTH_LABELS, never_applied, 'true_'))
+        for topic, labels, skipped, prefix in sources:
+            connection = writer.add_connection(
+                f'/{namespace}{topic}', MULTI_ARRAY, typestore=TYPES)
+            for k, raw in rows_of(run, labels, skipped, prefix):
+                writer.write(connection, 10**18 + k * period_ns, raw)
+    return path
+
+
+@pytest.fixture(scope='module')
+def page(run: RunRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a bag in which one sample was lost."""
+    out = tmp_path_factory.mktemp('report')
+    report.report_bag(write_bag(out / 'bag', run, lost=frozenset({60})), out, PARAMETERS)
+    return out / 'report.html'
+
+
+def png_references(html: str) -> list[bytes]:
+    return [base64.b64decode(data) for data in re.findall(r'base64,([^"]+)"', html)]
+
+
+def test_page_needs_nothing_from_elsewhere(page: Path) -> None:
+    html = page.read_text(encoding='utf-8')
+    sources = re.findall(r'(?:src|href|url|srcset|action)\s*[=(]\s*["\']?([^"\'>\s)]+)', html)
+    assert sources
+    assert all(source.startswith('data:image/png;base64,') for source in sources)
+    assert not re.search(r'https?:|//www|<script|<link|<iframe|@import', html)
+
+
+def test_page_holds_the_pictures_that_lie_beside_it(page: Path) -> None:
+    html = page.read_text(encoding='utf-8')
+    beside = {path.name: path.read_bytes() for path in page.parent.glob('*.png')}
+    assert sorted(png_references(html)) == sorted(beside.values())
+    assert set(beside) == {
+        'parameter_errors.png', 'estimates.png', 'control_error.png', 'laws.png',
+        'hysteresis.png', 'output.png', 'input.png',
+    }
+
+
+def test_page_tells_the_summary_and_the_parameters(page: Path) -> None:
+    html = page.read_text(encoding='utf-8')
+    summary = json.loads((page.parent / 'summary.json').read_text())
+    assert f'{summary["final"]["c_r"]:.6g}' in html
+    assert 'law: lms' in html
+
+
+def test_summary_of_a_bag_tells_latency_losses_and_truth(page: Path) -> None:
+    summary = json.loads((page.parent / 'summary.json').read_text())
+    assert summary['loop_latency_ms'] == pytest.approx({'p50': 0.4, 'p99': 0.4})
+    assert (summary['samples'], summary['lost_samples']) == (119, 1)
+    assert summary['truth'] == {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
+
+
+@pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
+def test_bag_gives_back_the_run(tmp_path: Path, storage: StoragePlugin) -> None:
+    worn = build_closed_loop(PARAMETERS.replaced({'backlash.rate': [0.1, 0.2, -0.3]})).run(40)
+    found = read_bag(write_bag(tmp_path / 'bag', worn, storage), worn.sample_period)
+    expected = worn.rows.copy()
+    # The last v was never applied: no u, and the truth of the sample before.
+    expected[-1, COLUMNS.index('u')] = nan
+    expected[-1, COLUMNS.index('true_m'):] = expected[-2, COLUMNS.index('true_m'):]
+    np.testing.assert_array_equal(found.run.rows, expected)
+    assert found.run.has_truth
+    assert (found.run.lost_samples, found.unpaired) == (0, 0)
+    np.testing.assert_array_equal(found.latency_s, LATENCY_S)
+
+
+def test_sample_missing_in_the_bag_is_lost(run: RunRecord, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / 'bag', run, lost=frozenset({30, 31, 70}))
+    found = read_bag(bag, run.sample_period).run
+    assert found.lost_samples == 3
+    kept = np.delete(run.rows, [30, 31, 70], axis=0)
+    np.testing.assert_array_equal(found.column('t'), kept[:, 0])
+    np.testing.assert_array_equal(found.column('u')[:-1], kept[:-1, COLUMNS.index('u')])
+
+
+def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / 'bag', run, unpaired=frozenset({50, 119}))
+    found = read_bag(bag, run.sample_period)
+    assert (found.unpaired, found.run.lost_samples, found.run.samples) == (2, 0, 118)
+
+
+def test_bag_of_a_namespace_is_read_without_being_told_the_period(
+    run: RunRecord, tmp_path: Path,
+) -> None:
+    bag = write_bag(tmp_path / 'bag', run, namespace='robot1/', lost=frozenset({5}))
+    assert read_bag(bag).run.sample_period == pytest.approx(0.01)
+
+
+def test_report_without_truth_shows_estimates_and_innovation(
+    run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_bag(tmp_path / 'bag', run, truth=False)
+    assert report.main(['bag']) == 0
+    out = tmp_path / 'results' / 'latest'
+    assert {path.name for path in out.glob('*.png')} == {
+        'estimates.png', 'innovation.png', 'hysteresis.png', 'output.png', 'input.png',
+    }
+    html = (out / 'report.html').read_text(encoding='utf-8')
+    assert 'no truth was recorded' in html
+    assert 'no parameters were given' in html
+    assert json.loads((out / 'summary.json').read_text())['estimator'] is None
+    assert capsys.readouterr().out.strip().endswith('report.html')
+
+
+def saved(run: RunRecord, folder: Path) -> Path:
+    folder.mkdir()
+    write_run(run, folder)
+    write_config(PARAMETERS, folder / 'parameters.yaml')
+    truth = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
+    write_summary({'truth': truth}, folder / 'summary.json')
+    return folder
+
+
+def test_saved_results_are_read_in_full(run: RunRecord, tmp_path: Path) -> None:
+    source = report.open_source(saved(run, tmp_path / 'results'))
+    np.testing.assert_array_equal(source.run.rows, run.rows)
+    assert source.parameters == PARAMETERS
+
+
+def test_bag_in_the_results_goes_first(run: RunRecord, tmp_path: Path) -> None:
+    folder = saved(run, tmp_path / 'results')
+    write_bag(folder / 'bag', run)
+    for path in (folder, folder / 'bag'):
+        source = report.open_source(path)
+        assert source.latency_s is not None
+        assert source.parameters == PARAMETERS
+
+
+def test_samples_take_the_truth_from_the_summary_beside_them(
+    run: RunRecord, tmp_path: Path,
+) -> None:
+    folder = saved(run, tmp_path / 'results')
+    source = report.open_source(folder / 'samples.csv')
+    assert source.run.has_truth
+    np.testing.assert_array_equal(source.run.column('true_c_l'), run.column('true_c_l'))
+    # Of a truth that wears, the summary knows only the end.
+    write_config(PARAMETERS.replaced({'backlash.rate': [0.1, 0, 0]}), folder / 'parameters.yaml')
+    assert not report.open_source(folder / 'samples.csv').run.has_truth
+
+
+def broken_bag(path: Path, run: RunRecord) -> None:
+    write_bag(path, run)
+    [data] = path.glob('*.mcap')
+    data.write_bytes(data.read_bytes()[:2000])
+
+
+def unclosed_bag(path: Path, run: RunRecord) -> None:
+    write_bag(path, run)
+    (path / 'metadata.yaml').unlink()
+
+
+def garbled_bag(path: Path, run: RunRecord) -> None:
+    write_bag(path, run)
+    (path / 'metadata.yaml').write_text('rosbag2_bagfile_information: [')
+
+
+def other_bag(path: Path, run: RunRecord) -> None:
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        writer.add_connection('/chatter', 'std_msgs/msg/String', typestore=TYPES)
+
+
+def empty_bag(path: Path, run: RunRecord) -> None:
+    write_bag(path, RunRecord(run.rows[:0], run.sample_period))
+
+
+def twice_bag(path: Path, run: RunRecord) -> None:
+    write_bag(path, RunRecord(run.rows[:1], run.sample_period))
+    other = path.with_name('other')
+    with Writer(other, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, labels in ((topics.SIGNALS, topics.SIGNAL_LABELS),
+                              (topics.ESTIMATES, topics.ESTIMATE_LABELS)):
+            connection = writer.add_connection(f'/{topic}', MULTI_ARRAY, typestore=TYPES)
+            for _, raw in itertools.chain(rows_of(run, labels, frozenset()),
+                                          rows_of(run, labels, frozenset())):
+                writer.write(connection, 0, raw)
+    path.rename(path.with_name('unused'))
+    other.rename(path)
+
+
+def empty_folder(path: Path, run: RunRecord) -> None:
+    path.mkdir()
+
+
+@pytest.mark.parametrize(
+    ('make', 'message'),
+    [
+        (None, 'does not exist'),
+        (broken_bag, 'cannot be read as a bag'),
+        (garbled_bag, 'cannot be read as a bag'),
+        (unclosed_bag, 'was never closed'),
+        (other_bag, 'holds no controller/signals, only /chatter'),
+        (empty_bag, 'holds no message of /controller/signals'),
+        (twice_bag, 'the node was started twice'),
+        (empty_folder, 'holds no bag, no record.npz and no samples.csv'),
+    ],
+)
+def test_unusable_input_is_one_line_and_leaves_nothing(
+    run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str], make: object, message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if callable(make):
+        make(tmp_path / 'bag', run)
+    assert report.main(['bag']) == 2
+    err = capsys.readouterr().err
+    assert err.startswith('report: ')
+    assert message in err
+    assert err.count('\n') == 1
+    assert not (tmp_path / 'results').exists()
+
+
+def test_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / 'notes.txt').touch()
+    with pytest.raises(InputError, match='is no bag folder'):
+        report.open_source(tmp_path / 'notes.txt')
+
+
+def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
+    run = build_closed_loop(PARAMETERS).run(1)
+    assert report.report_run(run, tmp_path, PARAMETERS)['samples'] == 1
+    assert (tmp_path / 'report.html').is_file()
+
+
+def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
+    other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
+    own, *others = analysis.compare_laws(run, other)
+    assert own.recorded
+    assert len(own.t) == run.samples
+    assert all('gone.csv' in trace.note for trace in others)
+    assert isinstance(figures.draw_laws([own, *others], analysis.Part('Begin', slice(10))), Figure)
+
+
+def texts_and_axes(figure: Figure) -> tuple[list[tuple[str, Bbox]], list[tuple[str, Bbox]]]:
+    """Boxes of all texts, and of the legends and data areas."""
+    figure.draw_without_rendering()
+    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
+    texts, areas = [], []
+    for axes in figure.axes:
+        legend = axes.get_legend()
+        if legend is not None:
+            texts.append(('legend', legend.get_window_extent(renderer)))
+        if not axes.axison:
+            continue
+        areas.append((axes.get_title(loc='left'), axes.get_window_extent(renderer)))
+        for text in (axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label):
+            if text.get_text():
+                texts.append((text.get_text(), text.get_window_extent(renderer)))
+        for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+            for tick in axis.get_major_ticks():
+                # Ticks beyond the limits exist but are not drawn.
+                if low <= tick.get_loc() <= high and tick.label1.get_visible():
+                    name = f'tick {tick.label1.get_text()}'
+                    texts.append((name, tick.label1.get_window_extent(renderer)))
+    return texts, areas
+
+
+def overlap(first: Bbox, second: Bbox) -> bool:
+    """Whether two boxes share more than a rim of two pixels."""
+    return bool(
+        min(first.x1, second.x1) - max(first.x0, second.x0) > 2
+        and min(first.y1, second.y1) - max(first.y0, second.y0) > 2
+    )
+
+
+@pytest.mark.parametrize('truth', [True, False])
+def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None:
+    rows = run.rows.copy()
+    for name in ('std_m', 'std_c_r', 'std_c_l'):
+        rows[:, COLUMNS.index(name)] = 0.1
+    rows[40:60, COLUMNS.index('status')] = 2.0
+    if not truth:
+        for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):
+            rows[:, COLUMNS.index(name)] = nan
+    shown = replace(run, rows=rows)
+    parts = analysis.interesting_parts(shown, PARAMETERS)
+    settling = {'m': 0.5, 'c_r': None, 'c_l': 0.9}
+    drawn = [
+        figures.draw_estimates(shown), figures.draw_innovation(shown, parts[0]),
+        figures.draw_hysteresis(shown, parts[1]), figures.draw_input(shown, parts),
+        figures.draw_output(shown, parts[1], together=False),
+        figures.draw_output(shown, parts[1], together=True),
+    ]
+    if truth:
+        traces = analysis.compare_laws(shown, PARAMETERS)
+        drawn += [
+            figures.draw_parameter_errors(shown, parts[0], settling),
+            figures.draw_control_error(shown, parts), figures.draw_laws(traces, parts[0]),
+        ]
+    for figure in drawn:
+        texts, areas = texts_and_axes(figure)
+        for (one, box), (other, second) in itertools.combinations(texts, 2):
+            assert not overlap(box, second), f'{one!r} and {other!r} overlap'
+        for (one, box), (title, area) in itertools.product(texts, areas):
+            assert not overlap(box, area), f'{one!r} covers data of {title!r}'
+
+
+def test_moving_rms_is_that_of_the_newest_samples() -> None:
+    values = np.array([3.0, nan, 4.0, 1e-9, 0.0, 1e-9])
+    small = 1e-9 / np.sqrt(2)
+    expected = [3.0, 3.0, 4.0, np.sqrt(8.0), small, small]
+    np.testing.assert_allclose(analysis.moving_rms(values, 2), expected, rtol=1e-9)
+
+
+def test_thinned_curve_keeps_every_extreme() -> None:
+    t = np.arange(100_000.0)
+    values = np.sin(t / 50.0)
+    values[[17, 40_000]] = [9.0, -9.0]
+    values[500:600] = nan
+    few_t, few = analysis.thinned(t, values, 1000)
+    assert len(few) <= 1000
+    assert np.all(np.diff(few_t) > 0.0)
+    assert (np.nanmax(few), np.nanmin(few)) == (9.0, -9.0)
+    np.testing.assert_array_equal(few, values[few_t.astype(int)])

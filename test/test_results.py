@@ -1,0 +1,189 @@
+"""Files of a run: complete, exact, and strict JSON."""
+
+from __future__ import annotations
+
+import csv
+import json
+from math import nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.tools import results
+from backlash_ros.tools.errors import InputError
+from backlash_ros.tools.files import write_atomically
+
+FIELDS = [
+    'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'final', 'final_std',
+    'truth', 'settling_time_s', 'control_error_rms', 'tracking_error_rms', 'loop_latency_ms',
+]
+
+
+@pytest.fixture(scope='module')
+def run() -> RunRecord:
+    lossy = Parameters({'output_loss': 0.1, 'estimator.law': 'lms'})
+    return build_closed_loop(lossy).run(150)
+
+
+def without_truth(run: RunRecord) -> RunRecord:
+    rows = run.rows.copy()
+    for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):
+        rows[:, COLUMNS.index(name)] = nan
+    return RunRecord(rows, run.sample_period, run.lost_samples)
+
+
+def strict(text: str) -> object:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f'{constant} is not JSON')
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_samples_are_written_in_full_precision(run: RunRecord, tmp_path: Path) -> None:
+    results.write_run(run, tmp_path)
+    with (tmp_path / 'samples.csv').open(newline='') as file:
+        header, *rows = csv.reader(file)
+    assert header == ['t', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f']
+    again = results.read_samples(tmp_path / 'samples.csv', run.sample_period)
+    assert len(rows) == run.samples
+    for name in header:
+        np.testing.assert_array_equal(again.column(name), run.column(name))
+
+
+def test_gaps_in_samples_are_lost_samples(run: RunRecord, tmp_path: Path) -> None:
+    assert run.lost_samples > 0
+    results.write_run(run, tmp_path)
+    again = results.read_samples(tmp_path / 'samples.csv')
+    assert again.sample_period == pytest.approx(0.01)
+    assert again.lost_samples == run.lost_samples
+
+
+def test_u_is_left_empty_where_it_is_unknown(run: RunRecord, tmp_path: Path) -> None:
+    results.write_run(without_truth(run), tmp_path)
+    with (tmp_path / 'samples.csv').open(newline='') as file:
+        assert {row['u'] for row in csv.DictReader(file)} == {''}
+    assert np.isnan(results.read_samples(tmp_path / 'samples.csv').column('u')).all()
+
+
+def test_record_keeps_every_bit(run: RunRecord, tmp_path: Path) -> None:
+    results.write_run(run, tmp_path)
+    again = results.read_record(tmp_path / 'record.npz')
+    np.testing.assert_array_equal(again.rows, run.rows)
+    assert (again.sample_period, again.lost_samples) == (run.sample_period, run.lost_samples)
+
+
+def test_record_of_fewer_columns_is_read(run: RunRecord, tmp_path: Path) -> None:
+    path = tmp_path / 'record.npz'
+    np.savez(path, columns=['t', 'm'], rows=run.rows[:, :2], sample_period=0.01, lost_samples=0)
+    again = results.read_record(path)
+    np.testing.assert_array_equal(again.column('m'), run.rows[:, 1])
+    assert np.isnan(again.column('v')).all()
+
+
+def test_summary_has_the_agreed_fields(run: RunRecord) -> None:
+    summary = results.summarise(run, Parameters({'estimator.law': 'lms'}))
+    assert list(summary) == FIELDS
+    assert list(summary['final']) == ['m', 'c_r', 'c_l', 'f']
+    for name in ('final_std', 'truth', 'settling_time_s'):
+        assert list(summary[name]) == ['m', 'c_r', 'c_l']
+    assert summary['estimator'] == 'lms'
+    assert summary['samples'] + summary['lost_samples'] == 150
+    assert summary['loop_latency_ms'] is None
+
+
+def test_what_is_not_finite_becomes_null(run: RunRecord, tmp_path: Path) -> None:
+    path = tmp_path / 'summary.json'
+    results.write_summary({'a': nan, 'b': [1.0, float('inf')], 'c': {'d': -float('inf')}}, path)
+    assert strict(path.read_text()) == {'a': None, 'b': [1.0, None], 'c': {'d': None}}
+    results.write_summary(results.summarise(run, None), path)
+    stored = strict(path.read_text())
+    assert isinstance(stored, dict)
+    assert stored['final_std'] == {'m': None, 'c_r': None, 'c_l': None}
+    assert stored['estimator'] is None
+
+
+def test_without_truth_nothing_is_said_to_have_settled(run: RunRecord) -> None:
+    summary = results.summarise(without_truth(run), None)
+    nothing = {'m': None, 'c_r': None, 'c_l': None}
+    assert summary['truth'] == nothing
+    assert summary['settling_time_s'] == nothing
+    assert summary['control_error_rms'] is None
+
+
+def test_latency_is_given_in_milliseconds_without_the_unknown(run: RunRecord) -> None:
+    latency = np.array([0.001, nan, 0.002, 0.003])
+    summary = results.summarise(run, None, latency)
+    assert summary['loop_latency_ms'] == pytest.approx({'p50': 2.0, 'p99': 2.98})
+    assert results.summarise(run, None, np.full(3, nan))['loop_latency_ms'] is None
+
+
+def test_run_without_samples_is_refused() -> None:
+    with pytest.raises(InputError, match='no sample'):
+        results.summarise(RunRecord(np.empty((0, len(COLUMNS))), 0.01), None)
+
+
+def test_latest_points_at_the_newest_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    folders = [results.result_directory(None) for _ in range(3)]
+    assert len(set(folders)) == 3
+    latest = tmp_path / 'results' / 'latest'
+    assert latest.is_symlink()
+    assert latest.resolve() == folders[-1].resolve()
+    # Relative, so that the results can be moved.
+    assert str(latest.readlink()) == folders[-1].name
+
+
+def test_named_folder_leaves_latest_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert results.result_directory(Path('a/b')) == Path('a/b')
+    assert Path('a/b').is_dir()
+    assert not Path('results').exists()
+
+
+def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
+    (tmp_path / 'file').touch()
+    with pytest.raises(InputError, match='file: cannot be made a folder'):
+        results.result_directory(tmp_path / 'file')
+
+
+def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / 'text'
+    write_atomically(path, 'old')
+    write_atomically(path, 'nëw')
+    assert path.read_text(encoding='utf-8') == 'nëw'
+    (tmp_path / 'folder' / 'full').mkdir(parents=True)
+    with pytest.raises(OSError, match='folder'):
+        write_atomically(tmp_path / 'folder', 'cannot replace a folder')
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ['folder', 'text']
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('', 'line 1: must be the header'),
+        ('a,b\n1,2\n', 'line 1: must be the header'),
+        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n', 'holds no sample'),
+        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n0,1\n', 'line 2: must hold 10 numbers'),
+        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n0,1,1,1,1,x,1,1,1,1\n', 'line 2: must hold 10 numbers'),
+        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
+        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
+    ],
+)
+def test_mistake_in_samples_names_the_line(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / 'samples.csv'
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        results.read_samples(path)
+
+
+@pytest.mark.parametrize('content', [b'', b'PK', b'nothing of the kind'])
+def test_broken_record_is_named(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / 'record.npz'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r'record\.npz: is not a record'):
+        results.read_record(path)
