@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
 
 Array = NDArray[np.float64]
 
 PERIODS = 3
+NOISE_TO_SWING = 0.002
 
 
 @dataclass(frozen=True)
@@ -63,15 +65,11 @@ def random_case(seed: int, **fixed: object) -> Case:
     omega = 2.0 * np.pi / (samples_per_period * period)
     waveform = str(rng.choice(['sine', 'multisine']))
     f = 0.22 * m if rng.random() < 0.5 else 0.0
-    # v = y_m / (m - f) + ...: swing v over 1.5 to 4 gaps with the true and with the first slope.
+    # Through (3.2) a first slope that is too large makes v small: y_m is chosen so that v swings
+    # over 1.5 to 4 gaps with the true slope and with the first one.
     slope = max(m, first[0]) - min(f, 0.8 * min(m, first[0]))
     crest = 1.0 if waveform == 'sine' else 0.5
     amplitude = float(rng.uniform(1.5, 4.0)) * 0.5 * (c_r - c_l) * slope / crest
-    response = np.polyval(numerator, np.exp(1j * omega * period)) / np.polyval(
-        denominator, np.exp(1j * omega * period)
-    )
-    swing = float(2.0 * abs(response) * amplitude * crest)
-    noise = 0.002 * swing
     parameters = Parameters({
         'plant.numerator': numerator.tolist(), 'plant.denominator': denominator.tolist(),
         'backlash.m': m, 'backlash.c_r': c_r, 'backlash.c_l': c_l,
@@ -79,7 +77,21 @@ def random_case(seed: int, **fixed: object) -> Case:
         'estimator.initial.m': first[0], 'estimator.initial.c_r': first[1],
         'estimator.initial.c_l': first[2], 'proportional.f': f,
         'waveform': waveform, 'amplitude': amplitude, 'frequency': float(omega),
-        'sample_period': period, 'output_noise_std': noise,
-        'estimator.output_noise_std': noise, 'seed': seed, **fixed,
+        'sample_period': period, 'seed': seed,
     })
-    return Case(seed, parameters, PERIODS * samples_per_period, f'{kind} {waveform}')
+    noise = NOISE_TO_SWING * _swing(parameters, samples_per_period)
+    changes = {'output_noise_std': noise, 'estimator.output_noise_std': noise, **fixed}
+    return Case(
+        seed, parameters.replaced(changes), PERIODS * samples_per_period, f'{kind} {waveform}'
+    )
+
+
+def _swing(parameters: Parameters, samples_per_period: int) -> float:
+    """Peak to peak of y in the last period of the loop that knows the backlash, without noise."""
+    known = parameters.replaced({
+        'estimator.law': 'fixed',
+        **{f'estimator.initial.{name}': parameters[f'backlash.{name}']
+           for name in ('m', 'c_r', 'c_l')},
+    })
+    y = build_closed_loop(known).run(PERIODS * samples_per_period + 1).column('y')
+    return float(np.ptp(y[-samples_per_period:]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from math import nan
 
@@ -55,6 +56,16 @@ def signals(size: float = 100.0, min_size: int = 1, max_size: int = 60) -> st.Se
     return st.lists(value, min_size=min_size, max_size=max_size)
 
 
+@st.composite
+def strokes(draw: st.DrawFn, size: float = 60.0, most: int = 8) -> list[float]:
+    """A signal that moves from one random value to the next, each time in 2 to 30 samples."""
+    signal = [0.0]
+    for _ in range(draw(st.integers(2, most))):
+        count = draw(st.integers(2, 30))
+        signal += np.linspace(signal[-1], draw(st.floats(-size, size)), count + 1)[1:].tolist()
+    return signal
+
+
 def eighths(low: int, high: int) -> st.SearchStrategy:
     """Multiples of 1/8: their products are exact in floating point."""
     return st.integers(low, high).map(lambda i: i / 8.0)
@@ -106,16 +117,30 @@ def paper_example(**changes: object) -> Parameters:
 class KnownInput:
     """Stands in for InputReconstruction where u is known: hand u(k-1) over as y(k)."""
 
-    lag = 1
     std = 0.0
-    ready = True
     innovation = nan
 
-    def __init__(self) -> None:
-        self.u_hat = 0.0
+    def __init__(self, lag: int = 1) -> None:
+        self.lag = lag
+        self._window: deque[float] = deque([0.0] * lag, maxlen=lag)
+        self._samples = 0
 
-    def update(self, y: float | None) -> float:
-        """Return u(k-1)."""
-        if y is not None:
-            self.u_hat = y
-        return self.u_hat
+    @property
+    def u_hat(self) -> float:
+        """u(k - lag)."""
+        return self._window[0]
+
+    @property
+    def ready(self) -> bool:
+        """Whether u(k - lag) lies after the start."""
+        return self._samples >= self.lag
+
+    def newer(self, samples: int) -> float:
+        """u(k - lag + samples)."""
+        return self._window[samples]
+
+    def update(self, y: float) -> float:
+        """Take in u(k-1) and return u(k - lag)."""
+        self._window.append(y)
+        self._samples += 1
+        return self._window[0]

@@ -95,7 +95,7 @@ def test_control_that_was_really_applied_replaces_the_own_command() -> None:
     estimator = Notebook()
     c = controller(estimator)
     c.step(0.0, 1.0)
-    c.step(0.1, 2.0, lost=1, applied=0.75)
+    c.step(0.1, 2.0, lost=1, applied=(0.75, 0.75))
     assert [interval.v for _, interval in estimator.updates] == [0.75, 0.75]
 
 
@@ -156,7 +156,7 @@ def test_input_that_is_not_finite_is_refused_and_changes_nothing(name: str, bad:
         c.step(0.0, 1.0)
     values: dict[str, float] = {'y': 0.1, 'y_m': 2.0, 'applied': 1.0, name: bad}
     with pytest.raises(ValueError, match='must be finite'):
-        disturbed.step(values['y'], values['y_m'], applied=values['applied'])
+        disturbed.step(values['y'], values['y_m'], applied=(values['applied'],))
     assert estimator.updates == []
     assert disturbed.step(0.2, 3.0) == reference.step(0.2, 3.0)
 

@@ -96,13 +96,42 @@ def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
     assert commands.late == 1
 
 
-def test_reported_controls_count_only_if_there_is_one_per_interval() -> None:
+def reported(end: int, *reports: tuple[float, float]) -> list[list[float]]:
+    """What reports (sample, v) tell of outputs 1 .. end, each taken as far as it has come."""
     commands = CommandHistory(PERIOD_S)
-    commands.report(1.0, START_NS + PERIOD_NS)
-    commands.report(2.0, START_NS + 2 * PERIOD_NS)
-    assert commands.reported_over(2, START_NS + 2 * PERIOD_NS) == [1.0, 2.0]
-    assert commands.reported_over(1, START_NS + 3 * PERIOD_NS) == []
-    assert commands.unreported == 1
+    commands.begin(START_NS)
+    answers = []
+    for k in range(1, end + 1):
+        for sample, v in reports:
+            if k - 1 < sample <= k:
+                commands.report(v, START_NS + int(sample * PERIOD_NS) - 1000)
+        answers.append(commands.reported_over(1, START_NS + k * PERIOD_NS))
+    return answers
+
+
+def test_a_reported_control_belongs_to_the_output_after_it() -> None:
+    assert reported(3, (1, 10.0), (2, 20.0), (3, 30.0)) == [[10.0], [20.0], [30.0]]
+
+
+def test_an_interval_without_a_report_takes_none_from_its_neighbours() -> None:
+    assert reported(3, (1, 10.0), (3, 30.0)) == [[10.0], [], [30.0]]
+
+
+def test_a_report_that_comes_after_its_output_is_not_taken_for_the_next_one() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.begin(START_NS)
+    assert commands.reported_over(1, START_NS + PERIOD_NS) == []
+    commands.report(10.0, START_NS + PERIOD_NS - 1000)
+    assert commands.reported_over(1, START_NS + 2 * PERIOD_NS) == []
+    assert commands.unreported == 2
+
+
+def test_reports_over_lost_outputs_are_used_one_by_one() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.begin(START_NS)
+    for k in (1, 2, 3):
+        commands.report(10.0 * k, START_NS + k * PERIOD_NS - 1000)
+    assert commands.reported_over(3, START_NS + 3 * PERIOD_NS) == [10.0, 20.0, 30.0]
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from backlash_ros.tools import analysis, figures, report
 from backlash_ros.tools.bag_reading import read_bag
 from backlash_ros.tools.configuration import write_config
 from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.results import write_run, write_summary
+from backlash_ros.tools.results import summarise, write_run, write_summary
 
 PARAMETERS = Parameters({'estimator.law': 'lms', 'output_noise_std': 1e-4})
 LATENCY_S = 0.0004
@@ -353,12 +353,13 @@ def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None
             rows[:, COLUMNS.index(name)] = nan
     shown = replace(run, rows=rows)
     parts = analysis.interesting_parts(shown, PARAMETERS)
+    late = shown.column('y_m')
+    references = [analysis.FollowedReference(late, 0.6, followed) for followed in (True, False)]
     settling = {'m': 0.5, 'c_r': None, 'c_l': 0.9}
     drawn = [
         figures.draw_estimates(shown), figures.draw_innovation(shown, parts[0]),
         figures.draw_hysteresis(shown, parts[1]), figures.draw_input(shown, parts),
-        figures.draw_output(shown, parts[1], together=False),
-        figures.draw_output(shown, parts[1], together=True),
+        *(figures.draw_output(shown, parts[1], reference) for reference in references),
     ]
     if truth:
         traces = analysis.compare_laws(shown, PARAMETERS)
@@ -372,6 +373,28 @@ def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None
             assert not overlap(box, second), f'{one!r} and {other!r} overlap'
         for (one, box), (title, area) in itertools.product(texts, areas):
             assert not overlap(box, area), f'{one!r} covers data of {title!r}'
+
+
+def test_output_is_compared_with_the_reference_as_late_as_the_structure_makes_it() -> None:
+    tracking = Parameters({'structure': 'tracking', 'amplitude': 0.2, 'tracking.preview': 60})
+    run = build_closed_loop(tracking).run(300)
+    reference = analysis.followed_reference(run, tracking)
+    assert reference.delay == pytest.approx(0.6)
+    np.testing.assert_array_equal(reference.values[60:], run.column('y_m')[:-60])
+    assert reference.followed
+    assert not analysis.followed_reference(run, None).followed
+    late, prompt = (summarise(run, known)['tracking_error_rms'] for known in (tracking, None))
+    assert late < 0.5 < prompt
+
+
+def test_diverging_law_does_not_flatten_the_others(run: RunRecord) -> None:
+    t = run.column('t')
+    mild, wild = np.full(len(t), 2.0), np.geomspace(1.0, 1e150, len(t))
+    traces = [analysis.LawTrace('lms', t, mild, mild, True),
+              analysis.LawTrace('printed', t, wild, wild, False)]
+    figure = figures.draw_laws(traces, analysis.Part('Start', slice(20)))
+    low, high = figure.axes[-1].get_ylim()
+    assert low < 2.0 < high < 1e5
 
 
 def test_moving_rms_is_that_of_the_newest_samples() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.controller import AdaptiveController, Limits
+from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Bounds, Estimate, Estimator
 from backlash_ros.core.fixed import FixedBacklash
 from backlash_ros.core.input_reconstruction import InputReconstruction
@@ -17,6 +18,7 @@ from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.lq_preview import preview_gains
+from backlash_ros.core.model_check import check_model, model_warnings
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.printed_law import PrintedLaw
 from backlash_ros.core.proportional import Proportional
@@ -39,7 +41,13 @@ def build_model(p: Parameters) -> TransferFunction:
 
 
 def build_controller(p: Parameters) -> AdaptiveController:
-    """The controller with the law and the structure that the parameters name."""
+    """The controller with the law and the structure that the parameters name.
+
+    Raises ParameterError for parameters that contradict each other and for a G(z) through which
+    the backlash cannot be learned.
+    """
+    check_model(build_model(p))
+    _check_first_guess(p)
     period = p.real('sample_period')
     inverse = BacklashInverse(
         p.real('inverse.direction_band'), p.real('inverse.take_up_rate') * period
@@ -48,6 +56,26 @@ def build_controller(p: Parameters) -> AdaptiveController:
         ESTIMATORS[p.word('estimator.law')](p), STRUCTURES[p.word('structure')](p), inverse,
         build_limits(p),
     )
+
+
+def _check_first_guess(p: Parameters) -> None:
+    bounds = _bounds(p)
+    for name in ('m', 'c_r', 'c_l'):
+        low, high = getattr(bounds, name)
+        value = p.real(f'estimator.initial.{name}')
+        if not low <= value <= high:
+            raise ParameterError(
+                f'estimator.initial.{name}', value, f'must lie within [{low:g}, {high:g}]',
+                f'change it or estimator.bounds.{name}',
+            )
+    low, high = p.pair('proportional.bounds')
+    if low >= high:
+        raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')
+
+
+def warnings_of(p: Parameters) -> list[str]:
+    """What is allowed but will make the estimate hard, a sentence each."""
+    return model_warnings(build_model(p), p.real('sample_period'), p.real('frequency'))
 
 
 def build_limits(p: Parameters) -> Limits:
@@ -145,7 +173,10 @@ def _tracking(p: Parameters) -> Structure:
         state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview')
     )
     careful = preview_gains(state, CAREFUL * weight, 0.0, 0)
-    return Tracking(state, gains, careful.state, p.real('inverse.caution'))
+    return Tracking(
+        state, gains, careful.state, p.real('inverse.caution'),
+        p.real('estimator.output_noise_std'),
+    )
 
 
 ESTIMATORS: dict[str, Callable[[Parameters], Estimator]] = {

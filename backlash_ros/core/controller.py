@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import inf, isfinite
 
 from backlash_ros.core.errors import ParameterError
@@ -61,25 +62,28 @@ class AdaptiveController:
         self._interval: Interval | None = None
 
     def step(
-        self, y: float, y_m: float, lost: int = 0, applied: float | None = None,
+        self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
     ) -> ControlStep:
         """Return the command for sample k.
 
         y, y_m: output and reference, finite. lost: samples that never arrived since the last
         call; the plant went on with the last v through all of them. applied: the v that was
-        really applied since then, if it is known.
+        really applied in each of the lost + 1 intervals since then, if it is known.
         """
-        if not (isfinite(y) and isfinite(y_m)):
-            raise ValueError(f'y={y!r} and y_m={y_m!r} must be finite')
+        if not (isfinite(y) and isfinite(y_m) and all(map(isfinite, applied))):
+            raise ValueError(f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite')
+        if lost < 0 or len(applied) not in (0, lost + 1):
+            raise ValueError(f'lost={lost!r} must be >= 0 and applied have lost + 1 values')
         estimator = self.estimator
         interval = self._interval
         if interval is not None:
-            if applied is not None:
-                interval = Interval(applied, interval.y_m, interval.u_d, interval.f)
-            for _ in range(lost):
-                estimator.update(None, interval)
+            held = [interval] * (lost + 1)
+            if applied:
+                held = [replace(interval, v=v) for v in applied]
+            for passed in held[:-1]:
+                estimator.update(None, passed)
             self.lost_samples += lost
-            estimator.update(y, interval)
+            estimator.update(y, held[-1])
         inverse = self.inverse
         v_before = inverse.v
         situation = Situation(y_m, y, estimator.estimate, estimator.x_hat, estimator.x_cov)

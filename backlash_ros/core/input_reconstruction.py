@@ -10,6 +10,7 @@ Reference: B. D. O. Anderson, J. B. Moore, Optimal Filtering, Prentice-Hall 1979
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import nan
 
 import numpy as np
@@ -17,59 +18,73 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.model_check import check_model
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-INPUT_STEP_STD = 1.0  # of w: only its ratio to the noise of y matters
-# Without noise on y the smoother still needs some: this far below the weakest response of y to w.
-NOISE_FLOOR = 1e-3
+# y is scaled so that a typical step of u, of size 1, shows in it with size 1. The floors say how
+# much noise the smoother assumes at least: this share of the weakest response, which counts as no
+# weaker than so much of the typical one.
+NOISE_FLOOR, WEAKEST = 1e-3, 1e-4
+# After a lost sample the covariances take this many lags to become stationary again.
+LAGS_TO_STEADY = 4
+
+
+@dataclass
+class _Covariance:
+    """p: of the predicted [x; u]. rows: of u(k-i), i = 0 .. lag, with it. var: of u(k-i)."""
+
+    p: Array
+    rows: Array
+    var: Array
 
 
 class InputReconstruction:
-    """Steady-state fixed-lag smoother: u_hat(k - lag) from y(..k).
+    """Fixed-lag smoother: u_hat(k - lag) from y(..k).
 
-    model: G(z). noise_std: standard deviation of the noise on y. lag: samples, >= 1.
-    Raises ParameterError where y does not show u (G has a zero at z = 1).
+    model: G(z). noise_std: standard deviation of the noise on y. lag: samples, no less than the
+    delay of G. std: standard deviation of u_hat while no sample is lost. Raises ParameterError.
     """
 
     def __init__(self, model: TransferFunction, noise_std: float, lag: int) -> None:
+        check_model(model)
+        if lag < model.delay:
+            raise ParameterError(
+                'estimator.lag', lag, f'must be >= {model.delay}', 'G(z) delays u by as much'
+            )
         self.lag = lag
         self.innovation = nan
+        self.samples = 0
         state = StateModel(model)
-        n = state.order
-        transition = np.block([[state.a, state.b[:, None]], [np.zeros((1, n)), np.ones((1, 1))]])
-        output = np.zeros(n + 1)
-        output[0] = self._c = state.c
-        process = np.zeros((n + 1, n + 1))
-        process[n, n] = INPUT_STEP_STD**2
-        noise = max(noise_std, NOISE_FLOOR * _weakest_response(model)) ** 2
-        try:
-            p = linalg.solve_discrete_are(
-                transition.T, output[:, None], process, np.array([[noise]])
-            )
-        except (linalg.LinAlgError, ValueError):
-            raise ParameterError(
-                'plant.numerator', model.numerator.tolist(),
-                'gives a G(z) through which u cannot be reconstructed',
-                'G(z) must have no zero at z = 1 and no hidden unstable pole',
-            ) from None
-        variance = float(output @ p @ output) + noise
-        self._gain = p @ output / variance
-        self._transition = transition
-        closed = transition - transition @ np.outer(self._gain, output)
-        # Smoothing gains of u(k - i), i = 0 .. lag: cross covariance with the present error.
-        rows = np.empty((lag + 1, n + 1))
-        rows[0] = p[n]
-        for i in range(lag):
-            rows[i + 1] = rows[i] @ closed.T
-        self._lag_gain = rows @ output / variance
-        removed = np.cumsum((rows @ output) ** 2 / variance)
-        self.std = float(np.sqrt(max(p[n, n] - removed[-1], 0.0)))
+        n = self._n = state.order
+        self._scale, weakest = _typical_and_weakest(model)
+        self._c = state.c
+        self._transition = np.eye(n + 1)
+        self._transition[:n, :n], self._transition[:n, n] = state.a, state.b / self._scale
+        self._noise = max(noise_std / self._scale, NOISE_FLOOR * weakest) ** 2
+        self._steady = self._stationary()
+        self._gain, self._lag_gain = self._gains(self._steady)
+        self._after_steady = self._covariance = self._measured(self._steady)
+        self.std = float(np.sqrt(self._after_steady.var[-1]))
         self._x = np.zeros(n + 1)
         self._window = np.zeros(lag + 1)  # u_hat(k - i) given y(..k)
-        self.samples = 0
+        self._since_loss = LAGS_TO_STEADY * lag
+
+    def _stationary(self) -> _Covariance:
+        """Covariances before a measurement when no sample was ever lost."""
+        size, lag = self._n + 1, self.lag
+        output, process = np.zeros((size, 1)), np.zeros((size, size))
+        output[0, 0], process[-1, -1] = self._c, 1.0
+        p = linalg.solve_discrete_are(
+            self._transition.T, output, process, np.array([[self._noise]])
+        )
+        covariance = _Covariance(p, np.tile(p[-1], (lag + 1, 1)), np.full(lag + 1, p[-1, -1]))
+        for _ in range(lag):
+            covariance = self._propagated(self._measured(covariance))
+            covariance.p = p
+        return covariance
 
     @property
     def u_hat(self) -> float:
@@ -82,13 +97,15 @@ class InputReconstruction:
 
     @property
     def ready(self) -> bool:
-        """Whether enough samples came in for the lag and for the start to be forgotten."""
-        return self.samples > 2 * self.lag
+        """Whether the start is forgotten and u_hat about as good as without lost samples."""
+        if self.samples <= 2 * self.lag:
+            return False
+        return bool(self._covariance.var[-1] <= 4.0 * self.std**2)
 
     @property
     def x_hat(self) -> Array:
         """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-        return self._x[:-1]
+        return np.asarray(self._x[:-1] * self._scale)
 
     def update(self, y: float | None) -> float:
         """Take in y(k), None if it was lost, and return u_hat(k - lag)."""
@@ -96,20 +113,52 @@ class InputReconstruction:
         window[1:] = window[:-1].copy()
         x = self._transition @ self._x
         window[0] = x[-1]
+        self._since_loss = 0 if y is None else self._since_loss + 1
+        steady = self._since_loss > LAGS_TO_STEADY * self.lag
+        if steady:
+            self._covariance, gain, lag_gain = self._after_steady, self._gain, self._lag_gain
+        else:
+            covariance = self._propagated(self._covariance)
+            gain, lag_gain = self._gains(covariance)
+            self._covariance = covariance if y is None else self._measured(covariance)
         if y is None:
             self.innovation = nan
         else:
-            e = y - self._c * float(x[0])
-            window += self._lag_gain * e
-            x += self._gain * e
-            self.innovation = e
+            e = y / self._scale - self._c * float(x[0])
+            window += lag_gain * e
+            x += gain * e
+            self.innovation = e * self._scale
         self._x = x
         self.samples += 1
         return float(window[-1])
 
+    def _gains(self, covariance: _Covariance) -> tuple[Array, Array]:
+        """Gains of [x; u] (n + 1,) and of u(k-i) (lag + 1,)."""
+        c = self._c
+        variance = c * c * covariance.p[0, 0] + self._noise
+        return covariance.p[:, 0] * (c / variance), covariance.rows[:, 0] * (c / variance)
 
-def _weakest_response(model: TransferFunction) -> float:
-    """Smallest |G W| on the unit circle off its zeros, W = 1/(z - 1) being the random walk."""
+    def _measured(self, covariance: _Covariance) -> _Covariance:
+        gain, lag_gain = self._gains(covariance)
+        row = self._c * covariance.p[0]
+        return _Covariance(
+            covariance.p - np.outer(gain, row), covariance.rows - np.outer(lag_gain, row),
+            covariance.var - lag_gain * self._c * covariance.rows[:, 0],
+        )
+
+    def _propagated(self, covariance: _Covariance) -> _Covariance:
+        p = self._transition @ covariance.p @ self._transition.T
+        p[-1, -1] += 1.0
+        p = 0.5 * (p + p.T)
+        rows, var = np.empty_like(covariance.rows), np.empty_like(covariance.var)
+        rows[1:], rows[0] = covariance.rows[:-1] @ self._transition.T, p[-1]
+        var[1:], var[0] = covariance.var[:-1], p[-1, -1]
+        return _Covariance(p, rows, var)
+
+
+def _typical_and_weakest(model: TransferFunction) -> tuple[float, float]:
+    """Median of |G W| on the unit circle, W = 1/(z - 1), and its minimum in units of that."""
     z = np.exp(1j * np.linspace(0.01, np.pi, 200))
-    response = np.abs(model.response(z) / (z - 1.0)) * INPUT_STEP_STD
-    return float(max(response.min(), 1e-6 * np.median(response)))
+    response = np.abs(model.response(z) / (z - 1.0))
+    typical = float(np.median(response))
+    return typical, max(float(response.min()) / typical, WEAKEST)

@@ -29,7 +29,7 @@ class BacklashInverse:
         self.v = 0.0
         self.side = Region.GAP  # line in use; GAP until u_d moves for the first time
         self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
-        self._taking_up = False
+        self.taking_up = False  # whether v is still on its way to the line
 
     def widen_band(self, band: float) -> None:
         """Use this band while it is wider than the one set: the noise of u_d may vary."""
@@ -54,16 +54,16 @@ class BacklashInverse:
         """Return v(t) for u_d(t) and the parameters in use, equation (2.3)."""
         side = self.direction(u_d)
         if side != Region.GAP:
-            self._taking_up = self._taking_up or side != self.side
+            self.taking_up = self.taking_up or side != self.side
             self.side, self.extreme = side, u_d
-        elif not self._taking_up:
+        elif not self.taking_up:
             return self.v
         target = self.extreme / m + (c_r if self.side == Region.RIGHT else c_l)
         move = target - self.v
-        if self._taking_up and abs(move) > self.take_up:
+        if self.taking_up and abs(move) > self.take_up:
             self.v += self.take_up if move > 0.0 else -self.take_up
         else:
-            self.v, self._taking_up = target, False
+            self.v, self.taking_up = target, False
         return self.v
 
     def hold(self, u_d: float) -> float:
@@ -75,4 +75,6 @@ class BacklashInverse:
     def applied(self, v: float) -> None:
         """Say which v was really applied (limits), so that the next move starts from there."""
         self.limited = v != self.v
+        # A v that was held back goes on its way although u_d rests.
+        self.taking_up = self.taking_up or self.limited
         self.v = v

@@ -26,6 +26,7 @@ from backlash_ros.core.input_reconstruction import InputReconstruction
 # either side, by more than so many standard deviations of its error: smoothing rounds the corners.
 STROKE = 8
 MOTION_THRESHOLD = 2.0
+LEAST_SHARE = 0.25  # of the mean motion of the stroke, below which the sample itself rests
 
 
 class NormalisedLms:
@@ -45,7 +46,7 @@ class NormalisedLms:
         self._reconstruction = reconstruction
         self._history = History(reconstruction.lag)
         self._threshold = MOTION_THRESHOLD * reconstruction.std
-        self._past: deque[float] = deque(maxlen=STROKE + 1)
+        self._past: deque[float] = deque([0.0, 0.0], maxlen=STROKE + 1)
         self._v_max = 0.0
 
     @property
@@ -77,15 +78,19 @@ class NormalisedLms:
             return
         ahead = self._reconstruction.newer(STROKE) - u
         behind = u - self._past[0]
-        if min(abs(ahead), abs(behind)) <= self._threshold or (ahead > 0.0) != (behind > 0.0):
+        step, rising = u - self._past[-2], True
+        if min(ahead, behind, step) < 0.0:
+            ahead, behind, step = -ahead, -behind, -step
+            rising = False
+        slowest = min(ahead, behind)
+        if slowest <= self._threshold or step < LEAST_SHARE * slowest / STROKE:
             return
         old = self.estimate
         m, c_r, c_l = old.m, old.c_r, old.c_l
         v = past.v
         self._v_max = max(self._v_max, abs(v))
-        rising = ahead > 0.0
         e = u - m * (v - (c_r if rising else c_l))
-        weight = 1.0 / self._v_max**2 if self._v_max > 0.0 else 0.0
+        weight = 1.0 / self._v_max**2 if self._v_max**2 > 0.0 else 0.0
         gain = self.step * e / (weight * v * v + 1.0)
         # Products first: they enter the error linearly, the crossings follow by division.
         product_r = m * c_r - gain if rising else m * c_r

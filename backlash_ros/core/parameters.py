@@ -103,11 +103,12 @@ def check_value(parameter: Parameter, value: object) -> Value:
     if isinstance(default, tuple):
         return _reals(parameter, value)
     number = _real(parameter, value)
-    if isinstance(default, int):
-        if number != int(number):
-            raise ParameterError(parameter.name, value, 'must be a whole number')
-        return int(number)
-    return number
+    if not isinstance(default, int):
+        return number
+    if number != int(number):
+        raise ParameterError(parameter.name, value, 'must be a whole number')
+    # Beyond 2^53 the detour over a float would lose digits.
+    return value if isinstance(value, int) else int(number)
 
 
 def _flag(parameter: Parameter, value: object) -> bool:
@@ -152,7 +153,10 @@ def _real(parameter: Parameter, value: object) -> float:
             raise ParameterError(parameter.name, value, 'must be a number') from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ParameterError(parameter.name, value, 'must be a number')
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:
+        raise ParameterError(parameter.name, '...', 'is too large for a number') from None
     if isnan(number) or not (isfinite(number) or parameter.infinite):
         raise ParameterError(parameter.name, number, 'must be finite')
     unit = f' {parameter.unit}' if parameter.unit else ''

@@ -59,7 +59,7 @@ class PrintedLaw:
         self._bounds, self._f_bounds = bounds, f_bounds
         self._reconstruction = reconstruction
         self._history = History(reconstruction.lag)
-        self._w = initial.c_r
+        self._upward = True
         self._u_before = 0.0
 
     @property
@@ -91,11 +91,11 @@ class PrintedLaw:
         old = self.estimate
         # w is c_r in the upward region, c_l in the downward one, and kept in the gap.
         if u != self._u_before:
-            self._w = old.c_r if u > self._u_before else old.c_l
-        upward = self._w == old.c_r
-        self._u_before = u
-        f = self._guarded(printed_f(u, past.y_m, old.m, self._w), old.f, self._f_bounds)
-        m = self._guarded(printed_m(u, past.y_m, f, self._w), old.m, self._bounds.m)
+            self._upward = u > self._u_before
+        upward, self._u_before = self._upward, u
+        w = old.c_r if upward else old.c_l
+        f = self._guarded(printed_f(u, past.y_m, old.m, w), old.f, self._f_bounds)
+        m = self._guarded(printed_m(u, past.y_m, f, w), old.m, self._bounds.m)
         c = printed_c(u, past.y_m, f, m)
         c_r = self._guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
         c_l = old.c_l if upward else self._guarded(c, old.c_l, self._bounds.c_l)

@@ -15,6 +15,7 @@ LARGEST_F_OVER_M = 0.8
 
 # Turns of u_d smaller than this many of its standard deviations are noise of the estimates.
 NOISE_BAND = 3.0
+ROUNDING = 1e-12
 
 
 class Proportional:
@@ -35,6 +36,14 @@ class Proportional:
         f = min(estimate.f, LARGEST_F_OVER_M * m)
         right = m * (y_m + f * c_r) / (m - f)
         left = m * (y_m + f * c_l) / (m - f)
+        held = y_m + f * inverse.v
+        if inverse.taking_up:
+            for side, u_d in ((Region.RIGHT, right), (Region.LEFT, left)):
+                if inverse.side == side and inverse.direction(u_d) == Region.GAP:
+                    v = inverse.step(u_d, m, c_r, c_l)  # u_d rests, v goes on to its line
+                    return Command(y_m + f * v, v, f)
+        elif _rests(inverse, held):
+            return Command(held, inverse.v, f)  # first case of (3.3): u_d rests, and so does v
         right_fits = inverse.direction(right) == Region.RIGHT
         left_fits = inverse.direction(left) == Region.LEFT
         if right_fits and left_fits:
@@ -43,8 +52,13 @@ class Proportional:
         if right_fits or left_fits:
             u_d = right if right_fits else left
             return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
-        u_d = y_m + f * inverse.v
-        return Command(u_d, inverse.hold(u_d), f)
+        return Command(held, inverse.hold(held), f)
+
+
+def _rests(inverse: BacklashInverse, u_d: float) -> bool:
+    """Whether u_d has not moved; u_d on a line and y_m + f v differ by rounding."""
+    near = abs(u_d - inverse.extreme) <= ROUNDING * (abs(u_d) + abs(inverse.v))
+    return near or inverse.direction(u_d) == Region.GAP
 
 
 def _deviation(y_m: float, estimate: Estimate) -> float:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.backlash import Backlash, check_backlash
 from backlash_ros.core.transfer_function import TransferFunction
 
 
@@ -74,5 +74,6 @@ class SimulatedPlant:
             value + rate * t + jump
             for value, rate, jump in zip(self._initial, self._extra.rate, jumped, strict=True)
         )
+        check_backlash(m, c_r, c_l)
         backlash = self.backlash
         backlash.m, backlash.c_r, backlash.c_l = m, c_r, c_l

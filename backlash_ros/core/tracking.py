@@ -16,6 +16,16 @@ from backlash_ros.core.structure import Command, Situation
 
 Array = NDArray[np.float64]
 
+# While the reference rests, v rests as well as long as |x - x*| is within so many standard
+# deviations of the noise on y (StateModel scales x so that |x| is the energy of the free response
+# of y over some 50 samples: 7 stands for an error of the size of the noise). Feedback through a gap that is not
+# known to the last digit would cross it for ever.
+REST_TOLERANCE = 7.0
+REST_DOUBT = 2.0  # the same in standard deviations of x, where that is more
+REST_SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
+OFF_AT_REST = 6.0  # standard deviations of y that mean a deviation while the state is unknown
+STEADY = 0.01  # share of the tolerance by which an ideal trajectory at rest may still move
+
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.
 NOISE_BAND = 0.5
@@ -30,10 +40,12 @@ class Tracking:
     While the backlash is unknown, `careful` replaces K: little feedback cannot destabilise a loop
     whose gain is unknown, and the trajectory itself excites it.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
+    noise_std: of y; while the trajectory rests and y is on it within the noise, v rests as well.
     """
 
     def __init__(
         self, model: StateModel, gains: PreviewGains, careful: Array, caution: float,
+        noise_std: float = 0.0,
     ) -> None:
         self.delay = len(gains.preview) - 1
         self._model, self._gains = model, gains
@@ -42,6 +54,8 @@ class Tracking:
         self._x = np.zeros(model.order)  # x* and q* of the trajectory
         self._q = 0.0
         self._integral = 0.0
+        self._noise_std, self._reach = noise_std, 0.0
+        self._resting: float | None = 0.0  # u* at which v rests, None while it moves
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
@@ -57,19 +71,50 @@ class Tracking:
             u_d -= gains.integral * (self._integral - self._q)
         else:
             u_d = ideal - float(self._careful @ deviation)
-        if situation.x_cov is not None:
+        self._rest(situation, deviation, ideal)
+        if self._resting is not None:
+            u_d = self._resting
+            inverse.widen_band(0.0)
+        elif situation.x_cov is not None:
             variance = float(gains.state @ situation.x_cov @ gains.state)
             inverse.widen_band(NOISE_BAND * sqrt(max(variance, 0.0)))
-        c_r, c_l = cautious_crossings(situation.estimate, self._caution)
+        # A single move cannot start a limit cycle, and should leave as little drift as possible.
+        caution = self._caution if self._resting is None else 0.0
+        c_r, c_l = cautious_crossings(situation.estimate, caution)
         v = inverse.step(u_d, situation.estimate.m, c_r, c_l)
         self._advance(ideal, situation.y, trusted, inverse.limited)
         return Command(u_d, v, 0.0)
 
     def _take_in(self, situation: Situation) -> None:
         if not self._window:
-            self._window.extend([situation.y] * (self.delay + 1))
+            start, noise = situation.y, OFF_AT_REST * self._noise_std
+            # What may be noise is no distance to go: a loop at rest stays at rest.
+            near = abs(start - situation.y_m) <= noise
+            self._window.extend([situation.y_m if near else start] * (self.delay + 1))
             self._x = situation.x_hat.copy()
         self._window.append(situation.y_m)
+
+    def _rest(self, situation: Situation, deviation: Array, ideal: float) -> None:
+        """Decide whether v rests: the trajectory does, and y needs no correction."""
+        self._reach = max(self._reach, sqrt(float(self._x @ self._x)))
+        tolerance = max(REST_TOLERANCE * self._noise_std, REST_SHARE * self._reach)
+        motion = self._model.a @ self._x + self._model.b * ideal - self._x
+        still = max(self._window) - min(self._window) <= self._noise_std
+        if not still or sqrt(float(motion @ motion)) > STEADY * tolerance:
+            self._resting = None
+            return
+        if situation.x_cov is None:
+            off = abs(situation.y - self._window[0]) > OFF_AT_REST * self._noise_std
+        else:
+            # x is scaled so that its norm is that of the free response of y over a horizon.
+            doubt = REST_DOUBT * sqrt(max(float(np.trace(situation.x_cov)), 0.0))
+            limit = max(tolerance, doubt)
+            size = sqrt(float(deviation @ deviation))
+            off = size > (0.25 * limit if self._resting is None else limit)
+        if off:
+            self._resting = None
+        elif self._resting is None:
+            self._resting = ideal
 
     def _advance(self, ideal: float, y: float, trusted: bool, limited: bool) -> None:
         r = self._window[0]

@@ -20,6 +20,7 @@ class CommandHistory:
         self.late = 0  # commands that missed their sample
         self.unreported = 0  # outputs without a matching report of the applied v
         self._period_ns = sample_period_s * 1e9
+        self._output_ns = 0  # stamp of the newest output
         self._published: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._reported: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
 
@@ -45,12 +46,20 @@ class CommandHistory:
         self.late += 1
         return [self._at(end_ns - i * self._period_ns) for i in reversed(range(intervals))]
 
+    def begin(self, end_ns: int) -> None:
+        """Note the first output: reports up to here belong to nothing."""
+        self._output_ns = end_ns
+
     def reported_over(self, intervals: int, end_ns: int) -> list[float]:
         """Reports since the last output; empty, and counted, unless there is one per interval."""
-        reports = []
+        begin_ns, self._output_ns = self._output_ns, end_ns
+        stamp_ns, reports = begin_ns, []
         while self._reported and self._reported[0][0] <= end_ns:
-            reports.append(self._reported.popleft()[1])
-        if len(reports) == intervals:
+            stamp_ns, v = self._reported.popleft()
+            if stamp_ns > begin_ns:
+                reports.append(v)
+        # The report of the newest interval may still be under way while older ones are here.
+        if len(reports) == intervals and stamp_ns > end_ns - 0.5 * self._period_ns:
             return reports
         self.unreported += 1
         return []

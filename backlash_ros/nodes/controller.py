@@ -14,14 +14,15 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.controller import ControlStep
 from backlash_ros.core.estimator import Interval, Status
+from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.parameter_table import CONTROLLER
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.command_history import CommandHistory
 from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.events import emit
-from backlash_ros.nodes.live_controller import apply_live, check_live
 from backlash_ros.nodes.loop_statistics import LoopStatistics
 from backlash_ros.nodes.messages import (
     DEPTH,
@@ -83,8 +84,8 @@ class ControllerNode(ProcessNode):
         self._signals = LabelledArrayPublisher(self, topics.SIGNALS, topics.SIGNAL_LABELS)
         self._estimates = LabelledArrayPublisher(self, topics.ESTIMATES, topics.ESTIMATE_LABELS)
         self._diagnostics = DiagnosticsPublisher(self)
-        self._live = LiveParameters(self, p, check_live, lambda q: apply_live(self._core, q))
-        self._listen()
+        self._live = LiveParameters(self, p, build_controller, self._take_up)
+        self._subscribe()
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         if self._timeout > 0.0:
             self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
@@ -95,7 +96,7 @@ class ControllerNode(ProcessNode):
             f'{key}: {count}' for key, count in counts.items() if count or key == 'samples'
         ))
 
-    def _listen(self) -> None:
+    def _subscribe(self) -> None:
         """Subscribe; plant_output only when everything else is there, for it starts the loop."""
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         reference = self.create_subscription(
@@ -195,19 +196,32 @@ class ControllerNode(ProcessNode):
         self._missing = 0
         last = self._last
         if last is None:
+            self._commands.begin(stamp_ns)
             return self._core.step(y, y_m)
+        if self._lockstep:
+            return self._core.step(y, y_m, lost)
         applied: list[float] = []
         if self._use_applied:
             applied = self._commands.reported_over(lost + 1, stamp_ns)
-        if not applied and not self._lockstep:
+        if not applied:
             applied = self._commands.over(lost + 1, stamp_ns)
-        if not applied or applied.count(last.v) == len(applied):
+        if applied.count(last.v) == len(applied):
             return self._core.step(y, y_m, lost)
         while lost and applied.count(applied[-1]) != len(applied):
             interval = Interval(applied.pop(0), last.y_m, last.u_d, last.estimate.f)
             self._core.estimator.update(None, interval)
             lost -= 1
         return self._core.step(y, y_m, lost, applied[-1])
+
+    def _take_up(self, p: Parameters) -> None:
+        """Take up limits, inverse and step sizes without touching what was learned."""
+        core = self._core
+        core.limits = build_limits(p)
+        core.inverse.direction_band = p.real('inverse.direction_band')
+        core.inverse.take_up = p.real('inverse.take_up_rate') * p.real('sample_period')
+        if isinstance(core.estimator, NormalisedLms):
+            core.estimator.step = p.real('lms.step')
+            core.estimator.step_f = p.real('lms.step_f')
 
     def _publish_rows(self, step: ControlStep, latency: float) -> None:
         e, sample = step.estimate, float(self._counter.index)

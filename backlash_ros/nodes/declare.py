@@ -64,12 +64,11 @@ def describe(parameter: Parameter) -> ParameterDescriptor:
 class LiveParameters:
     """Lets parameters change in a running node, all or nothing.
 
-    check(old, new): raises ParameterError for what the node cannot take up. apply(new): takes it
-    up.
+    check: raises ParameterError for a set that the node cannot take up. apply: takes it up.
     """
 
     def __init__(
-        self, node: Node, parameters: Parameters, check: Callable[[Parameters, Parameters], None],
+        self, node: Node, parameters: Parameters, check: Callable[[Parameters], object],
         apply: Callable[[Parameters], None],
     ) -> None:
         self.parameters = parameters
@@ -80,7 +79,7 @@ class LiveParameters:
 
     def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
         try:
-            self._check(self.parameters, self._with(changes))
+            self._check(self._with(changes))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

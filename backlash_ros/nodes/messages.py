@@ -21,10 +21,9 @@ DEPTH = 1000
 KEPT = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def quiet() -> PublisherEventCallbacks:
-    """For topics the loop does not depend on: rclpy looks at every event of every publisher in
-    every pass of the executor, and that delays the command.
-    """
+def without_events() -> PublisherEventCallbacks:
+    """For publishers that the loop does not depend on: nobody is told of unfit subscribers."""
+    # In every pass the executor looks at every event of every publisher; that delays the command.
     return PublisherEventCallbacks(use_default_callbacks=False)
 
 
@@ -33,7 +32,7 @@ class LabelledArrayPublisher:
 
     def __init__(self, node: Node, topic: str, labels: Sequence[str]) -> None:
         self._publisher = node.create_publisher(
-            Float64MultiArray, topic, DEPTH, event_callbacks=quiet()
+            Float64MultiArray, topic, DEPTH, event_callbacks=without_events()
         )
         self._message = Float64MultiArray()
         self._message.layout.dim = [MultiArrayDimension(label=label, size=1) for label in labels]
@@ -56,7 +55,7 @@ class DiagnosticsPublisher:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._publisher = node.create_publisher(
-            DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=quiet()
+            DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=without_events()
         )
         self._status = DiagnosticStatus(name=node.get_fully_qualified_name().strip('/'))
         self._message = DiagnosticArray(status=[self._status])

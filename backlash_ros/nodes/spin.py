@@ -113,7 +113,7 @@ def spin_paced(
             if not idle() or now > looked + LONGEST_BLINDNESS_NS:
                 executor.spin_once(timeout_sec=0.0)
                 looked = now
-            n = int((time.monotonic_ns() - start) / period_ns)
+            n = max(n + 1, int((time.monotonic_ns() - start) / period_ns))
             if not tick(n, start + int(n * period_ns)):
                 return
         elif remaining < NAP_NS and idle():

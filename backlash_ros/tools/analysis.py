@@ -13,15 +13,19 @@ from backlash_ros.core.assembly import ESTIMATORS
 from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Status
+from backlash_ros.core.metrics import delayed_reference, delayed_tracking_error_rms
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
 from backlash_ros.tools.errors import BrokenOffError, InputError
+from backlash_ros.tools.results import reference_delay
 from backlash_ros.tools.simulation import prepare, run_loop
 
 Array = NDArray[np.float64]
 
 LONGEST_COMPARISON = 10_000  # samples for which the other laws are simulated
 POINTS = 4_000  # of a curve in a figure: more cannot be told apart
+# RMS of the error over that of the reference below which y counts as following it.
+FOLLOWING = 0.5
 PERIODIC = ('sine', 'square', 'triangle', 'multisine')
 
 
@@ -54,6 +58,18 @@ def reference_period(parameters: Parameters | None) -> float | None:
 
 
 @dataclass(frozen=True)
+class FollowedReference:
+    """values: the reference at each sample, shape (N,), delay [s] late.
+
+    followed: whether y comes close enough to it for both to be drawn on one scale.
+    """
+
+    values: Array
+    delay: float
+    followed: bool
+
+
+@dataclass(frozen=True)
 class Part:
     """A stretch of a run with a name for it."""
 
@@ -76,7 +92,8 @@ def moving_rms(values: Array, samples: int) -> Array:
     known = np.isfinite(values)
     # Each sum anew: a running one would keep the rounding errors of large values long past.
     window = np.ones(samples)
-    squares = np.convolve(np.where(known, values, 0.0) ** 2, window)[:len(values)]
+    with np.errstate(over='ignore'):  # of a law that diverges
+        squares = np.convolve(np.where(known, values, 0.0) ** 2, window)[:len(values)]
     count = np.convolve(known.astype(np.float64), window)[:len(values)]
     return np.where(count > 0.0, np.sqrt(squares / np.maximum(count, 1.0)), np.nan)
 
@@ -110,6 +127,17 @@ def _simulated(parameters: Parameters, samples: int) -> tuple[Array, Array, str]
     except (ParameterError, InputError, BrokenOffError) as error:
         return np.empty(0), np.empty(0), str(error)
     return run.column('t'), control_error(run), ''
+
+
+def followed_reference(run: RunRecord, parameters: Parameters | None) -> FollowedReference:
+    """What y is to follow: y_m, as late as the structure makes it."""
+    delay = reference_delay(parameters)
+    half = float(run.column('t')[run.samples // 2])
+    error = delayed_tracking_error_rms(run, delay, half)
+    return FollowedReference(
+        delayed_reference(run, delay), delay * run.sample_period,
+        error is not None and error < FOLLOWING,
+    )
 
 
 def estimated_loop(run: RunRecord) -> Array:

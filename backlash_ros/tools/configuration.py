@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from math import isfinite
@@ -178,8 +179,8 @@ def shipped_configs() -> Path:
     # The source tree first: beside the code that runs lies the configuration written for it.
     places = [Path(__file__).resolve().parents[2] / 'config']
     try:
-        from ament_index_python.packages import get_package_share_directory
-        places.append(Path(get_package_share_directory(PACKAGE)) / 'config')
+        ament_index = importlib.import_module('ament_index_python.packages')
+        places.append(Path(ament_index.get_package_share_directory(PACKAGE)) / 'config')
     except (ImportError, LookupError, OSError):
         pass  # no ament index here, or the package is not in it
     places.append(Path(sys.prefix) / 'share' / PACKAGE / 'config')

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.run_record import RunRecord
-from backlash_ros.tools.analysis import LawTrace, Part, control_error, estimated_loop, frozen
+from backlash_ros.tools.analysis import (
+    FollowedReference,
+    LawTrace,
+    Part,
+    control_error,
+    estimated_loop,
+    frozen,
+)
 from backlash_ros.tools.drawing import (
     COLOURS,
     ESTIMATES,
@@ -39,6 +46,7 @@ TIME = 'time t [s]'
 NAMES = ('m', 'c_r', 'c_l')
 WHOLE = Part('Whole run', slice(None))
 DECADES = 8.0  # that a logarithmic axis shows at most: what is below them is as good as zero
+DIVERGED = 1e3  # times the largest error of the best law: more need not be told apart
 STD_MARGIN = 0.25  # of the range of the estimates that is left for their standard deviations
 
 
@@ -166,10 +174,14 @@ def _draw_sizes(axes: Axes, traces: Sequence[LawTrace], part: Part) -> None:
         size = np.where(trace.rms > 0.0, trace.rms, np.nan)
         curve(axes, trace.t[part.rows], size[part.rows], LAW_COLOURS.get(trace.law, OTHER_LAW),
               trace.law, style, 1.8)
-    known = np.concatenate([trace.rms[trace.rms > 0.0] for trace in traces])
-    if known.size:
+    sizes = [trace.rms[np.isfinite(trace.rms) & (trace.rms > 0.0)] for trace in traces]
+    # A law that diverges leaves the axes, which are made for those that do not.
+    highest = [float(size.max()) for size in sizes if size.size]
+    if highest:
+        top = min(max(highest), DIVERGED * min(highest))
         # Not the least of all: an error begins at zero.
-        limit_decades(axes, float(np.percentile(known, 2)), float(known.max()), DECADES)
+        low = float(np.percentile(np.concatenate(sizes), 2))
+        limit_decades(axes, low, top, DECADES)
     label(axes, x=TIME)
 
 
@@ -208,24 +220,29 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     return figure
 
 
-def draw_output(run: RunRecord, end: Part, together: bool) -> Figure:
-    """Reference and output: on one scale if `together`, else each on its own."""
+def draw_output(run: RunRecord, end: Part, reference: FollowedReference) -> Figure:
+    """Reference and output: on one scale where y follows, else each on its own."""
     figure = new_figure(5.6)
-    t, y, y_m = run.column('t'), run.column('y'), run.column('y_m')
+    t, y = run.column('t'), run.column('y')
     grid = figure.subplots(2, 2, sharex='col')
+    late = f', {reference.delay:.4g} s late' if reference.delay else ''
+    lower_signal = y - reference.values if reference.followed else y
     for column, part in enumerate((WHOLE, end)):
         upper, lower = grid[0][column], grid[1][column]
-        curve(upper, t[part.rows], y_m[part.rows], COLOURS['y_m'], '$y_m$',
-              '--' if together else '-')
-        shown = y - y_m if together else y
-        curve(lower, t[part.rows], shown[part.rows], COLOURS['y'])
-        if together:
+        curve(upper, t[part.rows], reference.values[part.rows], COLOURS['y_m'], f'$y_m${late}',
+              '--' if reference.followed else '-')
+        curve(lower, t[part.rows], lower_signal[part.rows], COLOURS['y'])
+        if reference.followed:
             curve(upper, t[part.rows], y[part.rows], COLOURS['y'], 'y')
             legend_above(upper)
         label(upper, part.name)
         label(lower, x=TIME)
-    label(grid[0][0], y='[unit of y]' if together else 'reference $y_m$ [unit of $y_m$]')
-    label(grid[1][0], y='$y - y_m$ [unit of y]' if together else 'output y [unit of y]')
+    if reference.followed:
+        label(grid[0][0], y='[unit of y]')
+        label(grid[1][0], y='y minus reference [unit of y]')
+    else:
+        label(grid[0][0], y=f'reference $y_m$ [unit of $y_m$]{late}')
+        label(grid[1][0], y='output y [unit of y]')
     return figure
 
 
@@ -250,10 +267,10 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     return figure
 
 
-def draw_innovation(run: RunRecord, start: Part) -> Figure:
+def draw_innovation(run: RunRecord, end: Part) -> Figure:
     """y minus its prediction: the health of the model where no truth is known."""
     figure = new_figure(3.4)
-    for axes, part in zip(figure.subplots(1, 2), (start, WHOLE), strict=True):
+    for axes, part in zip(figure.subplots(1, 2), (WHOLE, end), strict=True):
         t = run.column('t')[part.rows]
         curve(axes, t, run.column('innovation')[part.rows], COLOURS['e'])
         shade(axes, t, frozen(run)[part.rows], 'frozen')

@@ -9,7 +9,7 @@ from html import escape
 from typing import Any
 
 NAMES = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
-UNITS = {'m': 'u/v', 'c_r': 'v', 'c_l': 'v'}
+UNITS = {'m': 'of u/v', 'c_r': 'of v', 'c_l': 'of v'}
 NOTHING = '–'
 
 STYLE = """
@@ -108,7 +108,7 @@ def _backlash_table(summary: Mapping[str, Any]) -> str:
             NOTHING if truth is None else 'never' if settled is None else f'{settled:.4g} s',
             UNITS[name],
         ))
-    rows.append(('f', _number(summary['final']['f'], 6), *[NOTHING] * 4, 'u/v'))
+    rows.append(('f', _number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
     return _table(header, rows)
 
 
@@ -120,14 +120,16 @@ def relative_error(final: float, truth: float | None) -> str:
 
 
 def _facts_table(summary: Mapping[str, Any]) -> str:
-    latency, tracking = summary['loop_latency_ms'], summary['tracking_error_rms']
+    latency = summary['loop_latency_ms']
+    control, tracking = summary['control_error_rms'], summary['tracking_error_rms']
     duration = summary['samples'] + summary['lost_samples']
     facts = [
         ('samples', f'{summary["samples"]} in {duration * summary["sample_period"]:.6g} s'),
         ('lost samples', str(summary['lost_samples'])),
         ('sample period', f'{summary["sample_period"]:.6g} s'),
         ('structure', escape(summary['structure'] or NOTHING)),
-        ('control error RMS, last second', f'{_number(summary["control_error_rms"])} u'),
+        ('control error RMS, last second',
+         NOTHING if control is None else f'{control:.4g} [unit of u]'),
         ('tracking error RMS, last half',
          NOTHING if tracking is None else f'{100.0 * tracking:.3g} % of y<sub>m</sub>'),
         ('latency y → v, median',

@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import figures
-from backlash_ros.tools.analysis import compare_laws, compared_samples, interesting_parts
+from backlash_ros.tools.analysis import (
+    compare_laws,
+    compared_samples,
+    followed_reference,
+    interesting_parts,
+)
 from backlash_ros.tools.bag_reading import is_bag, read_bag
 from backlash_ros.tools.command_line import OptionParser, run_tool
 from backlash_ros.tools.configuration import effective_parameters, load_config, write_config
@@ -40,8 +45,6 @@ from backlash_ros.tools.results import (
 PAGE = 'report.html'
 BAG = 'bag'
 TITLE = 'Adaptive backlash inverse control'
-# y is drawn on the scale of y_m where it follows y_m at least this well.
-FOLLOWING = 0.5
 Array = NDArray[np.float64]
 
 
@@ -126,7 +129,7 @@ def draw(source: Source, summary: dict[str, Any]) -> Iterable[Picture]:
         yield Picture(
             'innovation.png', 'Innovation',
             'y minus its prediction. White and small: the model explains the plant.',
-            png(figures.draw_innovation(run, start)),
+            png(figures.draw_innovation(run, end)),
         )
     if run.has_truth and parameters is not None:
         duration = compared_samples(run) * run.sample_period
@@ -143,13 +146,13 @@ def draw(source: Source, summary: dict[str, Any]) -> Iterable[Picture]:
         'The loop as the last estimates see it: u itself was not measured.',
         png(figures.draw_hysteresis(run, end)),
     )
-    tracking = summary['tracking_error_rms']
-    together = tracking is not None and tracking < FOLLOWING
+    reference = followed_reference(run, parameters)
     yield Picture(
         'output.png', 'Reference and output',
-        'y follows y<sub>m</sub>.' if together else
-        'Each on its own scale: this structure makes u follow u<sub>d</sub>, not y follow '
-        'y<sub>m</sub>.', png(figures.draw_output(run, end, together)),
+        'y follows y<sub>m</sub>.' if reference.followed else
+        'Each on its own scale: y does not follow y<sub>m</sub>, which the structure '
+        'u<sub>d</sub> = y<sub>m</sub> + f v does not aim at.',
+        png(figures.draw_output(run, end, reference)),
     )
     yield Picture(
         'input.png', 'Desired input and control',

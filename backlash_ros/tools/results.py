@@ -15,7 +15,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.metrics import control_error_rms, settling_time, tracking_error_rms
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.metrics import (
+    control_error_rms,
+    delayed_tracking_error_rms,
+    settling_time,
+)
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.errors import InputError
@@ -85,9 +90,16 @@ def summarise(
         'truth': {name: last[f'true_{name}'] if truth else None for name in BACKLASH},
         'settling_time_s': settling,
         'control_error_rms': control_error_rms(run),
-        'tracking_error_rms': tracking_error_rms(run),
+        'tracking_error_rms': delayed_tracking_error_rms(
+            run, reference_delay(parameters), float(t[run.samples // 2])
+        ),
         'loop_latency_ms': _latency_ms(latency_s),
     }
+
+
+def reference_delay(parameters: Parameters | None) -> int:
+    """Samples by which y is to follow y_m late, which the structure decides; 0 if unknown."""
+    return build_controller(parameters).structure.delay if parameters else 0
 
 
 def _latency_ms(latency_s: NDArray[np.float64] | None) -> dict[str, float] | None:

@@ -66,13 +66,20 @@ def _once(parameters: Parameters, duration: float | None, out: Path | None) -> N
     from backlash_ros.tools.report import PAGE, report_run
     samples = number_of_samples(parameters, duration)
     loop = prepare(parameters)
-    directory = result_directory(out)
+    _refuse_bad(out)
     # disable=None: no bar where stderr is not a terminal.
     with tqdm(total=samples, desc='simulate', unit='sample', disable=None) as bar:
         run = run_loop(loop, samples, lambda _: bar.update())
+    directory = result_directory(out)
     summary = report_run(run, directory, parameters)
     print(run_table(summary))
     print(f'report: {directory / PAGE}')
+
+
+def _refuse_bad(out: Path | None) -> None:
+    """Fail before a long run, not after it; a folder of its own is made only for a whole run."""
+    if out is not None:
+        result_directory(out)
 
 
 def run_table(summary: Mapping[str, Any]) -> str:
@@ -98,9 +105,10 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     first = parameters.integer('seed')
     seeds = range(first, first + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
+    _refuse_bad(options.out)
+    outcomes = batch.run_jobs(jobs, label='simulate')
     directory = result_directory(options.out)
     write_config(parameters, directory / CONFIG)
-    outcomes = batch.run_jobs(jobs, label='simulate')
     csv = directory / (SWEEP if swept else SEEDS)
     write_table(csv, batch.outcome_header(swept), [
         batch.outcome_row(swept, job, outcome) for job, outcome in zip(jobs, outcomes, strict=True)

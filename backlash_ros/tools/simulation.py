@@ -24,8 +24,10 @@ def run_loop(
     """Run the loop; raises BrokenOffError when its signals grow beyond every number."""
     try:
         # The controller refuses what is not finite: numpy need not say so as well.
-        with np.errstate(over='ignore', invalid='ignore'):
+        with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
             return loop.run(samples, on_sample)
+    except OverflowError as error:
+        raise BrokenOffError('the run broke off: a signal grew beyond every number') from error
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         reason = ' '.join(str(error).split())
         raise BrokenOffError(f'the run broke off: {reason}') from error

@@ -1,0 +1,233 @@
+"""Latency from y to v through DDS beside a bare echo node, and the speed of lockstep."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+# Before rclpy reads it.
+os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+
+import numpy as np
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from reporting import Check
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools.processes import (
+    ProcessPlan,
+    ProcessSupervisor,
+    child_environment,
+    free_domain,
+)
+
+RATES_HZ = (100.0, 1000.0)
+BLOCK_S, SETTLE_S = 0.5, 0.1  # of each block the beginning is not counted
+WARM_UP_S = 3.0  # acquisition is not counted either
+DEADLINE_S = 30.0  # for processes to start
+PATIENCE_S = 0.2  # for an answer
+LATENCY_LIMIT = 1.3
+LOCKSTEP_SAMPLES = 3000
+NODES = 'backlash_ros.nodes'
+
+
+@dataclass
+class Latencies:
+    """Times from question to answer [s] of one rate, and questions without an answer."""
+
+    rate: float
+    controller: list[float] = field(default_factory=list)
+    echo: list[float] = field(default_factory=list)
+    unanswered: int = 0
+
+    def ratio(self, quantile: float) -> float:
+        """Quantile of the controller over that of the echo."""
+        return float(np.quantile(self.controller, quantile) / np.quantile(self.echo, quantile))
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """Cells: rate, p50 and p99 of controller and echo in us, their ratio, how many."""
+        rows = []
+        for quantile in (0.5, 0.99):
+            of_controller = 1e6 * float(np.quantile(self.controller, quantile))
+            of_echo = 1e6 * float(np.quantile(self.echo, quantile))
+            rows.append([
+                f'{self.rate:g} Hz', f'p{100 * quantile:g}', f'{of_controller:.0f}',
+                f'{of_echo:.0f}', f'{self.ratio(quantile):.2f}',
+                f'{len(self.controller)} + {len(self.echo)}',
+            ])
+        return rows
+
+
+LATENCY_HEADER = ('rate', '', 'y to v [us]', 'echo [us]', 'ratio', 'samples')
+
+
+class Driver:
+    """A plant driver that asks controller and echo, and measures how long each takes."""
+
+    def __init__(self, domain: int, parameters: Parameters) -> None:
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain)
+        self._node = Node('driver', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+        self._plant, self._reference = build_plant(parameters), build_reference(parameters)
+        self._period = parameters.real('sample_period')
+        self._v = 0.0
+        self._answered_at: float | None = None
+        node = self._node
+        self._y_m = node.create_publisher(Float64, topics.REFERENCE, 1)
+        self._y = node.create_publisher(Float64, topics.PLANT_OUTPUT, 1)
+        self._question = node.create_publisher(Float64, 'echo/in', 1)
+        self._answers = [
+            node.create_subscription(Float64, topics.CONTROL, self._on_control, 1),
+            node.create_subscription(Float64, 'echo/out', self._on_echo, 1),
+        ]
+
+    def _on_control(self, message: Float64) -> None:
+        self._answered_at = time.perf_counter()
+        self._v = message.data
+
+    def _on_echo(self, message: Float64) -> None:
+        self._answered_at = time.perf_counter()
+
+    def _connected(self) -> bool:
+        publishers = (self._y_m, self._y, self._question)
+        return all(p.get_subscription_count() for p in publishers) and all(
+            s.get_publisher_count() for s in self._answers)
+
+    def connect(self) -> None:
+        """Return once everybody is heard and the controller has a reference."""
+        deadline = time.monotonic() + DEADLINE_S
+        while not self._connected():
+            if time.monotonic() > deadline:
+                raise RuntimeError(f'the nodes were not there within {DEADLINE_S:g} s')
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def _ask(self, publisher: rclpy.publisher.Publisher, value: float) -> float | None:
+        message = Float64(data=value)
+        self._answered_at = None
+        start = time.perf_counter()
+        publisher.publish(message)
+        while self._answered_at is None:
+            self._executor.spin_once(timeout_sec=PATIENCE_S)
+            if self._answered_at is None and time.perf_counter() - start > PATIENCE_S:
+                return None
+        return self._answered_at - start
+
+    def measure(self, duration_s: float) -> Latencies:
+        """Alternate blocks of both; the plant goes on with the newest v through all of them."""
+        result = Latencies(1.0 / self._period)
+        start, tick = time.perf_counter(), 0
+        while True:
+            now = time.perf_counter() - start
+            if now > duration_s + WARM_UP_S:
+                return result
+            due = int(now / self._period) + 1
+            time.sleep(max(due * self._period - now, 0.0))
+            for _ in range(due - tick):
+                self._plant.step(self._v)
+            tick = due
+            t = due * self._period
+            in_block = (t - WARM_UP_S) % BLOCK_S
+            asks_controller = t < WARM_UP_S or int((t - WARM_UP_S) / BLOCK_S) % 2 == 0
+            passed = self._ask_controller(t) if asks_controller else self._ask(self._question, t)
+            if t < WARM_UP_S or in_block < SETTLE_S:
+                continue
+            if passed is None:
+                result.unanswered += 1
+            else:
+                (result.controller if asks_controller else result.echo).append(passed)
+
+    def _ask_controller(self, t: float) -> float | None:
+        # Later than its y, so that the controller answers y with nothing else on its hands.
+        passed = self._ask(self._y, self._plant.measure())
+        self._y_m.publish(Float64(data=self._reference(t + self._period)))
+        return passed
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.shutdown(context=self._context)
+
+
+@contextmanager
+def processes(plans: Sequence[ProcessPlan]) -> Iterator[tuple[ProcessSupervisor, int]]:
+    """The processes of one measurement in a domain of their own; all are gone afterwards."""
+    with tempfile.TemporaryDirectory() as folder, free_domain() as domain:
+        environment = child_environment(Path(folder), domain)
+        with ProcessSupervisor(plans, Path(folder), environment, lambda: False) as supervisor:
+            yield supervisor, domain
+
+
+def node_plan(name: str, values: Mapping[str, object]) -> ProcessPlan:
+    """How to start a node with parameters."""
+    arguments: list[str] = ['--ros-args'] if values else []
+    for key, value in values.items():
+        text = value if isinstance(value, str) else json.dumps(value)
+        arguments += ['-p', f'{key}:={text}']
+    return ProcessPlan(name, (sys.executable, '-m', f'{NODES}.{name}', *arguments))
+
+
+def measure_latency(rate: float, law: str, duration_s: float) -> Latencies:
+    """Latency of the controller process with this law at this rate."""
+    values = {
+        'sample_period': 1.0 / rate, 'estimator.law': law, 'estimator.output_noise_std': 1e-3,
+    }
+    # The same waves per sample at every rate: G is given in samples, not in seconds.
+    parameters = Parameters({
+        **values, 'output_noise_std': 1e-3, 'frequency': 0.126 * rate,
+    })
+    echo = ProcessPlan('echo', (sys.executable, str(Path(__file__).with_name('echo_node.py'))))
+    with processes([node_plan('controller', values), echo]) as (_, domain):
+        driver = Driver(domain, parameters)
+        try:
+            driver.connect()
+            return driver.measure(duration_s)
+        finally:
+            driver.close()
+
+
+def latency_checks(latencies: Sequence[Latencies], law: str) -> list[Check]:
+    """The bound on the ratio to the echo."""
+    return [
+        Check(
+            f'y to v / bare echo, p50, {law}, {item.rate:g} Hz', f'<= {LATENCY_LIMIT:g}',
+            f'{item.ratio(0.5):.2f}', item.ratio(0.5) <= LATENCY_LIMIT,
+        ) for item in latencies
+    ]
+
+
+def lockstep_speed(law: str, samples: int = LOCKSTEP_SAMPLES) -> float:
+    """Samples per second of plant, controller and reference as processes in lockstep."""
+    values = {'lockstep': True, 'samples': samples, 'estimator.law': law, 'seed': 1}
+    plans = [node_plan(name, values) for name in ('controller', 'reference', 'plant')]
+    with processes(plans) as (supervisor, _):
+        started = _wait_for(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
+        done = _wait_for(supervisor, lambda kind, _: kind == 'done')
+    return samples / (done - started)
+
+
+def _wait_for(supervisor: ProcessSupervisor, wanted: Callable[[str, str], bool]) -> float:
+    deadline = time.monotonic() + 10.0 * DEADLINE_S
+    while time.monotonic() < deadline:
+        for event in supervisor.events(0.1):
+            if wanted(event.kind, event.process):
+                return time.perf_counter()
+        ended = supervisor.ended()
+        if ended:
+            raise RuntimeError(f'{ended[0].plan.name} ended: {ended[0].end_of_log()}')
+    raise RuntimeError('the nodes did not come to an end in time')

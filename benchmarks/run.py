@@ -1,0 +1,178 @@
+"""Measure the package: time of a controller step, latency through DDS, speed of simulations.
+
+`make bench` runs everything; `make bench ARGS='--only step'` a part of it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+# Before numpy is imported: the matrices are tiny, threads would only disturb the loop.
+for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
+    os.environ.setdefault(_name, '1')
+
+import loop_latency
+import step_times
+from loop_latency import LATENCY_HEADER, RATES_HZ
+from reporting import CHECK_HEADER, ROOT, Check, machine, markdown_table, text_table
+from step_times import LAWS, MISSING, STEP_HEADER
+
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.parameters import Parameters
+
+DOCUMENT = ROOT / 'docs' / 'performance.md'
+DURATION_S = 20.0
+LATENCY_LAWS = ('kalman', 'lms')
+SPEED_HEADER = ('law', 'samples/s')
+SIMULATED_SAMPLES = 3000
+
+
+@dataclass
+class Section:
+    """A table with what it shows, and the bounds it is held to."""
+
+    title: str
+    explanation: str
+    header: tuple[str, ...]
+    rows: list[list[str]] = field(default_factory=list)
+    checks: list[Check] = field(default_factory=list)
+
+
+def measure_steps(_: float) -> list[Section]:
+    """Time of one controller step."""
+    if step_times.KalmanFilter is None:
+        print(MISSING)
+    explanation = (
+        'One whole controller step (estimator, structure, inverse) beside one predict + update '
+        "of filterpy's KalmanFilter with six states, taking turns in the same loop."
+    )
+    laws = Section('Time of a controller step', explanation, STEP_HEADER)
+    timings = step_times.law_timings()
+    laws.rows = [timing.row for timing in timings]
+    if step_times.KalmanFilter is not None:
+        laws.checks = step_times.step_checks(timings)
+    growth = Section(
+        'Growth of the cost',
+        'The law kalman with G of growing order, and its bank alone with a growing number of '
+        'hypotheses: 7 once the gap is found, and during the search as many more as v has '
+        'swung over.', STEP_HEADER,
+    )
+    growth.rows = [
+        timing.row for timing in [*step_times.order_timings(), *step_times.bank_timings()]]
+    return [laws, growth]
+
+
+def measure_latency(duration_s: float) -> list[Section]:
+    """Latency of the controller process."""
+    sections = []
+    for law in LATENCY_LAWS:
+        section = Section(
+            f'Latency from y to v, {law}',
+            'The real controller process beside a bare rclpy node that publishes what it gets, '
+            'in alternating blocks of half a second, seen by the driver that asks both.',
+            LATENCY_HEADER,
+        )
+        latencies = [loop_latency.measure_latency(rate, law, duration_s) for rate in RATES_HZ]
+        for item in latencies:
+            section.rows += item.rows
+            if item.unanswered:
+                print(f'{law}, {item.rate:g} Hz: {item.unanswered} samples without an answer')
+        section.checks = loop_latency.latency_checks(latencies, law)
+        sections.append(section)
+    return sections
+
+
+def measure_lockstep(_: float) -> list[Section]:
+    """Speed of lockstep."""
+    section = Section(
+        'Lockstep', 'Plant, controller and reference as processes over DDS, as fast as they go.',
+        SPEED_HEADER,
+    )
+    section.rows = [[law, f'{loop_latency.lockstep_speed(law):.0f}'] for law in LATENCY_LAWS]
+    return [section]
+
+
+def measure_simulation(_: float) -> list[Section]:
+    """Speed of the loop in one process."""
+    section = Section(
+        'Simulation', 'The same loop in one process, on one processor.', SPEED_HEADER)
+    for law in LAWS:
+        loop = build_closed_loop(Parameters({'estimator.law': law, 'output_noise_std': 1e-3}))
+        start = time.perf_counter()
+        loop.run(SIMULATED_SAMPLES)
+        speed = SIMULATED_SAMPLES / (time.perf_counter() - start)
+        section.rows.append([law, f'{speed:.0f}'])
+    return [section]
+
+
+PARTS: dict[str, Callable[[float], list[Section]]] = {
+    'step': measure_steps, 'latency': measure_latency, 'lockstep': measure_lockstep,
+    'simulate': measure_simulation,
+}
+
+
+def write_document(path: Path, sections: list[Section]) -> None:
+    """Write the results as Markdown."""
+    paragraphs = [
+        '# Performance: what was measured',
+        f"Written by `make bench ARGS='--write'` on {machine()}. Ratios carry over to other "
+        'machines, the times themselves do not.',
+        '## Bounds and verdicts',
+        markdown_table(CHECK_HEADER, [check.row for s in sections for check in s.checks]),
+    ]
+    for section in sections:
+        paragraphs += [f'## {section.title}', section.explanation,
+                       markdown_table(section.header, section.rows)]
+    path.parent.mkdir(exist_ok=True)
+    path.write_text('\n\n'.join(paragraphs) + '\n')
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Options of the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--only', metavar='PART[,PART...]', default=','.join(PARTS),
+                        help=f'parts to measure, of {", ".join(PARTS)}')
+    parser.add_argument('--duration', type=float, default=DURATION_S, metavar='SECONDS',
+                        help=f'of each measurement of latency, default {DURATION_S:g}')
+    parser.add_argument('--write', action='store_true',
+                        help=f'write {DOCUMENT.relative_to(ROOT)}; needs all parts')
+    arguments = parser.parse_args()
+    arguments.parts = arguments.only.split(',')
+    unknown = [part for part in arguments.parts if part not in PARTS]
+    if unknown:
+        parser.error(f'--only {unknown[0]} must be of {", ".join(PARTS)}')
+    if not arguments.duration > 0.0:
+        parser.error(f'--duration {arguments.duration:g} must be > 0')
+    if arguments.write and set(arguments.parts) != set(PARTS):
+        parser.error('--write needs all parts: leave out --only')
+    return arguments
+
+
+def main() -> int:
+    """Return 0 if every bound holds, else 1."""
+    arguments = parse_arguments()
+    print(machine())
+    sections: list[Section] = []
+    for part in arguments.parts:
+        for section in PARTS[part](arguments.duration):
+            # Shown as soon as it is known: all of them take minutes.
+            print(f'\n{section.title}')
+            print(text_table(section.header, section.rows), flush=True)
+            sections.append(section)
+    checks = [check for section in sections for check in section.checks]
+    if checks:
+        print('\n' + text_table(CHECK_HEADER, [check.row for check in checks]))
+    if arguments.write:
+        write_document(DOCUMENT, sections)
+        print(f'wrote {DOCUMENT.relative_to(ROOT)}')
+    return 0 if all(check.holds for check in checks) else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())

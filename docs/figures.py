@@ -1,0 +1,212 @@
+"""Makes every picture and every number of the documents anew: `make docs`.
+
+Pictures go to docs/images. Numbers go between the marks `<!-- name: made by docs/figures.py -->`
+and `<!-- end -->` of the pages, and docs/parameters.md is written as a whole.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from generate_parameters import write_parameters
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from runs import WITHOUT, simulate
+from tables import TABLES
+
+from backlash_ros.core.metrics import delayed_reference
+from backlash_ros.core.run_record import RunRecord
+from backlash_ros.tools.analysis import compare_laws, interesting_parts
+from backlash_ros.tools.drawing import (
+    COLOURS,
+    ESTIMATES,
+    STYLES,
+    UNITS,
+    band,
+    curve,
+    label,
+    legend_above,
+    legend_below,
+    new_figure,
+    png,
+    shade,
+    zero_line,
+)
+from backlash_ros.tools.figures import draw_hysteresis, draw_laws
+
+DOCS = Path(__file__).resolve().parent
+IMAGES = DOCS / 'images'
+PAGES = [DOCS.parent / 'README.md', *DOCS.glob('*.md')]
+MARK = re.compile(r'(<!-- (\w+): made by docs/figures\.py -->\n).*?(<!-- end -->)', re.DOTALL)
+TIME = 'time t [s]'
+NAMES = ('m', 'c_r', 'c_l')
+WITH_COLOUR, WITHOUT_COLOUR = '#0072B2', '#D55E00'
+SMALL = {'structure': 'tracking', 'amplitude': '0.2'}
+# The gapless observer allows for a disturbance, which is what helps this loop most.
+NO_INVERSE = {**WITHOUT, 'estimator.initial.m': '1.3', 'fixed.doubt': '0.5'}
+NO_GAP = {'backlash.c_r': '1e-9', 'backlash.c_l': '-1e-9', 'fixed.doubt': '0.0'}
+RESTING = {'linewidth': 6.0, 'alpha': 0.22, 'color': COLOURS['true']}
+
+
+def draw_result() -> Figure:
+    """A worn gear: y without and with compensation, and what the controller has learned."""
+    gear = {'amplitude': '0.3'}
+    plain = simulate(4.0, {**gear, **WITHOUT}, 'geared_motor.yaml').record
+    learned = simulate(4.0, gear, 'geared_motor.yaml').record
+    figure = new_figure(6.4)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
+    t = learned.column('t')
+    curve(upper, t, learned.column('y_m'), COLOURS['y_m'], 'reference $y_m$', '--')
+    curve(upper, t, plain.column('y'), WITHOUT_COLOUR, 'y without compensation', width=1.8)
+    curve(upper, t, learned.column('y'), WITH_COLOUR, 'y with this package', width=1.8)
+    label(upper, 'Load behind a worn gear', 'angle [rad]')
+    legend_above(upper)
+    _draw_shares(lower, learned)
+    label(lower, 'What is learned from v and y', 'estimate / truth', TIME)
+    lower.set_ylim(-0.05, 1.15)
+    legend_above(lower)
+    return figure
+
+
+def _draw_shares(axes: Axes, run: RunRecord) -> None:
+    t = run.column('t')
+    axes.axhline(1.0, label='truth', **RESTING)
+    for name, width in zip(NAMES, (1.4, 2.4, 1.6), strict=True):
+        share = run.column(name) / run.column(f'true_{name}')
+        curve(axes, t, share, COLOURS[name], f'${ESTIMATES[name]}$', STYLES[name], width)
+
+
+def draw_figure_4() -> Figure:
+    """Parameter errors of three laws on the paper's example, as Figure 4 and as shares."""
+    figure = new_figure(6.6)
+    rows = figure.add_gridspec(2, 1, height_ratios=[1.0, 0.01])
+    grid = np.asarray(rows[0].subgridspec(2, 3).subplots(sharex=True, sharey='row'))
+    for column, law in enumerate(('printed', 'lms', 'kalman')):
+        run = simulate(5.0, {'estimator.law': law}).record
+        absolute, relative = grid[0][column], grid[1][column]
+        t = run.column('t')
+        for name in NAMES:
+            truth = run.column(f'true_{name}')
+            error = truth - run.column(name)
+            unit = UNITS[name].removeprefix('unit of ')
+            curve(absolute, t, error, COLOURS[name], f'${name} - {ESTIMATES[name]}$ [{unit}]',
+                  STYLES[name], 1.8)
+            percent = np.maximum(100.0 * np.abs(error / truth), 1e-12)
+            curve(relative, t, percent, COLOURS[name], '', STYLES[name], 1.5)
+        zero_line(absolute)
+        relative.set_yscale('log')
+        relative.set_ylim(1e-6, 1e3)
+        label(absolute, f'estimator.law: {law}')
+        label(relative, x=TIME)
+    grid[0][0].set_ylim(-3.0, 3.0)
+    label(grid[0][0], y='true minus estimated')
+    label(grid[1][0], y='size of the error [%]')
+    legend_below(figure.add_subplot(rows[1]), grid[0][1])
+    return figure
+
+
+def draw_figure_5() -> Figure:
+    """Control errors of the laws on the paper's example, as Figure 5."""
+    run = simulate(5.0)
+    start, _ = interesting_parts(run.record, run.parameters)
+    return draw_laws(compare_laws(run.record, run.parameters), start)
+
+
+def draw_loop() -> Figure:
+    """The v-u loop of the paper's example at the end of a run."""
+    run = simulate(5.0)
+    _, end = interesting_parts(run.record, run.parameters)
+    return draw_hysteresis(run.record, end)
+
+
+def draw_convergence() -> Figure:
+    """Estimates with two standard deviations under noise, zooming in with time."""
+    run = simulate(6.0, {'output_noise_std': '1e-3'}).record
+    figure = new_figure(6.6)
+    t = run.column('t')
+    for axes, name in zip(figure.subplots(3, 1, sharex=True), NAMES, strict=True):
+        truth, estimate = run.column(f'true_{name}'), run.column(name)
+        error, std = estimate - truth, run.column(f'std_{name}')
+        band(axes, t, -2 * std, 2 * std, COLOURS[name], '±2 published standard deviations')
+        curve(axes, t, error, COLOURS[name], f'${ESTIMATES[name]} - {name}$')
+        zero_line(axes)
+        reach = 6.0 * float(np.nanmedian(std))
+        axes.set_ylim(-reach, reach)
+        label(axes, f'{name}, true value {truth[0]:g}', f'[{UNITS[name]}]')
+        legend_above(axes)
+    label(axes, x=TIME)
+    return figure
+
+
+def draw_recovery() -> Figure:
+    """c_r steps from 3 to 4 without a word to the estimator."""
+    jump = {'output_noise_std': '1e-3', 'backlash.jump': '[0.0, 1.0, 0.0]',
+            'backlash.jump_time': '3.0'}
+    run = simulate(5.0, jump).record
+    figure = new_figure(4.0)
+    axes = figure.subplots()
+    t = run.column('t')
+    axes.plot(t, run.column('true_c_r'), label='true', **RESTING)
+    curve(axes, t, run.column('c_r'), COLOURS['c_r'], f'${ESTIMATES["c_r"]}$', width=1.8)
+    shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
+    label(axes, '$c_r$ steps from 3 to 4', f'[{UNITS["c_r"]}]', TIME)
+    legend_above(axes)
+    axes.set_ylim(0.0, 4.5)
+    return figure
+
+
+def draw_tracking() -> Figure:
+    """Output and tracking error of `structure: tracking` on the paper's plant."""
+    loops = {
+        'no compensation': (simulate(6.0, {**SMALL, **NO_INVERSE}), WITHOUT_COLOUR, '-'),
+        'adaptive inverse': (simulate(6.0, SMALL), WITH_COLOUR, '-'),
+        'no backlash': (simulate(6.0, {**SMALL, **NO_INVERSE, **NO_GAP}), '#000000', '--'),
+    }
+    figure = new_figure(6.4)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    for name, (run, colour, style) in loops.items():
+        t, reference = run.record.column('t'), delayed_reference(run.record, run.delay)
+        curve(upper, t, run.record.column('y'), colour, f'y, {name}', style)
+        error = np.abs(run.record.column('y') - reference) / float(np.abs(reference).max())
+        curve(lower, t, np.maximum(error, 1e-9), colour, name, style)
+    curve(upper, t, reference, COLOURS['y_m'], '$y_m$, delayed', ':', 2.4)
+    lower.set_yscale('log')
+    lower.set_ylim(1e-7, 10.0)
+    lower.set_xlim(0.0, 4.0)
+    label(upper, 'Output', '[unit of y]')
+    label(lower, 'Distance from the delayed reference', 'share of the amplitude', TIME)
+    legend_above(upper)
+    legend_above(lower)
+    return figure
+
+
+FIGURES: dict[str, Callable[[], Figure]] = {
+    'result': draw_result, 'figure_4': draw_figure_4, 'figure_5': draw_figure_5,
+    'hysteresis': draw_loop, 'convergence': draw_convergence, 'recovery': draw_recovery,
+    'tracking': draw_tracking,
+}
+
+
+def fill_in(page: Path) -> None:
+    """Write the tables between their marks."""
+    text = page.read_text(encoding='utf-8')
+    filled = MARK.sub(lambda found: f'{found[1]}{TABLES[found[2]]()}\n{found[3]}', text)
+    if filled != text:
+        page.write_text(filled, encoding='utf-8')
+
+
+def main() -> None:
+    """Make everything."""
+    IMAGES.mkdir(exist_ok=True)
+    for name, draw in FIGURES.items():
+        (IMAGES / f'{name}.png').write_bytes(png(draw()))
+    write_parameters()
+    for page in PAGES:
+        fill_in(page)
+
+
+if __name__ == '__main__':
+    main()

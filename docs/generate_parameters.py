@@ -1,0 +1,68 @@
+"""Writes docs/parameters.md from the one table of parameters; `make docs` calls it."""
+
+from __future__ import annotations
+
+from math import inf, isfinite
+from pathlib import Path
+
+from backlash_ros.core.parameter_table import PARAMETERS, Parameter, Value
+
+PAGE = Path(__file__).with_name('parameters.md')
+HEAD = """# Parameters
+
+Made from [parameter_table.py](../backlash_ros/core/parameter_table.py) by `make docs`; do not edit.
+The nodes, `bringup` and `simulate` all read one YAML file:
+[paper_example.yaml](../config/paper_example.yaml) shows every group.
+`y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in
+a running node.
+
+| name | default | unit | allowed | meaning | used by |
+|---|---|---|---|---|---|
+"""
+
+
+def parameters_page() -> str:
+    """The whole page."""
+    return HEAD + ''.join(f'{_row(parameter)}\n' for parameter in PARAMETERS)
+
+
+def _row(p: Parameter) -> str:
+    users = ', '.join(p.used_by) + (', *live*' if p.live else '')
+    cells = (f'`{p.name}`', f'`{_value(p.default)}`', p.unit, _allowed(p), p.description, users)
+    return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'
+
+
+def _value(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return '[' + ', '.join(_value(element) for element in value) + ']'
+    if isinstance(value, str):
+        return value or "''"
+    if abs(value) == inf:
+        return '.inf' if value > 0 else '-.inf'
+    return f'{value:g}' if isinstance(value, float) and value == float(f'{value:g}') else str(value)
+
+
+def _allowed(p: Parameter) -> str:
+    if p.choices:
+        return ', '.join(f'`{choice}`' for choice in p.choices)
+    if isinstance(p.default, bool):
+        return '`true`, `false`'
+    rules = []
+    if isfinite(p.low):
+        rules.append(f'{">" if p.above else "≥"} {p.low:g}')
+    if isfinite(p.high):
+        rules.append(f'≤ {p.high:g}')
+    if p.length is not None:
+        rules.append(f'{p.length} numbers')
+    return ', '.join(rules)
+
+
+def write_parameters() -> None:
+    """Write the page."""
+    PAGE.write_text(parameters_page(), encoding='utf-8')
+
+
+if __name__ == '__main__':
+    write_parameters()

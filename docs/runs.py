@@ -1,0 +1,44 @@
+"""The simulated runs that the documents show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import RunRecord
+from backlash_ros.tools.configuration import effective_parameters
+from backlash_ros.tools.simulation import prepare, run_loop
+
+# No compensation: the inverse is told that there is no gap, and learns nothing.
+WITHOUT = {
+    'estimator.law': 'fixed', 'estimator.initial.c_r': '0.0', 'estimator.initial.c_l': '0.0',
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run: what `simulate --config CONFIG --set ... --duration SECONDS` computes."""
+
+    parameters: Parameters
+    record: RunRecord
+    delay: int  # samples by which y is meant to follow y_m
+
+
+def simulate(
+    duration: float, settings: Mapping[str, str] | None = None, config: str | None = None,
+) -> Run:
+    """Run once, or take the run that has been made already."""
+    return _simulate(duration, tuple((settings or {}).items()), config)
+
+
+@cache
+def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: str | None) -> Run:
+    parameters = effective_parameters(
+        Path(config) if config else None, [f'{name}={value}' for name, value in settings]
+    )
+    loop = prepare(parameters)
+    record = run_loop(loop, round(duration / parameters.real('sample_period')))
+    return Run(parameters, record, loop.controller.structure.delay)

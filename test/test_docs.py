@@ -1,0 +1,178 @@
+"""The documents: links lead somewhere, what they name exists, what is made is current."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.parameter_table import BY_NAME
+from backlash_ros.tools import batch, bringup, simulate
+from backlash_ros.tools.configuration import effective_parameters
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / 'docs'
+PAGES = sorted([ROOT / 'README.md', *DOCS.glob('*.md')])
+README = (ROOT / 'README.md').read_text()
+BLOCK = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
+LINK = re.compile(r'\]\(([^)\s]+)\)')
+CODE = re.compile(r'`([^`\n]+)`')
+DOTTED = re.compile(r'[a-z_]+(\.[a-z_0-9]+)+')
+SETTING = re.compile(r'^(?P<name>[a-z_.]+): (?P<value>\S.*)$')
+MARKS = re.compile(r'<!-- (\w+): made by docs/figures\.py -->\n(.*?)<!-- end -->', re.DOTALL)
+GROUPS = {name.split('.')[0] for name in BY_NAME if '.' in name}
+# Files of a result and topics share their first word with a group of parameters.
+FILE_ENDINGS = {'py', 'yaml', 'json', 'csv', 'md', 'html', 'txt'}
+
+
+def of_every_page(pattern: re.Pattern[str]) -> Iterator[tuple[Path, str]]:
+    for page in PAGES:
+        for found in pattern.finditer(page.read_text()):
+            yield page, found[1]
+
+
+def shell_commands() -> list[list[str]]:
+    """Return the words of each command in the shell blocks of all pages, and in `simulate ...`."""
+    lines = [
+        line
+        for page in PAGES for language, text in BLOCK.findall(page.read_text())
+        if language in ('bash', 'sh')
+        for line in text.replace('\\\n', ' ').splitlines()
+    ]
+    lines += [code for _, code in of_every_page(CODE) if code.startswith('simulate -')]
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [line for line in words if line]
+
+
+def console_scripts() -> set[str]:
+    return set(re.findall(r"f'(\w+) = \{PACKAGE\}", (ROOT / 'setup.py').read_text()))
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings, as they are formed on the web."""
+    headings = re.findall(r'^#+ (.*)$', page.read_text(), re.MULTILINE)
+    return {
+        re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings
+    }
+
+
+def test_links_lead_to_files_and_headings() -> None:
+    broken = []
+    for page, link in of_every_page(LINK):
+        if '://' in link:
+            continue
+        path, _, anchor = link.partition('#')
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(f'{page.name}: {link}')
+    assert broken == []
+
+
+def test_every_picture_is_shown() -> None:
+    shown = {(page.parent / link).resolve() for page, link in of_every_page(LINK)}
+    assert set((DOCS / 'images').iterdir()) <= shown
+
+
+def test_made_tables_are_filled_and_known_to_the_script() -> None:
+    found = {name: text for page in PAGES for name, text in MARKS.findall(page.read_text())}
+    assert all(text.startswith('| ') for text in found.values())
+    source = ast.parse((DOCS / 'tables.py').read_text())
+    tables = next(
+        node.value for node in ast.walk(source)
+        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == 'TABLES'
+    )
+    assert isinstance(tables, ast.Dict)
+    assert {ast.literal_eval(key) for key in tables.keys if key is not None} == set(found)
+
+
+def test_page_of_parameters_is_current() -> None:
+    code = 'import generate_parameters as g, sys; sys.stdout.write(g.parameters_page())'
+    done = subprocess.run(
+        [sys.executable, '-c', f'import sys; sys.path.insert(0, {str(DOCS)!r}); {code}'],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )
+    assert (DOCS / 'parameters.md').read_text() == done.stdout, 'call make docs'
+
+
+def test_parameters_that_pages_name_exist() -> None:
+    named = {
+        code for _, code in of_every_page(CODE)
+        if DOTTED.fullmatch(code) and code.split('.')[0] in GROUPS
+        and code.split('.')[-1] not in FILE_ENDINGS
+    }
+    assert named
+    assert named <= set(BY_NAME)
+
+
+def test_settings_that_pages_name_are_accepted() -> None:
+    settings = [
+        (found['name'], found['value']) for _, code in of_every_page(CODE)
+        if (found := SETTING.match(code)) and found['name'] in BY_NAME
+        and found['value'] != 'n'
+    ]
+    assert settings
+    for name, value in settings:
+        effective_parameters(None, [f'{name}={value}'])
+
+
+@pytest.mark.parametrize('words', shell_commands(), ids=' '.join)
+def test_command_exists_and_takes_its_arguments(words: list[str]) -> None:
+    program, *arguments = words
+    if program == 'make':
+        targets = re.findall(r'^(\w+):', (ROOT / 'Makefile').read_text(), re.MULTILINE)
+        assert arguments[0] in targets
+    elif program == 'ros2':
+        assert arguments[:2] == ['run', 'backlash_ros']
+        assert arguments[2] in console_scripts()
+    elif program in ('rosdep', 'colcon', '.'):
+        assert program != 'colcon' or arguments[-1] == 'backlash_ros'
+    else:
+        assert program.removeprefix('.venv/bin/') in console_scripts()
+        check_tool(program.removeprefix('.venv/bin/'), arguments)
+
+
+def check_tool(program: str, arguments: list[str]) -> None:
+    """Let the tool itself parse its options, and the core build what they describe."""
+    if program == 'report':
+        assert len(arguments) == 1
+        return
+    options = (
+        simulate._parser().parse_args(arguments) if program == 'simulate'
+        else bringup.parse_options(arguments)
+    )
+    build_controller(effective_parameters(options.config, options.settings, options.seed))
+    for sweep in getattr(options, 'sweep', []):
+        batch.parse_sweep(sweep)
+
+
+def test_python_blocks_run() -> None:
+    for page in PAGES:
+        for language, text in BLOCK.findall(page.read_text()):
+            if language == 'python':
+                subprocess.run([sys.executable, '-c', text], cwd=ROOT, check=True)
+
+
+def test_readme_names_every_executable_and_topic() -> None:
+    codes = set(CODE.findall(README))
+    assert console_scripts() <= codes
+    named = {value for name, value in vars(topics).items() if name.isupper()}
+    assert {name for name in named if isinstance(name, str)} <= codes
+
+
+def test_pages_do_not_speak_of_this_machine() -> None:
+    places = [str(ROOT), str(Path.home())]
+    for page in [*PAGES, ROOT / 'CHANGELOG.rst']:
+        assert not any(place in page.read_text() for place in places if len(place) > 1)
+
+
+def test_changelog_holds_the_version_or_what_is_forthcoming() -> None:
+    text = (ROOT / 'CHANGELOG.rst').read_text()
+    assert re.search(r'^(Forthcoming|\d+\.\d+\.\d+.*)\n-+$', text, re.MULTILINE)
