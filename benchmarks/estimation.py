@@ -13,8 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 # Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
-for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
-    os.environ.setdefault(_name, '1')
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 from estimation_points import ACCURACY_HEADER, CASES, HOUR, Benchmark, Outcome
 from reporting import (

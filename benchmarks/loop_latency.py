@@ -192,13 +192,17 @@ def measure_latency(rate: float, law: str, duration_s: float) -> Latencies:
         **values, 'output_noise_std': 1e-3, 'frequency': 0.126 * rate,
     })
     echo = ProcessPlan('echo', (sys.executable, str(Path(__file__).with_name('echo_node.py'))))
-    with processes([node_plan('controller', values), echo]) as (_, domain):
+    with processes([node_plan('controller', values), echo]) as (supervisor, domain):
         driver = Driver(domain, parameters)
         try:
             driver.connect()
-            return driver.measure(duration_s)
+            result = driver.measure(duration_s)
         finally:
             driver.close()
+        _check_running(supervisor)
+        if not (result.controller and result.echo):
+            raise RuntimeError(f'{law}, {rate:g} Hz: nobody answered')
+        return result
 
 
 def latency_checks(latencies: Sequence[Latencies], law: str) -> list[Check]:
@@ -227,7 +231,10 @@ def _wait_for(supervisor: ProcessSupervisor, wanted: Callable[[str, str], bool])
         for event in supervisor.events(0.1):
             if wanted(event.kind, event.process):
                 return time.perf_counter()
-        ended = supervisor.ended()
-        if ended:
-            raise RuntimeError(f'{ended[0].plan.name} ended: {ended[0].end_of_log()}')
+        _check_running(supervisor)
     raise RuntimeError('the nodes did not come to an end in time')
+
+
+def _check_running(supervisor: ProcessSupervisor) -> None:
+    for child in supervisor.ended():
+        raise RuntimeError(f'{child.plan.name} ended: {child.end_of_log()}')

@@ -14,8 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 # Before numpy is imported: the matrices are tiny, threads would only disturb the loop.
-for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
-    os.environ.setdefault(_name, '1')
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import loop_latency
 import step_times
@@ -46,7 +45,7 @@ class Section:
 
 def measure_steps(_: float) -> list[Section]:
     """Time of one controller step."""
-    if step_times.KalmanFilter is None:
+    if not step_times.HAS_FILTER:
         print(MISSING)
     explanation = (
         'One whole controller step (estimator, structure, inverse) beside one predict + update '
@@ -55,7 +54,7 @@ def measure_steps(_: float) -> list[Section]:
     laws = Section('Time of a controller step', explanation, STEP_HEADER)
     timings = step_times.law_timings()
     laws.rows = [timing.row for timing in timings]
-    if step_times.KalmanFilter is not None:
+    if step_times.HAS_FILTER:
         laws.checks = step_times.step_checks(timings)
     growth = Section(
         'Growth of the cost',

@@ -23,6 +23,7 @@ try:
     from filterpy.kalman import KalmanFilter
 except ImportError:
     KalmanFilter = None
+HAS_FILTER = KalmanFilter is not None
 
 Array = NDArray[np.float64]
 
@@ -101,7 +102,7 @@ def step_timer(parameters: Parameters, skip: int = 0) -> tuple[Timed, Callable[[
 
 def filter_timer() -> Timed | None:
     """A function that runs and times one predict + update of a six-state filter."""
-    if KalmanFilter is None:
+    if not HAS_FILTER:
         return None
     reference = KalmanFilter(dim_x=REFERENCE_STATES, dim_z=1)
     reference.P *= 10.0
@@ -163,7 +164,7 @@ def law_timings() -> list[Timing]:
         )
         for seed in range(ACQUISITIONS)
     ]
-    return [*steady, *_pooled(parts)[:-1]]
+    return [*steady, *_pooled(parts)[:-1 if HAS_FILTER else None]]
 
 
 def _pooled(parts: Sequence[list[Timing]]) -> list[Timing]:
@@ -187,7 +188,7 @@ def order_timings() -> list[Timing]:
         if status() != Status.TRACKING:
             what += f' ({status().name.lower().replace("_", " ")})'
         contestants[what] = step
-    return compare(contestants, 'steady', TIMED)[:-1 if KalmanFilter is not None else None]
+    return compare(contestants, 'steady', TIMED)[:-1 if HAS_FILTER else None]
 
 
 def order_example(order: int) -> Parameters:
@@ -208,7 +209,7 @@ def bank_timings() -> list[Timing]:
         f'bank of {count} hypotheses, order 3': _bank_timer(parameters, count, run)
         for count in HYPOTHESES
     }
-    return compare(contestants, 'steady', STEADY_FROM // 2)[:-1 if KalmanFilter else None]
+    return compare(contestants, 'steady', STEADY_FROM // 2)[:-1 if HAS_FILTER else None]
 
 
 def _bank_timer(parameters: Parameters, count: int, run: RunRecord) -> Timed:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from generate_parameters import write_parameters
@@ -48,7 +49,7 @@ SMALL = {'structure': 'tracking', 'amplitude': '0.2'}
 # The gapless observer allows for a disturbance, which is what helps this loop most.
 NO_INVERSE = {**WITHOUT, 'estimator.initial.m': '1.3', 'fixed.doubt': '0.5'}
 NO_GAP = {'backlash.c_r': '1e-9', 'backlash.c_l': '-1e-9', 'fixed.doubt': '0.0'}
-RESTING = {'linewidth': 6.0, 'alpha': 0.22, 'color': COLOURS['true']}
+RESTING: dict[str, Any] = {'linewidth': 6.0, 'alpha': 0.22, 'color': COLOURS['true']}
 
 
 def draw_result() -> Figure:

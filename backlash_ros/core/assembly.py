@@ -13,6 +13,7 @@ from backlash_ros.core.controller import AdaptiveController, Limits
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Bounds, Estimate, Estimator
 from backlash_ros.core.fixed import FixedBacklash
+from backlash_ros.core.gradient import GradientEstimator
 from backlash_ros.core.input_reconstruction import InputReconstruction
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.kalman import KalmanEstimator
@@ -20,6 +21,7 @@ from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.lq_preview import preview_gains
 from backlash_ros.core.model_check import check_model, model_warnings
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.pole_placement import FourBlocks, PolePlacement, place_poles
 from backlash_ros.core.printed_law import PrintedLaw
 from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.reference_signal import ReferenceSignal
@@ -31,6 +33,8 @@ from backlash_ros.core.transfer_function import TransferFunction
 
 # Until the backlash is known, half of the motion of u may not be what the first guess says.
 DOUBT_OF_FIRST_GUESS = 0.5
+# A law averages over the noise of u by itself, but not over the bias of smoothing it away.
+LITTLE_SMOOTHING = 0.1
 CAREFUL = 1e4  # times the input weight while the backlash is unknown
 
 
@@ -122,9 +126,8 @@ def _initial(p: Parameters) -> Estimate:
 
 
 def _reconstruction(p: Parameters) -> InputReconstruction:
-    return InputReconstruction(
-        build_model(p), p.real('estimator.output_noise_std'), p.integer('estimator.lag')
-    )
+    noise_std = p.real('estimator.output_noise_std') * LITTLE_SMOOTHING
+    return InputReconstruction(build_model(p), noise_std, p.integer('estimator.lag'))
 
 
 def _kalman(p: Parameters) -> Estimator:
@@ -159,16 +162,46 @@ def _fixed(p: Parameters) -> Estimator:
     )
 
 
+def _gradient(p: Parameters) -> Estimator:
+    structure = p.word('structure')
+    if structure != 'pole_placement':
+        raise ParameterError(
+            'structure', structure, 'must be pole_placement for estimator.law: gradient',
+            'the law learns from the response of that loop; every other law fits any structure',
+        )
+    blocks = _four_blocks(p)
+    return GradientEstimator(
+        _initial(p), _bounds(p), blocks, build_model(p).order, p.real('gradient.step'),
+        p.real('estimator.output_noise_std'),
+    )
+
+
 def _proportional(p: Parameters) -> Structure:
     return Proportional()
 
 
-def _tracking(p: Parameters) -> Structure:
-    model = build_model(p)
+def _input_weight(p: Parameters, model: TransferFunction) -> float:
     z = np.exp(1j * np.pi / 10.0)
     scale = float(abs(model.response(np.array([z]))[0])) ** 2
+    return p.real('tracking.input_weight') * scale
+
+
+def _pole_placement(p: Parameters) -> Structure:
+    return PolePlacement(_four_blocks(p))
+
+
+def _four_blocks(p: Parameters) -> FourBlocks:
+    model = build_model(p)
     state = StateModel(model)
-    weight = p.real('tracking.input_weight') * scale
+    gains = preview_gains(state, _input_weight(p, model), 0.0, 0)
+    closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
+    return place_poles(model, closed, p.real('pole_placement.filter_pole'))
+
+
+def _tracking(p: Parameters) -> Structure:
+    model = build_model(p)
+    state = StateModel(model)
+    weight = _input_weight(p, model)
     gains = preview_gains(
         state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview')
     )
@@ -181,7 +214,8 @@ def _tracking(p: Parameters) -> Structure:
 
 ESTIMATORS: dict[str, Callable[[Parameters], Estimator]] = {
     'kalman': _kalman, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
+    'gradient': _gradient,
 }
 STRUCTURES: dict[str, Callable[[Parameters], Structure]] = {
-    'proportional': _proportional, 'tracking': _tracking,
+    'proportional': _proportional, 'tracking': _tracking, 'pole_placement': _pole_placement,
 }

@@ -45,7 +45,8 @@ class FixedBacklash:
         self._input = np.append(model.b, 0.0)
         self._noise_var = max(noise_std, 1e-12) ** 2
         self._doubt = doubt
-        self._x, self._p = np.zeros(n + 1), np.zeros((n + 1, n + 1))
+        self._x: Array = np.zeros(n + 1)
+        self._p: Array = np.zeros((n + 1, n + 1))
         self._u = 0.0
         self._started = False
 

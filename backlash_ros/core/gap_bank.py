@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from math import inf, log, nan
+from math import inf, log, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,9 @@ Array = NDArray[np.float64]
 
 # Rounding in the propagation is not symmetric; left alone it would grow.
 SYMMETRISE_EVERY = 16
+CROSSING_REACH = 2.0  # standard deviation of a crossing before the first sample, in gaps
+STATE_REACH = 30.0  # standard deviation of x at the start, in terms of what was seen of y and v
+PRECISION = 1e-7  # least ratio of the deviations of the noise and of x at the start
 ELECT_EVERY = 4  # corrections between two looks for the most likely hypothesis
 NIS_MEMORY = 1.0 / 40.0  # the mean of a true hypothesis is 1, its standard deviation then 0.16
 NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
@@ -36,14 +39,19 @@ NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
 
 @dataclass(frozen=True)
 class Prior:
-    """What is believed before the first sample: theta and its standard deviations, shape (3,).
+    """What is believed of theta = (m, m c_r, m c_l) before the first sample.
 
-    state_std: standard deviation of the unknown x in the coordinates of StateModel.
+    theta: shape (3,). slope_std: of m. Given g, neither crossing is further from 0 than g, which
+    bounds what is believed of the products.
     """
 
     theta: Array
-    theta_std: Array
-    state_std: float
+    slope_std: float
+
+    def variances(self, gaps: Array) -> Array:
+        """Variances of theta per hypothesis, shape (H, 3)."""
+        product = (CROSSING_REACH * self.slope_std * gaps) ** 2
+        return np.stack([np.full(len(gaps), self.slope_std**2), product, product], axis=1)
 
 
 class GapBank:
@@ -70,11 +78,11 @@ class GapBank:
         self.noise_var, self.drift_var, self.tolerance = noise_var, drift_var, tolerance
         self.mean = np.zeros((count, n + 3))
         self.mean[:, n:] = prior.theta
-        variances = np.concatenate([np.full(n, prior.state_std**2), prior.theta_std**2])
-        self.cov = np.tile(np.diag(variances), (count, 1, 1))
-        # Every filter pays once for how little its prior says of x; repaid here, so that banks
-        # with different priors can be compared.
-        self.log_likelihood = np.full(count, n * log(prior.state_std))
+        self.cov = np.zeros((count, n + 3, n + 3))
+        diagonal = np.arange(n, n + 3)
+        widest = np.where(gaps > 0.0, gaps, gaps.max())  # the null hypothesis may hold any u
+        self.cov[:, diagonal, diagonal] = prior.variances(widest)
+        self.log_likelihood = np.zeros(count)
         self.active = 0  # hypotheses [:active] have started
         self.since_motion = 0  # samples since u last moved under the leader
         self.turned = False  # whether the leader engaged the other side with the last step
@@ -91,8 +99,9 @@ class GapBank:
         self._phi = np.zeros((count, 3))
         self._phi[0, 0] = 1.0  # for good under the null hypothesis
         self._v_low, self._v_high = inf, -inf  # swing of v so far
+        self._y_low, self._y_high, self._y = inf, -inf, 0.0  # swing of y so far, newest y
+        self._kick = float(np.linalg.norm(model.b)) * float(prior.theta[0])
         self._corrections = 0
-        self._noise_charge = 0.5 * (1.0 + log(noise_var))
 
     @property
     def theta(self) -> Array:
@@ -159,7 +168,7 @@ class GapBank:
         before = self.active
         if before < len(self.gaps):
             self._start(v)
-            self.log_likelihood[self.active:] -= self._noise_charge
+            self.log_likelihood[self.active:] -= 0.5 * (1.0 + log(self.noise_var))
         if before:
             self._play(before, v)
             self._propagate(before)
@@ -176,6 +185,21 @@ class GapBank:
         self._reach[new] = v if rising else v + self.gaps[new]
         self._left[new] = 0.0 if rising else 1.0
         self._set_phi(new)
+        self._set_state(new)
+
+    def _set_state(self, new: slice) -> None:
+        """Believe of x that it is near the equilibrium of the newest y, give or take a lot."""
+        n, largest = self._n, max(abs(self._v_low), abs(self._v_high))
+        swing = max(self._y_high - self._y_low, 0.0)
+        std = STATE_REACH * (swing + self._kick * largest + sqrt(self.noise_var))
+        # Covariances of doubles do not span more orders of magnitude than this.
+        self.noise_var = max(self.noise_var, (PRECISION * std) ** 2)
+        self.mean[new, :n] = self._model.equilibrium * self._y
+        diagonal = np.arange(n)
+        self.cov[new, diagonal, diagonal] = std**2
+        # Every filter pays once for how little it believes of x; repaid, so that filters that
+        # believed differently can be compared.
+        self.log_likelihood[new] += n * log(std)
 
     def _play(self, count: int, v: float) -> None:
         """Move the play operators; phi is that of the last engagement."""
@@ -213,6 +237,8 @@ class GapBank:
         gate: largest innovation of the leader in standard deviations. learn: False holds theta
         and corrects x alone, its covariance still counting theta as unknown (Schmidt's filter).
         """
+        self._y_low, self._y_high = min(y, self._y_low), max(y, self._y_high)
+        self._y = y
         count, n = self.active, self._n
         if not count:
             return True

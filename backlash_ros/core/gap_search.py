@@ -30,6 +30,7 @@ LARGEST_SPREAD = 0.3  # of the gap: the standard deviation is not to be trusted 
 LOST = 3.0  # standard deviations between read and estimated gap from which both are tried
 CAPACITY = 16384  # samples kept for replays
 REPLAY_SPEED = 3  # recorded samples per new one
+FIRST_REPLAY_SPEED = 8  # while no estimate is known at all
 LAST_REPLAY = CAPACITY * (REPLAY_SPEED - 1) // REPLAY_SPEED  # later ones would not catch up
 GROWTH_EARLY, GROWTH_LATE = 1.3, 3.0  # of the record between two replays
 EARLY = 400  # samples during which a misread record still shows in the estimate
@@ -44,8 +45,8 @@ FINE_TOLERANCE = 1e-6  # keeps the comparison finite when the estimate is exact
 SETTLED = 100  # samples of the fine bank after which the coarse one may rest
 NIS_SETTLED = 1.6  # normalised innovation squared of a fine bank that may be trusted to go alone
 # Without noise the filter still needs some, this far below what one sample of u does to x.
-NOISE_FLOOR = 1e-5
-STATE_REACH = 100.0  # prior of x, in terms of what was seen of y and v
+NOISE_FLOOR = 1e-6
+SLOPE_REACH = 30.0  # standard deviation of the slope before the first sample, in first guesses
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class GapSearch:
         self._read_with: Array = np.empty(0)  # gaps with which the fine bank read the record
         self._fine_since = 0
         self._earliest = 0
+        self._noise_floor = 0.0
         self._refused = 0
         self._settled = False
 
@@ -122,12 +124,14 @@ class GapSearch:
         count = self.samples
         if np.ptp(self._v[:count]) == 0.0:
             return
-        bounds = self._settings.bounds
+        s = self._settings
+        motion = float(np.abs(self._v[:count]).max()) * s.initial.m
+        self._noise_floor = NOISE_FLOOR * float(np.linalg.norm(s.model.b)) * motion
+        bounds = s.bounds
         widest = bounds.c_r[1] - bounds.c_l[0]
         steps = ceil(-log(SMALLEST_GAP) / log(GRID_RATIO))
-        self.coarse = self._bank(
-            np.geomspace(SMALLEST_GAP * widest, widest, steps + 1), with_null=True
-        )
+        grid: Array = widest * SMALLEST_GAP ** np.linspace(1.0, 0.0, steps + 1)
+        self.coarse = self._bank(grid, with_null=True)
         for y, v in zip(self._y[:count], self._v[:count], strict=True):
             _advance(self.coarse, y, v)
 
@@ -193,7 +197,8 @@ class GapSearch:
     def _advance_replay(self) -> None:
         replay = self._replay
         assert replay is not None
-        end = min(self._replayed + REPLAY_SPEED, self.samples)
+        speed = REPLAY_SPEED if self.fine is not None else FIRST_REPLAY_SPEED
+        end = min(self._replayed + speed, self.samples)
         for k in range(self._replayed, end):
             _advance(replay, float(self._y[k]), float(self._v[k]))
         self._replayed = end
@@ -205,16 +210,12 @@ class GapSearch:
             self._read_with = replay.gaps
 
     def _bank(self, gaps: Array, with_null: bool) -> GapBank:
-        s, count = self._settings, min(self.samples, CAPACITY)
-        kick = float(np.linalg.norm(s.model.b) * np.abs(self._v[:count]).max()) * s.initial.m
-        noise = max(s.noise_std, NOISE_FLOOR * kick)
-        seen = np.abs(self._y[:count][np.isfinite(self._y[:count])]).max(initial=0.0)
+        s = self._settings
         i, b = s.initial, s.bounds
         prior = Prior(
-            np.array([i.m, i.m * i.c_r, i.m * i.c_l]),
-            np.array([b.m[1], 0.25 * b.m[1] * b.c_r[1], 0.25 * b.m[1] * -b.c_l[0]]),
-            STATE_REACH * (seen + noise + kick),
+            np.array([i.m, i.m * i.c_r, i.m * i.c_l]), min(SLOPE_REACH * i.m, b.m[1])
         )
+        noise = max(s.noise_std, self._noise_floor)
         drift = drift_in_products(i, s.drift_std) if any(s.drift_std) else None
         tolerance = COARSE_TOLERANCE if with_null else FINE_TOLERANCE
         return GapBank(gaps, s.model, prior, noise**2, drift, tolerance, with_null)

@@ -68,7 +68,7 @@ class InputReconstruction:
         self._gain, self._lag_gain = self._gains(self._steady)
         self._after_steady = self._covariance = self._measured(self._steady)
         self.std = float(np.sqrt(self._after_steady.var[-1]))
-        self._x = np.zeros(n + 1)
+        self._x: Array = np.zeros(n + 1)
         self._window = np.zeros(lag + 1)  # u_hat(k - i) given y(..k)
         self._since_loss = LAGS_TO_STEADY * lag
 

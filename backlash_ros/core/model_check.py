@@ -1,4 +1,4 @@
-"""Checks of G(z) before anything runs: what cannot be estimated is refused, what is hard is said."""
+"""Checks of G(z): what cannot be estimated through it is refused, what is hard is said."""
 
 from __future__ import annotations
 

@@ -9,7 +9,6 @@ from math import hypot, isfinite, isnan, sqrt
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter, Value
 
-
 NOISE = 'estimator.output_noise_std'
 
 

@@ -38,6 +38,14 @@ class StateModel:
         self.b: Array = to_state @ b
         self.c = float(triangle[0, 0])
         self.memory = _memory(model)
+        self.equilibrium = self._equilibrium()
+
+    def _equilibrium(self) -> Array:
+        """State x at rest with y = 1, shape (n,): a constant u holds it, none in an integrator."""
+        n = self.order
+        rest = np.zeros((n + 1, n + 1))
+        rest[:n, :n], rest[:n, n], rest[n, 0] = self.a - np.eye(n), self.b, self.c
+        return np.asarray(linalg.lstsq(rest, np.eye(n + 1)[n])[0][:n])
 
 
 def _horizon(model: TransferFunction) -> int:

@@ -35,14 +35,11 @@ class CommandHistory:
     def over(self, intervals: int, end_ns: int) -> list[float]:
         """v over each of the newest `intervals`, oldest first; the last one ended at end_ns.
 
-        Empty before the first command.
+        Empty if it was the newest command in all of them, as usual.
         """
-        if not self._published:
-            return []
-        newest_ns, newest = self._published[-1]
         first_end = end_ns - (intervals - 1) * self._period_ns
-        if newest_ns < first_end:
-            return [newest] * intervals
+        if self._published[-1][0] < first_end:
+            return []
         self.late += 1
         return [self._at(end_ns - i * self._period_ns) for i in reversed(range(intervals))]
 

@@ -16,7 +16,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.controller import ControlStep
-from backlash_ros.core.estimator import Interval, Status
+from backlash_ros.core.estimator import Status
 from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.parameter_table import CONTROLLER
 from backlash_ros.core.parameters import Parameters
@@ -194,24 +194,15 @@ class ControllerNode(ProcessNode):
         """Step the core over the missing outputs to y, with the v that was really applied."""
         lost = min(self._missing, LONGEST_GAP)
         self._missing = 0
-        last = self._last
-        if last is None:
+        if self._last is None:
             self._commands.begin(stamp_ns)
             return self._core.step(y, y_m)
-        if self._lockstep:
-            return self._core.step(y, y_m, lost)
         applied: list[float] = []
-        if self._use_applied:
-            applied = self._commands.reported_over(lost + 1, stamp_ns)
-        if not applied:
-            applied = self._commands.over(lost + 1, stamp_ns)
-        if applied.count(last.v) == len(applied):
-            return self._core.step(y, y_m, lost)
-        while lost and applied.count(applied[-1]) != len(applied):
-            interval = Interval(applied.pop(0), last.y_m, last.u_d, last.estimate.f)
-            self._core.estimator.update(None, interval)
-            lost -= 1
-        return self._core.step(y, y_m, lost, applied[-1])
+        if not self._lockstep:
+            if self._use_applied:
+                applied = self._commands.reported_over(lost + 1, stamp_ns)
+            applied = applied or self._commands.over(lost + 1, stamp_ns)
+        return self._core.step(y, y_m, lost, applied)
 
     def _take_up(self, p: Parameters) -> None:
         """Take up limits, inverse and step sizes without touching what was learned."""

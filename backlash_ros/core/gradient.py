@@ -1,0 +1,118 @@
+"""The adaptation of Tao and Kokotović: a normalised gradient on the products, from y and y_m.
+
+With theta = (m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi, the loop of
+pole_placement.py answers to the true theta with
+
+    y = y_ref + W (u - u_d),   y_ref = theta_3 B/A_m y_m
+
+so that with zeta = W phi the estimation error is linear in the parameter error:
+
+    eps = y - y_ref + W u_d - theta_hat' zeta = (theta - theta_hat)' zeta
+    theta_hat(k+1) = theta_hat(k) + step P zeta eps / (zeta' P zeta + xi^2/u_s^2 + a^2)
+
+xi = theta_hat' zeta - W u_d is the swapping term. P = diag(1/v_s^2, 1, 1) gives the slope and the
+crossings regressors of one size; v_s^2, u_s^2 and 10 a^2 are the means of v^2, u_d^2 and
+zeta' P zeta, so that no unit matters; a is larger where y is noisy. The side of phi is the one the inverse used.
+
+Reference: G. Tao, P. V. Kokotović, Adaptive Control of Systems with Actuator and Sensor
+Nonlinearities, Wiley 1996.
+"""
+
+from __future__ import annotations
+
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.pole_placement import FourBlocks
+from backlash_ros.core.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+ON_LINE = 1e-9  # relative distance of v from a line of the inverse that counts as none
+FLOOR = 0.1  # a^2, in units of the mean of zeta' P zeta
+NOISE_MARGIN = 10.0  # a is at least that many standard deviations of y, in units of u_s
+MEMORY = 200  # samples of the running means
+
+
+class GradientEstimator:
+    """Learns (m, m c_r, m c_l) from the tracking error of the four-block loop.
+
+    step: 0 < step < 2. noise_std: of y. Only valid while v comes from PolePlacement with the same blocks, which
+    are the model that explains y.
+    """
+
+    def __init__(
+        self, initial: Estimate, bounds: Bounds, blocks: FourBlocks, order: int, step: float,
+        noise_std: float,
+    ) -> None:
+        self.estimate = initial
+        self.step = step
+        self.innovation = nan
+        self.u_hat = 0.0
+        self.x_hat = np.zeros(order)
+        self.x_cov = None
+        self._bounds, self._noise_square = bounds, (NOISE_MARGIN * noise_std) ** 2
+        self._reference = _Filter(blocks.reference, 1)
+        # W of phi and of u_d side by side.
+        self._disturbance = _Filter(blocks.disturbance, 4)
+        self._phi = np.zeros(3)
+        self._v_square = self._u_square = self._size = 0.0  # running means
+        self._samples = 0
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
+        old = self.estimate
+        self._engage(interval, old)
+        theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
+        self.u_hat = float(theta @ self._phi)
+        y_ref = float(self._reference.step(np.array([interval.y_m]))[0])
+        filtered = self._disturbance.step(np.append(self._phi, interval.u_d))
+        self._samples += 1
+        share = 1.0 / min(self._samples, MEMORY)
+        self._v_square += share * (interval.v**2 - self._v_square)
+        self._u_square += share * (interval.u_d**2 - self._u_square)
+        if y is None:
+            self.innovation = nan
+            return
+        zeta = filtered[:3]
+        xi = float(theta @ zeta - filtered[3])
+        eps = self.innovation = y - y_ref - xi
+        if self._v_square == 0.0 or self._u_square == 0.0:
+            return
+        scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
+        size = float(zeta @ scaled)
+        self._size += share * (size - self._size)
+        norm = size + max(FLOOR * self._size, self._noise_square / self._u_square)
+        norm += xi**2 / self._u_square
+        if norm == 0.0:
+            return
+        theta = theta + (self.step * eps / norm) * scaled
+        low, high = self._bounds.m
+        m = min(max(float(theta[0]), low), high)
+        m, c_r, c_l = self._bounds.project(m, float(theta[1]) / m, float(theta[2]) / m)
+        self.estimate = Estimate(m, c_r, c_l, old.f, status=Status.TRACKING)
+
+    def _engage(self, interval: Interval, used: Estimate) -> None:
+        """Set phi for the line on which the inverse put v; between lines the last one holds."""
+        v, line = interval.v, interval.u_d / used.m
+        near = ON_LINE * (abs(v) + abs(line))
+        if abs(v - line - used.c_r) <= near:
+            self._phi = np.array([v, -1.0, 0.0])
+        elif abs(v - line - used.c_l) <= near:
+            self._phi = np.array([v, 0.0, -1.0])
+
+
+class _Filter:
+    """A strictly proper transfer function applied to several signals at once."""
+
+    def __init__(self, model: TransferFunction, signals: int) -> None:
+        self._a, self._b, _ = model.state_space()
+        self._x = np.zeros((model.order, signals))
+
+    def step(self, inputs: Array) -> Array:
+        """Take in u(k-1) of each signal and return y(k), shape (signals,)."""
+        self._x = self._a @ self._x + np.outer(self._b, inputs)
+        return self._x[0]
