@@ -9,7 +9,7 @@ from math import sin
 import numpy as np
 from cramer_rao import cramer_rao
 from numpy.typing import NDArray
-from random_cases import random_case
+from random_cases import Case, random_case
 
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.controller import Limits
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 NAMES = ('m', 'c_r', 'c_l')
 MARKS_S = (0.5, 1.0, 2.0, 6.0)
+QUIET_NOISE = 1e-4  # times the noise of a random case
 
 
 @dataclass(frozen=True)
@@ -122,10 +123,21 @@ def _nees(error: Array, cov: Array | None) -> float:
     return float('nan') if cov is None else float(error @ np.linalg.solve(cov, error))
 
 
+def run_quiet_case(seed: int) -> CaseResult:
+    """The random case with next to no noise, which the estimator is told."""
+    noise = QUIET_NOISE * random_case(seed).parameters.real('output_noise_std')
+    return _run_case(random_case(
+        seed, **{'output_noise_std': noise, 'estimator.output_noise_std': noise}
+    ))
+
+
 def run_random_case(seed: int) -> CaseResult:
     """Simulate one random case for three periods."""
-    case = random_case(seed)
-    p = case.parameters
+    return _run_case(random_case(seed))
+
+
+def _run_case(case: Case) -> CaseResult:
+    seed, p = case.seed, case.parameters
     truth = p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
     try:
         run = build_closed_loop(p).run(case.samples + 1)

@@ -20,7 +20,7 @@ from backlash_ros.core.run_record import RunRecord
 from backlash_ros.core.state_model import StateModel
 
 try:
-    from filterpy.kalman import KalmanFilter
+    from filterpy.kalman import KalmanFilter  # type: ignore[import-untyped]
 except ImportError:
     KalmanFilter = None
 HAS_FILTER = KalmanFilter is not None
@@ -214,7 +214,7 @@ def bank_timings() -> list[Timing]:
 
 def _bank_timer(parameters: Parameters, count: int, run: RunRecord) -> Timed:
     model = StateModel(build_model(parameters))
-    prior = Prior(np.array([1.0, 1.0, -1.0]), np.array([10.0, 100.0, 100.0]), 100.0)
+    prior = Prior(np.array([1.0, 1.0, -1.0]), 10.0)
     bank = GapBank(np.geomspace(0.1, 6.0, count + 1)[1:], model, prior, NOISE**2)
     v, y = run.column('v').tolist(), run.column('y').tolist()
     k = 0

@@ -15,8 +15,6 @@ from backlash_ros.tools.configuration import (
     find_config,
     load_config,
     parse_setting,
-    read_reference,
-    reference_samples,
     shipped_configs,
     write_config,
 )
@@ -182,29 +180,3 @@ def test_settings_go_before_the_file_and_the_seed_before_both(config: Path) -> N
     written(config, '/**: {ros__parameters: {seed: 2, amplitude: 2.0, bias: 2.0}}')
     parameters = effective_parameters(config, ['amplitude=3', 'seed=3'], seed=4)
     assert (parameters['bias'], parameters['amplitude'], parameters['seed']) == (2.0, 3.0, 4)
-
-
-def test_reference_file_is_read(tmp_path: Path) -> None:
-    path = written(tmp_path / 'y_m.csv', 't,y_m\n0,1\n0.01,-2.5\n0.020000001,3e-1\n')
-    assert read_reference(path, 0.01) == (1.0, -2.5, 0.3)
-    parameters = Parameters({'waveform': 'file', 'file': str(path)})
-    assert reference_samples(parameters) == (1.0, -2.5, 0.3)
-    assert reference_samples(Parameters({'file': str(path)})) == ()
-
-
-@pytest.mark.parametrize(
-    ('text', 'message'),
-    [
-        ('0,1\n', 'line 1: must be the header t,y_m'),
-        ('t,y_m\n', 'holds no sample'),
-        ('t,y_m\n0,1\n0.02,2\n', r'line 3: t=0\.02 must be 0\.01'),
-        ('t,y_m\n0,nan\n', 'line 2: y_m=nan must be finite'),
-        ('t,y_m\n0,1,2\n', 'line 2: must hold two numbers'),
-        ('t,y_m\n0,a\n', 'line 2: must hold two numbers'),
-    ],
-)
-def test_mistake_in_a_reference_file_names_the_line(
-    tmp_path: Path, text: str, message: str,
-) -> None:
-    with pytest.raises(InputError, match=message):
-        read_reference(written(tmp_path / 'y_m.csv', text), 0.01)

@@ -82,11 +82,9 @@ def test_lms_does_so_with_the_defaults_of_all_other_parameters() -> None:
 def test_lms_learns_from_other_references_that_swing_past_the_gap(
     waveform: str, frequency: float,
 ) -> None:
-    p = paper_example(
-        waveform=waveform, frequency=frequency, **{'estimator.output_noise_std': 0.0}
-    )
-    run = build_closed_loop(p).run(TEN_SECONDS)
-    assert_settled_within(run, 10.0)
+    p = paper_example(waveform=waveform, frequency=frequency)
+    run = build_closed_loop(p).run(2 * TEN_SECONDS)
+    assert_settled_within(run, 12.0)
 
 
 @settings(max_examples=25)
@@ -95,7 +93,7 @@ def test_lms_learns_behind_any_plant(model: TransferFunction) -> None:
     run = build_closed_loop(paper_example(
         plant__numerator=model.numerator.tolist(), plant__denominator=model.denominator.tolist(),
     )).run(TEN_SECONDS)
-    assert_settled_within(run, 10.0)
+    assert_settled_within(run, 5.0)
 
 
 def test_lms_with_the_wrong_sign_learns_nothing() -> None:
@@ -112,7 +110,7 @@ def test_lms_learns_although_outputs_are_lost(period: int, burst: int) -> None:
     loop.lose = every(period, burst)
     run = loop.run(TEN_SECONDS)
     assert run.lost_samples == TEN_SECONDS - run.samples > 0
-    assert_settled_within(run, 10.0)
+    assert_settled_within(run, 5.0)
 
 
 @pytest.mark.parametrize('period', [50, 20])
@@ -133,7 +131,7 @@ def test_lms_learns_with_outputs_lost_at_random(loss: float) -> None:
 def test_lms_learns_from_the_v_that_the_limits_let_through() -> None:
     run = build_closed_loop(paper_example(control__min=-9.0, control__max=9.0)).run(TEN_SECONDS)
     assert np.abs(run.column('v')).max() == 9.0
-    assert_settled_within(run, 10.0)
+    assert_settled_within(run, 5.0)
 
 
 def test_printed_law_stays_finite_and_does_not_identify() -> None:

@@ -40,7 +40,7 @@ def of_every_page(pattern: re.Pattern[str]) -> Iterator[tuple[Path, str]]:
 
 
 def shell_commands() -> list[list[str]]:
-    """Return the words of each command in the shell blocks of all pages, and in `simulate ...`."""
+    """Return the words of each command in the shell blocks of all pages and in `simulate -...`."""
     lines = [
         line
         for page in PAGES for language, text in BLOCK.findall(page.read_text())
@@ -100,6 +100,14 @@ def test_page_of_parameters_is_current() -> None:
         cwd=ROOT, capture_output=True, text=True, check=True,
     )
     assert (DOCS / 'parameters.md').read_text() == done.stdout, 'call make docs'
+
+
+def test_python_files_that_pages_name_exist() -> None:
+    named = {code for _, code in of_every_page(CODE) if re.fullmatch(r'\w+\.py', code)}
+    folders = ('backlash_ros', 'docs', 'benchmarks', 'test', 'scripts')
+    present = {path.name for folder in folders for path in (ROOT / folder).rglob('*.py')}
+    assert named
+    assert named <= present
 
 
 def test_parameters_that_pages_name_exist() -> None:

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.command_history import CommandHistory
-from backlash_ros.nodes.reference_file import read_reference_file
 from backlash_ros.nodes.sample_counter import SampleCounter
 
 PERIOD_S, PERIOD_NS = 0.01, 10_000_000
@@ -132,29 +126,3 @@ def test_reports_over_lost_outputs_are_used_one_by_one() -> None:
     for k in (1, 2, 3):
         commands.report(10.0 * k, START_NS + k * PERIOD_NS - 1000)
     assert commands.reported_over(3, START_NS + 3 * PERIOD_NS) == [10.0, 20.0, 30.0]
-
-
-@pytest.mark.parametrize(
-    ('text', 'complaint'),
-    [
-        ('', 'header t,y_m'),
-        ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
-        ('t,y_m\n0,1\n0.02,2\n', 'line 3 must hold t=0.01'),
-        ('t,y_m\n0,nan\n', 'finite y_m'),
-    ],
-)
-def test_a_reference_file_is_refused_with_its_line(
-    tmp_path: Path, text: str, complaint: str,
-) -> None:
-    file = tmp_path / 'reference.csv'
-    file.write_text(text)
-    parameters = Parameters({'waveform': 'file', 'file': str(file)})
-    with pytest.raises(ParameterError, match=complaint):
-        read_reference_file(parameters)
-
-
-def test_a_reference_file_gives_one_value_per_period(tmp_path: Path) -> None:
-    file = tmp_path / 'reference.csv'
-    file.write_text('t,y_m\n0,1\n0.01,-2.5\n')
-    parameters = Parameters({'waveform': 'file', 'file': str(file)})
-    assert read_reference_file(parameters) == (1.0, -2.5)

@@ -24,6 +24,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.pole_placement import FourBlocks, PolePlacement, place_poles
 from backlash_ros.core.printed_law import PrintedLaw
 from backlash_ros.core.proportional import Proportional
+from backlash_ros.core.reference_file import read_reference_file
 from backlash_ros.core.reference_signal import ReferenceSignal
 from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
 from backlash_ros.core.state_model import StateModel
@@ -103,11 +104,12 @@ def build_plant(p: Parameters) -> SimulatedPlant:
     return SimulatedPlant(build_model(p), backlash, p.real('sample_period'), rng, imperfections)
 
 
-def build_reference(p: Parameters, samples: tuple[float, ...] = ()) -> ReferenceSignal:
-    """y_m(t); samples are the values of the file for waveform: file."""
+def build_reference(p: Parameters) -> ReferenceSignal:
+    """y_m(t); reads the file for waveform: file."""
     return ReferenceSignal(
         p.word('waveform'), p.real('amplitude'), p.real('frequency'), p.real('bias'),
-        p.real('frequency_start'), p.real('sweep_time'), p.real('sample_period'), samples,
+        p.real('frequency_start'), p.real('sweep_time'), p.real('sample_period'),
+        read_reference_file(p),
     )
 
 

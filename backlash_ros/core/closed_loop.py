@@ -43,6 +43,7 @@ class ClosedLoop:
                 self.plant.step(v)
             else:
                 step = self.controller.step(y, self.reference(t), lost)
+                self.controller.refine()
                 lost, v = 0, step.v
                 truth = self.plant.backlash
                 u = self.plant.step(v)
@@ -58,11 +59,11 @@ class ClosedLoop:
         return RunRecord(rows[:kept], self.sample_period, self.controller.lost_samples + lost)
 
 
-def build_closed_loop(p: Parameters, reference_samples: tuple[float, ...] = ()) -> ClosedLoop:
+def build_closed_loop(p: Parameters) -> ClosedLoop:
     """The loop of the given parameters; the seed also draws which outputs are lost."""
     loss = p.real('output_loss')
     rng = np.random.default_rng([p.integer('seed'), 1])
     return ClosedLoop(
-        build_controller(p), build_plant(p), build_reference(p, reference_samples),
+        build_controller(p), build_plant(p), build_reference(p),
         p.real('sample_period'), lambda: loss > 0.0 and float(rng.random()) < loss,
     )

@@ -49,7 +49,7 @@ class AdaptiveController:
     """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
 
     Call `step` once per received y. The estimator is updated before v is computed, so that
-    v(k) uses everything up to y(k).
+    v(k) uses everything up to y(k). Call `refine` when v is on its way.
     """
 
     def __init__(
@@ -94,3 +94,7 @@ class AdaptiveController:
         return ControlStep(
             y_m, y, command.u_d, v, estimator.u_hat, estimator.innovation, estimator.estimate
         )
+
+    def refine(self) -> None:
+        """Do what the command did not have to wait for; optional, the next step makes up for it."""
+        self.estimator.refine()

@@ -112,3 +112,6 @@ class Estimator(Protocol):
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
+
+    def refine(self) -> None:
+        """Do what the command of this sample need not wait for."""

@@ -65,6 +65,9 @@ class FixedBacklash:
         """Covariance of x_hat, shape (n, n)."""
         return self._p[:-1, :-1]
 
+    def refine(self) -> None:
+        """Nothing is left to do after the command."""
+
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
         e = self.estimate

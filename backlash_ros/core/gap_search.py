@@ -130,8 +130,8 @@ class GapSearch:
         bounds = s.bounds
         widest = bounds.c_r[1] - bounds.c_l[0]
         steps = ceil(-log(SMALLEST_GAP) / log(GRID_RATIO))
-        grid: Array = widest * SMALLEST_GAP ** np.linspace(1.0, 0.0, steps + 1)
-        self.coarse = self._bank(grid, with_null=True)
+        grid = widest * SMALLEST_GAP ** np.linspace(1.0, 0.0, steps + 1)
+        self.coarse = self._bank(np.asarray(grid, dtype=np.float64), with_null=True)
         for y, v in zip(self._y[:count], self._v[:count], strict=True):
             _advance(self.coarse, y, v)
 

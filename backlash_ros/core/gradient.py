@@ -95,6 +95,9 @@ class GradientEstimator:
         m, c_r, c_l = self._bounds.project(m, float(theta[1]) / m, float(theta[2]) / m)
         self.estimate = Estimate(m, c_r, c_l, old.f, status=Status.TRACKING)
 
+    def refine(self) -> None:
+        """Nothing is left to do after the command."""
+
     def _engage(self, interval: Interval, used: Estimate) -> None:
         """Set phi for the line on which the inverse put v; between lines the last one holds."""
         v, line = interval.v, interval.u_d / used.m

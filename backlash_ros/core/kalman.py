@@ -104,6 +104,12 @@ class KalmanEstimator:
             self._challenger = None
         self._publish()
 
+    def refine(self) -> None:
+        """Search on: read the record again, compare all gaps."""
+        self._search.refine()
+        if self._challenger is not None:
+            self._challenger.refine()
+
     def _restart_in_vain(self, watched: _Watched) -> None:
         """Begin afresh where a first search found nothing, and remember why."""
         if watched.inconsistent_for >= RESTART_AFTER:
@@ -183,6 +189,7 @@ class _Watched:
         self.consistent_for = 0  # samples
         self.inconsistent_for = 0  # samples
         self.contradicted = False
+        self._waiting: tuple[float | None, float, bool] | None = None
         self._proven = False
         self._refused = 0  # in a row
         self._calm: list[float] = []  # normalised innovations squared since a contradiction
@@ -197,6 +204,7 @@ class _Watched:
 
     def add(self, y: float | None, v: float) -> bool:
         """Take in a sample; return False if y was refused as an outlier."""
+        self.refine()
         search = self.search
         fine, accepted = search.fine, True
         if fine is not None:
@@ -209,8 +217,14 @@ class _Watched:
                 self._follow(fine)
         elif search.coarse is not None:
             self._count(search.coarse.nis < NIS_TRUSTED)
-        search.add(y, v, accepted)
+        self._waiting = (y, v, accepted)
         return accepted
+
+    def refine(self) -> None:
+        """Let the search take in the newest sample."""
+        if self._waiting is not None:
+            self.search.add(*self._waiting)
+            self._waiting = None
 
     def _judge(self, fine: GapBank, accepted: bool) -> None:
         self._refused = 0 if accepted else self._refused + 1

@@ -69,6 +69,9 @@ class NormalisedLms:
         """y(k) minus its prediction; nan where y(k) was lost."""
         return self._reconstruction.innovation
 
+    def refine(self) -> None:
+        """Nothing is left to do after the command."""
+
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""
         u = self._reconstruction.update(y)

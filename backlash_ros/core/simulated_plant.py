@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from backlash_ros.core.backlash import Backlash, check_backlash
 from backlash_ros.core.transfer_function import TransferFunction
@@ -43,7 +44,7 @@ class SimulatedPlant:
         self.sample = 0
         self._initial = (backlash.m, backlash.c_r, backlash.c_l)
         self._a, self._b, _ = model.state_space()
-        self._x = np.zeros(model.order)
+        self._x: NDArray[np.float64] = np.zeros(model.order)
         self._sample_period = sample_period
         self._rng = rng
         self._extra = imperfections or Imperfections()

@@ -54,7 +54,7 @@ class Tracking:
         self._x = np.zeros(model.order)  # x* and q* of the trajectory
         self._q = 0.0
         self._integral = 0.0
-        self._noise_std, self._reach = noise_std, 0.0
+        self._noise_std, self._reach, self._u_reach = noise_std, 0.0, 0.0
         self._resting: float | None = 0.0  # u* at which v rests, None while it moves
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
@@ -70,7 +70,7 @@ class Tracking:
             u_d = ideal - float(gains.state @ deviation)
             u_d -= gains.integral * (self._integral - self._q)
         else:
-            u_d = ideal - float(self._careful @ deviation)
+            u_d = ideal - self._careful_feedback(situation.estimate, deviation, ideal)
         self._rest(situation, deviation, ideal)
         if self._resting is not None:
             u_d = self._resting
@@ -93,6 +93,15 @@ class Tracking:
             self._window.extend([situation.y_m if near else start] * (self.delay + 1))
             self._x = situation.x_hat.copy()
         self._window.append(situation.y_m)
+
+    def _careful_feedback(self, estimate: Estimate, deviation: Array, ideal: float) -> float:
+        """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.
+
+        A wrong slope may make the loop unstable: bounded feedback cannot make it unbounded.
+        """
+        self._u_reach = max(self._u_reach, abs(ideal))
+        limit = max(self._u_reach, estimate.m * (estimate.c_r - estimate.c_l))
+        return min(max(float(self._careful @ deviation), -limit), limit)
 
     def _rest(self, situation: Situation, deviation: Array, ideal: float) -> None:
         """Decide whether v rests: the trajectory does, and y needs no correction."""

@@ -35,6 +35,9 @@ from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import ProcessNode, run
 
 DIAGNOSTICS_PERIOD_S = 1.0
+# A controller that was held up for a few samples still learns from them; after a longer stall it
+# goes on with the newest ones.
+KEPT_OUTPUTS = 10
 LOOK_S = 0.1  # between two looks for a silent plant_output
 # Gaps beyond this are not stepped over to the end: nothing is left to predict from them, and the
 # command must not wait for it.
@@ -124,7 +127,7 @@ class ControllerNode(ProcessNode):
         )
 
     def _start(self) -> None:
-        self.listen(Float64, topics.PLANT_OUTPUT, self._on_output, 1)
+        self.listen(Float64, topics.PLANT_OUTPUT, self._on_output, KEPT_OUTPUTS)
         emit('ready')
 
     def _on_reference(self, message: Float64) -> None:
@@ -184,6 +187,7 @@ class ControllerNode(ProcessNode):
         statistics.used += 1
         statistics.latencies.append(latency)
         self._publish_rows(step, latency)
+        self._core.refine()
         changed = self._last is None or self._last.estimate.status != step.estimate.status
         self._last = step
         if changed or self._silent:

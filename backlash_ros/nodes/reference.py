@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import sys
+import time
+from math import inf
+from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
@@ -13,25 +16,38 @@ from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.parameter_table import REFERENCE
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.messages import DEPTH, KEPT, stamp_ns_of
-from backlash_ros.nodes.reference_file import read_reference_file
+from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
+
+# plant_output counts as silent after this; then the own clock takes over.
+SILENT_PERIODS, SHORTEST_SILENCE_S = 3.0, 0.1
 
 
 class ReferenceNode(ProcessNode):
-    """Publishes y_m(kT) every sample period; in lockstep once per tick of /clock."""
+    """Publishes y_m for the sample that comes next.
+
+    plant_output is the sampling clock: with y(k), y_m of sample k+1 leaves and is there in time.
+    Where no output comes, y_m goes on by the own clock; a node that waits for its subscribers
+    stays at y_m(0) before the first output, so that the run begins at t = 0. In lockstep y_m
+    leaves once per tick of /clock.
+    """
 
     def __init__(self) -> None:
         super().__init__(REFERENCE)
         p = self.settings
-        self._signal = build_reference(p, read_reference_file(p))
+        self._signal = build_reference(p)
         self._sample_period = p.real('sample_period')
         self._lockstep = p.flag('lockstep')
         self._started = False
+        self._counter = SampleCounter(self._sample_period)
+        self._sample = 0  # the one that comes next
+        self._heard_at = -inf  # on the steady clock [s]
         self._message = Float64()
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, KEPT if self._lockstep else DEPTH
         )
         listeners = p.integer('wait_for_subscribers')
+        self._waits = listeners > 0
         self.call_when(
             lambda: self._output.get_subscription_count() >= listeners, self._start,
             f'{listeners} subscribers of {topics.REFERENCE}',
@@ -49,13 +65,26 @@ class ReferenceNode(ProcessNode):
         self._started = True
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
+        else:
+            self.listen(Float64, topics.PLANT_OUTPUT, self._on_output, 1)
         emit('ready')
 
     def _on_clock(self, message: Clock) -> None:
         self._publish(round(stamp_ns_of(message) * 1e-9 / self._sample_period))
 
+    def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
+        before = self._counter.index
+        self._counter.count(info['source_timestamp'], info['publication_sequence_number'])
+        self._sample += self._counter.index - before if before >= 0 else 1
+        self._heard_at = time.monotonic()
+        self._publish(self._sample)
+
     def _on_tick(self, tick: int, due_ns: int) -> bool:
-        self._publish(tick)
+        silence = max(SILENT_PERIODS * self._sample_period, SHORTEST_SILENCE_S)
+        if time.monotonic() > self._heard_at + silence:
+            self._publish(self._sample)
+            if self._counter.index >= 0 or not self._waits:
+                self._sample += 1
         return True
 
     def _publish(self, sample: int) -> None:

@@ -20,7 +20,7 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import command_line, processes
 from backlash_ros.tools.command_line import DONE, FAILED, OptionParser
-from backlash_ros.tools.configuration import effective_parameters, reference_samples, write_config
+from backlash_ros.tools.configuration import effective_parameters, write_config
 from backlash_ros.tools.errors import InputError
 from backlash_ros.tools.processes import Event, ProcessPlan, ProcessSupervisor, RunError
 from backlash_ros.tools.progress import ProgressDisplay, number
@@ -244,8 +244,10 @@ def plan_processes(plan: RunPlan) -> tuple[ProcessPlan, ...]:
     recorder = {
         'wait_for_publishers': 'true', 'bag': _quoted(plan.bag) if plan.record else "''",
     }
+    # In real time the reference follows plant_output as well, in lockstep it follows /clock.
+    outputs = '2' if plan.parameters.flag('lockstep') else '3'
     return (
-        _node('plant', plan, listeners),
+        _node('plant', plan, {'wait_for_subscribers': outputs}),
         _node('reference', plan, listeners),
         _node('controller', plan, listeners),
         _node('recorder', plan, recorder),
@@ -280,7 +282,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
         )
     build_controller(parameters)
     build_plant(parameters)
-    build_reference(parameters, reference_samples(parameters))
+    build_reference(parameters)
     if options.out is not None and (options.out / BAG).exists():
         raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
     # The nodes need a path that holds wherever it is read.

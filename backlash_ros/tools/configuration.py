@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import importlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -202,45 +200,3 @@ def write_config(parameters: Parameters, path: Path) -> None:
         branch[leaf] = list(value) if isinstance(value, tuple) else value
     document = {EVERY_NODE: {'ros__parameters': tree}}
     write_atomically(path, yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000))
-
-
-def reference_samples(parameters: Parameters) -> tuple[float, ...]:
-    """y_m of the CSV of `waveform: file`; empty for every other waveform."""
-    if parameters.word('waveform') != 'file':
-        return ()
-    path = parameters.word('file')
-    if not path:
-        raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
-    return read_reference(Path(path), parameters.real('sample_period'))
-
-
-def read_reference(path: Path, sample_period: float) -> tuple[float, ...]:
-    """Read a CSV with the header t,y_m and one row per sample period, from t = 0 on.
-
-    Raises InputError, naming the line, for anything else: a time is never rounded silently.
-    """
-    try:
-        with path.open(newline='', encoding='utf-8') as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f'{path}: cannot be read: {error}') from None
-    if not rows or [cell.strip() for cell in rows[0]] != ['t', 'y_m']:
-        raise InputError(f'{path}: line 1: must be the header t,y_m')
-    samples: list[float] = []
-    for line, row in enumerate(rows[1:], start=2):
-        try:
-            t, y_m = (float(cell) for cell in row)
-        except ValueError:
-            raise InputError(f'{path}: line {line}: must hold two numbers t,y_m') from None
-        due = len(samples) * sample_period
-        if not abs(t - due) <= TIME_TOLERANCE * sample_period:
-            raise InputError(
-                f'{path}: line {line}: t={t!r} must be {due:.9g}: one row per '
-                f'sample_period={sample_period!r}'
-            )
-        if not isfinite(y_m):
-            raise InputError(f'{path}: line {line}: y_m={y_m!r} must be finite')
-        samples.append(y_m)
-    if not samples:
-        raise InputError(f'{path}: holds no sample')
-    return tuple(samples)

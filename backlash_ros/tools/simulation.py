@@ -9,13 +9,12 @@ import numpy as np
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
-from backlash_ros.tools.configuration import reference_samples
 from backlash_ros.tools.errors import BrokenOffError
 
 
 def prepare(parameters: Parameters) -> ClosedLoop:
     """The closed loop, with the file of `waveform: file` read; raises what is wrong with it."""
-    return build_closed_loop(parameters, reference_samples(parameters))
+    return build_closed_loop(parameters)
 
 
 def run_loop(

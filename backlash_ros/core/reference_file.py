@@ -10,7 +10,7 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 
 HEADER = ['t', 'y_m']
-TIME_TOLERANCE = 1e-6  # of a sample period
+TIME_TOLERANCE = 1e-3  # of a sample period: what a file in decimals rounds away
 
 
 def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
