@@ -17,7 +17,7 @@ class Parameters(Mapping[str, Value]):
 
     def __init__(self, values: Mapping[str, object] | None = None) -> None:
         """Take given values and the defaults of all others; raises ParameterError."""
-        given = dict(values or {})
+        self._given = given = dict(values or {})
         check_names(given)
         self._values = {
             p.name: check_value(p, given[p.name]) if p.name in given else p.default
@@ -80,8 +80,8 @@ class Parameters(Mapping[str, Value]):
         return first, second, third
 
     def replaced(self, changes: Mapping[str, object]) -> Parameters:
-        """A new set with some values changed; raises ParameterError."""
-        return Parameters({**self._values, **changes})
+        """A new set with some values changed, defaults staying defaults; raises ParameterError."""
+        return Parameters({**self._given, **changes})
 
 
 def check_names(names: Iterable[str]) -> None:

@@ -26,6 +26,8 @@ REST_SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that 
 OFF_AT_REST = 6.0  # standard deviations of y that mean a deviation while the state is unknown
 STEADY = 0.01  # share of the tolerance by which an ideal trajectory at rest may still move
 
+WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
+
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.
 NOISE_BAND = 0.5
@@ -97,11 +99,17 @@ class Tracking:
     def _careful_feedback(self, estimate: Estimate, deviation: Array, ideal: float) -> float:
         """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.
 
-        A wrong slope may make the loop unstable: bounded feedback cannot make it unbounded.
+        A wrong slope may make the loop unstable, which bounded feedback slows down. The bound
+        widens while it is met: a gap wider than the first guess has to be crossed some day.
         """
-        self._u_reach = max(self._u_reach, abs(ideal))
-        limit = max(self._u_reach, estimate.m * (estimate.c_r - estimate.c_l))
-        return min(max(float(self._careful @ deviation), -limit), limit)
+        self._u_reach = max(
+            self._u_reach, abs(ideal), estimate.m * (estimate.c_r - estimate.c_l)
+        )
+        feedback = float(self._careful @ deviation)
+        if abs(feedback) > self._u_reach:
+            feedback = self._u_reach if feedback > 0.0 else -self._u_reach
+            self._u_reach *= WIDENING
+        return feedback
 
     def _rest(self, situation: Situation, deviation: Array, ideal: float) -> None:
         """Decide whether v rests: the trajectory does, and y needs no correction."""

@@ -91,9 +91,9 @@ class PlantNode(ProcessNode):
 
     def _has_listeners(self) -> bool:
         wanted = self.settings.integer('wait_for_subscribers')
-        # Beside the loop itself, those who listen want to hear everything.
-        others = max(wanted - 1, 0)
-        if self._truth.listeners < others or self._applied.get_subscription_count() < others:
+        # One of several is a recorder, which wants to hear everything.
+        recorders = int(wanted > 1)
+        if self._truth.listeners < recorders or self._applied.get_subscription_count() < recorders:
             return False
         return self._output.get_subscription_count() >= max(wanted, int(self._lockstep))
 
