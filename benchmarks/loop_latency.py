@@ -34,7 +34,7 @@ from backlash_ros.tools.processes import (
 )
 
 RATES_HZ = (100.0, 1000.0)
-BLOCK_S, SETTLE_S = 0.5, 0.1  # of each block the beginning is not counted
+BLOCK, SETTLE = 50, 10  # samples of a block, and how many of them at its start do not count
 WARM_UP_S = 3.0  # acquisition is not counted either
 DEADLINE_S = 30.0  # for processes to start
 PATIENCE_S = 0.2  # for an answer
@@ -141,10 +141,10 @@ class Driver:
                 self._plant.step(self._v)
             tick = due
             t = due * self._period
-            in_block = (t - WARM_UP_S) % BLOCK_S
-            asks_controller = t < WARM_UP_S or int((t - WARM_UP_S) / BLOCK_S) % 2 == 0
+            warming_up = t < WARM_UP_S
+            asks_controller = warming_up or due // BLOCK % 2 == 0
             passed = self._ask_controller(t) if asks_controller else self._ask(self._question, t)
-            if t < WARM_UP_S or in_block < SETTLE_S:
+            if warming_up or due % BLOCK < SETTLE:
                 continue
             if passed is None:
                 result.unanswered += 1

@@ -74,7 +74,8 @@ def measure_latency(duration_s: float) -> list[Section]:
         section = Section(
             f'Latency from y to v, {law}',
             'The real controller process beside a bare rclpy node that publishes what it gets, '
-            'in alternating blocks of half a second, seen by the driver that asks both.',
+            f'in alternating blocks of {loop_latency.BLOCK} samples, as seen by the driver that '
+            'asks both.',
             LATENCY_HEADER,
         )
         latencies = [loop_latency.measure_latency(rate, law, duration_s) for rate in RATES_HZ]

@@ -142,7 +142,8 @@ def _kalman(p: Parameters) -> Estimator:
         )
     return KalmanEstimator(
         _initial(p), _bounds(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
-        p.triple('estimator.drift_std'), p.real('sample_period'), observer,
+        p.real('estimator.input_noise_std'), p.triple('estimator.drift_std'),
+        p.real('sample_period'), observer,
     )
 
 

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf, isfinite
+from math import inf
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Estimate, Estimator, Interval
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.structure import Situation, Structure
+
+LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
+
+
+def plausible(value: float) -> bool:
+    """Whether a value can be a measurement at all; nan, inf and absurd magnitudes are not."""
+    return abs(value) <= LARGEST
 
 
 @dataclass(frozen=True)
@@ -70,8 +77,11 @@ class AdaptiveController:
         call; the plant went on with the last v through all of them. applied: the v that was
         really applied in each of the lost + 1 intervals since then, if it is known.
         """
-        if not (isfinite(y) and isfinite(y_m) and all(map(isfinite, applied))):
-            raise ValueError(f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite')
+        if not (plausible(y) and plausible(y_m) and all(map(plausible, applied))):
+            raise ValueError(
+                f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite and no larger than '
+                f'{LARGEST:g}'
+            )
         if lost < 0 or len(applied) not in (0, lost + 1):
             raise ValueError(f'lost={lost!r} must be >= 0 and applied have lost + 1 values')
         estimator = self.estimator

@@ -54,6 +54,18 @@ class Prior:
         return np.stack([np.full(len(gaps), self.slope_std**2), product, product], axis=1)
 
 
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of white noise on y and on u, and the drift of theta per sample.
+
+    drift_var: covariance, shape (3, 3); None where theta is constant.
+    """
+
+    output_std: float
+    input_std: float = 0.0
+    drift_var: Array | None = None
+
+
 class GapBank:
     """Kalman filters for gap widths g (H,), ascending, stepped together.
 
@@ -61,21 +73,26 @@ class GapBank:
     certain which side is engaged, whatever u was held at before. Until then it is charged what a
     true model would cost per sample, so that early and late starters can be compared.
 
-    noise_var: variance R of the noise on y. drift_var: added to the covariance of theta per
-    sample, shape (3, 3), None without drift. tolerance: relative width of g that one hypothesis
-    stands for. with_null: put the hypothesis "v never engaged: u is
-    a constant" in front as row 0, for which theta[0] is that constant.
+    noise: what is added per sample. tolerance: relative width of g that one hypothesis stands
+    for. with_null: put the hypothesis "v never engaged: u is a constant" in front as row 0, for
+    which theta[0] is that constant.
     """
 
     def __init__(
-        self, gaps: Array, model: StateModel, prior: Prior, noise_var: float,
-        drift_var: Array | None = None, tolerance: float = 0.0, with_null: bool = False,
+        self, gaps: Array, model: StateModel, prior: Prior, noise: Noise,
+        tolerance: float = 0.0, with_null: bool = False,
     ) -> None:
         if with_null:
             gaps = np.concatenate([[0.0], gaps])
         n, count = model.order, len(gaps)
         self.gaps = gaps.copy()
-        self.noise_var, self.drift_var, self.tolerance = noise_var, drift_var, tolerance
+        self.noise_var, self.tolerance = noise.output_std**2, tolerance
+        self._process_var: Array | None = None
+        if noise.input_std > 0.0 or noise.drift_var is not None:
+            self._process_var = np.zeros((n + 3, n + 3))
+            self._process_var[:n, :n] = noise.input_std**2 * np.outer(model.b, model.b)
+            if noise.drift_var is not None:
+                self._process_var[n:, n:] = noise.drift_var
         self.mean = np.zeros((count, n + 3))
         self.mean[:, n:] = prior.theta
         self.cov = np.zeros((count, n + 3, n + 3))
@@ -89,7 +106,7 @@ class GapBank:
         self.leader = 0  # most likely hypothesis that has started
         self.doubt = np.zeros((3, 3))  # covariance of theta that comes from not knowing the gap
         self.innovation = nan  # of the leader
-        self.innovation_var = noise_var
+        self.innovation_var = self.noise_var
         self.nis = 1.0  # running mean of the leader's normalised innovation squared
         self._model, self._n, self._first = model, n, 1 if with_null else 0
         self._transition = np.tile(np.eye(n + 3), (count, 1, 1))
@@ -102,6 +119,11 @@ class GapBank:
         self._y_low, self._y_high, self._y = inf, -inf, 0.0  # swing of y so far, newest y
         self._kick = float(np.linalg.norm(model.b)) * float(prior.theta[0])
         self._corrections = 0
+
+    @property
+    def swing(self) -> float:
+        """How far v has swung so far."""
+        return max(self._v_high - self._v_low, 0.0)
 
     @property
     def theta(self) -> Array:
@@ -179,8 +201,8 @@ class GapBank:
         if not (rising or v < self._v_low):
             return
         self._v_low, self._v_high = min(v, self._v_low), max(v, self._v_high)
-        before, swing = self.active, max(self._v_high - self._v_low, 0.0)
-        self.active = int(np.searchsorted(self.gaps, swing, side='right'))
+        before = self.active
+        self.active = int(np.searchsorted(self.gaps, self.swing, side='right'))
         new = slice(before, self.active)
         self._reach[new] = v if rising else v + self.gaps[new]
         self._left[new] = 0.0 if rising else 1.0
@@ -228,8 +250,8 @@ class GapBank:
         transition[:, :n, n:] = self._model.b[:, None] * self._phi[:count, None, :]
         mean[:] = (transition @ mean[:, :, None])[:, :, 0]
         np.matmul(transition @ cov, transition.transpose(0, 2, 1), out=cov)
-        if self.drift_var is not None:
-            cov[:, n:, n:] += self.drift_var
+        if self._process_var is not None:
+            cov += self._process_var
 
     def correct(self, y: float, gate: float = inf, learn: bool = True) -> bool:
         """Take in y(k); return False if it was refused as an outlier.
@@ -250,7 +272,7 @@ class GapBank:
         e = y - c * mean[:, 0]
         leader = self.leader
         self.innovation, self.innovation_var = float(e[leader]), float(variance[leader])
-        square = self.innovation**2 / self.innovation_var
+        square = self.innovation * self.innovation / self.innovation_var
         self.nis += NIS_MEMORY * (min(square, NIS_CAP) - self.nis)
         if square > gate * gate:
             return False

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.crossings import Crossings
 from backlash_ros.core.estimator import Bounds, Estimate
-from backlash_ros.core.gap_bank import GapBank, Prior
+from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -40,6 +40,8 @@ START_GATE = 8.0  # standard deviations; before the fine bank stands only gross 
 PATIENCE = 2  # outliers in a row that the coarse bank refuses before it believes them
 NULL_MARGIN = 15.0  # log-likelihood by which a gap must beat "v never engaged"
 COARSE_MARGIN = 10.0  # log-likelihood by which the fine bank may not fall behind the coarse one
+REPLAY_PRECISION = 0.5  # of the gap: known better, it is worth a fine bank
+NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
 COARSE_TOLERANCE = 0.1  # half of GRID_RATIO - 1
 FINE_TOLERANCE = 1e-6  # keeps the comparison finite when the estimate is exact
 SETTLED = 100  # samples of the fine bank after which the coarse one may rest
@@ -56,7 +58,8 @@ class SearchSettings:
     model: StateModel
     bounds: Bounds
     initial: Estimate
-    noise_std: float
+    noise_std: float  # of y
+    input_noise_std: float  # of u
     drift_std: tuple[float, float, float]  # of m, c_r, c_l per square root of a sample
 
 
@@ -92,6 +95,11 @@ class GapSearch:
     def exhausted(self) -> bool:
         """Whether the record is used up without a sign of engagement: begin afresh."""
         return self.samples >= LAST_REPLAY and self.fine is None and not self.excited
+
+    def precise(self, found: Crossings, share: float) -> bool:
+        """Whether the gap is known to a share of itself, or is as good as none against v."""
+        known = found.std_gap < share * found.gap
+        return known or (self.coarse is not None and found.std_gap < NO_GAP * self.coarse.swing)
 
     @property
     def excited(self) -> bool:
@@ -177,7 +185,7 @@ class GapSearch:
         best = bank.leader
         self._earliest = self.samples + PAUSE
         found = bank.found()
-        if found is None or not 0.0 < found.std_gap < 0.5 * found.gap:
+        if found is None or not self.precise(found, REPLAY_PRECISION):
             return
         if self.samples >= LAST_REPLAY:
             # Too late to read the record again: go on with what the coarse bank knows.
@@ -192,7 +200,7 @@ class GapSearch:
         gaps = fine_gaps(found, FINE)
         if abs(found.gap - read_with[best]) > LOST * found.std_gap:
             gaps = np.union1d(gaps, bracket(read_with, best))
-        self._replay, self._replayed = self._bank(gaps, with_null=False), 0
+        self._replay, self._replayed = self._bank(gaps, with_null=False, at=found), 0
 
     def _advance_replay(self) -> None:
         replay = self._replay
@@ -209,16 +217,18 @@ class GapSearch:
             self.fine, self._replay = replay, None
             self._read_with = replay.gaps
 
-    def _bank(self, gaps: Array, with_null: bool) -> GapBank:
+    def _bank(self, gaps: Array, with_null: bool, at: Crossings | None = None) -> GapBank:
         s = self._settings
         i, b = s.initial, s.bounds
         prior = Prior(
             np.array([i.m, i.m * i.c_r, i.m * i.c_l]), min(SLOPE_REACH * i.m, b.m[1])
         )
-        noise = max(s.noise_std, self._noise_floor)
-        drift = drift_in_products(i, s.drift_std) if any(s.drift_std) else None
+        noise = Noise(
+            max(s.noise_std, self._noise_floor), s.input_noise_std,
+            drift_in_products(at or i, s.drift_std) if any(s.drift_std) else None,
+        )
         tolerance = COARSE_TOLERANCE if with_null else FINE_TOLERANCE
-        return GapBank(gaps, s.model, prior, noise**2, drift, tolerance, with_null)
+        return GapBank(gaps, s.model, prior, noise, tolerance, with_null)
 
 
 def _advance(bank: GapBank, y: float, v: float) -> None:
@@ -238,11 +248,13 @@ def bracket(gaps: Array, leader: int) -> Array:
 
 def fine_gaps(found: Crossings, count: int) -> Array:
     """Gaps of a fine bank around an estimate, ascending and > 0."""
-    spread = min(REACH * found.std_gap, LARGEST_SPREAD * found.gap)
-    return np.asarray(found.gap + spread * np.linspace(-1.0, 1.0, count))
+    least = 1e-3 * found.std_gap
+    gap = max(found.gap, least)
+    spread = min(REACH * found.std_gap, max(LARGEST_SPREAD * gap, found.std_gap))
+    return np.maximum(gap + spread * np.linspace(-1.0, 1.0, count), least)
 
 
-def drift_in_products(at: Estimate, std: tuple[float, float, float]) -> Array:
+def drift_in_products(at: Estimate | Crossings, std: tuple[float, float, float]) -> Array:
     """Covariance (3, 3) that one sample of drift of (m, c_r, c_l) adds to theta."""
     jacobian = np.array([[1.0, 0.0, 0.0], [at.c_r, at.m, 0.0], [at.c_l, 0.0, at.m]])
     return np.asarray(jacobian @ np.diag(np.square(std)) @ jacobian.T)

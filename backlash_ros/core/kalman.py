@@ -34,21 +34,23 @@ PRECISE_SLOPE, PRECISE_GAP = 0.2, 0.3  # relative deviations below which an esti
 class KalmanEstimator:
     """Learns (m, c_r, c_l) from y alone with a bank of Kalman filters over the gap width.
 
-    noise_std: standard deviation of the noise on y. drift_std: random walk of m, c_r, c_l per
-    square root of a second. Nothing else needs tuning. observer: gives the state of G until the
-    bank can, for structures that want it.
+    noise_std, input_noise_std: standard deviations of white noise on y and on u. drift_std: random
+    walk of m, c_r, c_l per square root of a second. Nothing else needs tuning. observer: gives the
+    state of G until the bank can, for structures that want it.
     """
 
     def __init__(
         self, initial: Estimate, bounds: Bounds, model: StateModel, noise_std: float,
-        drift_std: tuple[float, float, float], sample_period: float,
+        input_noise_std: float, drift_std: tuple[float, float, float], sample_period: float,
         observer: FixedBacklash | None = None,
     ) -> None:
         self.estimate = initial
         self.outliers = 0
         root = sample_period**0.5
         drift = (drift_std[0] * root, drift_std[1] * root, drift_std[2] * root)
-        self._settings = SearchSettings(model, bounds, initial, noise_std, drift)
+        self._settings = SearchSettings(
+            model, bounds, initial, noise_std, input_noise_std, drift
+        )
         self._bounds = bounds
         self._observer, self._no_state = observer, np.zeros(model.order)
         self._search = self._new_search()
@@ -137,7 +139,7 @@ class KalmanEstimator:
         found = watched.found
         if found is None or found.std_m > PRECISE_SLOPE * found.m:
             return None
-        if not found.std_gap < PRECISE_GAP * found.gap:
+        if not watched.search.precise(found, PRECISE_GAP):
             return None
         values = (found.m, found.c_r, found.c_l)
         slack = (found.std_m, found.std_c_r, found.std_c_l)
@@ -256,5 +258,5 @@ class _Watched:
     def _follow(self, fine: GapBank) -> None:
         """Let the hypotheses on the gap follow the estimate of it."""
         found = self.found
-        if found is not None and found.gap > 0.0:
+        if found is not None:
             fine.move_gaps(fine_gaps(found, len(fine.gaps)))

@@ -73,6 +73,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('estimator.output_noise_std', 1e-5,
               'standard deviation of the noise on y; where it is not given, that of the simulated '
               'noise and quantum if there is any', 'y', low=0.0),
+    Parameter('estimator.input_noise_std', 0.0,
+              'kalman: standard deviation of white noise on u: what G(z) and the backlash lack',
+              'u', low=0.0),
     Parameter('estimator.drift_std', (0.0, 0.0, 0.0),
               'kalman: random walk of m, c_r, c_l per square root of a second', length=3,
               low=0.0),

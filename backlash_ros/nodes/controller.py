@@ -15,7 +15,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_limits
-from backlash_ros.core.controller import ControlStep
+from backlash_ros.core.controller import ControlStep, plausible
 from backlash_ros.core.estimator import Status
 from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.parameter_table import CONTROLLER
@@ -53,7 +53,7 @@ STATES: dict[Status, tuple[bytes, str]] = {
     Status.INCONSISTENT: (
         DiagnosticStatus.ERROR,
         'frozen: plant_output does not follow from v through G(z) and a backlash; '
-        'check the sensor, G(z) and whether v is applied in time',
+        'check the sensor, G(z), whether v is applied in time, and estimator.output_noise_std',
     ),
 }
 
@@ -131,7 +131,7 @@ class ControllerNode(ProcessNode):
         emit('ready')
 
     def _on_reference(self, message: Float64) -> None:
-        if isfinite(message.data):
+        if plausible(message.data):
             self._y_m = message.data
         else:
             self._statistics.dropped += 1
@@ -144,7 +144,7 @@ class ControllerNode(ProcessNode):
         self._pair()
 
     def _on_applied_control(self, message: Float64, info: dict[str, Any]) -> None:
-        if isfinite(message.data):
+        if plausible(message.data):
             self._commands.report(message.data, info['source_timestamp'])
         else:
             self._statistics.dropped += 1
@@ -171,8 +171,8 @@ class ControllerNode(ProcessNode):
         statistics.lost += lost
         self._missing += lost
         self._heard_at = time.monotonic()
-        if not (isfinite(y) and isfinite(y_m)):
-            if isfinite(y):
+        if not (plausible(y) and plausible(y_m)):
+            if plausible(y):
                 statistics.without_reference += 1
             else:
                 statistics.dropped += 1
