@@ -67,8 +67,12 @@ def write_document(
     path: Path, benchmark: Benchmark, checks: list[Check], notes: list[str],
 ) -> None:
     """Write the results as Markdown."""
-    options = '' if (benchmark.seeds, benchmark.first_seed) == (SEEDS, FIRST_SEED) else (
-        f' --seeds {benchmark.seeds} --first-seed {benchmark.first_seed}')
+    options = ''.join(
+        f' --{name} {value}' for name, value, default in (
+            ('seeds', benchmark.seeds, SEEDS), ('first-seed', benchmark.first_seed, FIRST_SEED),
+            ('cases', benchmark.cases, CASES), ('hour', benchmark.hour, HOUR),
+        ) if value != default
+    )
     command = f'python benchmarks/estimation.py --write{options}'
     paragraphs = [
         '# Estimation: what was measured',

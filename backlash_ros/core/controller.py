@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
+from typing import NamedTuple
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Estimate, Estimator, Interval
@@ -39,8 +40,7 @@ class Limits:
         return min(max(v, self.low), self.high)
 
 
-@dataclass(frozen=True)
-class ControlStep:
+class ControlStep(NamedTuple):
     """What one sample made: the command, and the estimate it was computed with."""
 
     y_m: float
@@ -89,7 +89,7 @@ class AdaptiveController:
         if interval is not None:
             held = [interval] * (lost + 1)
             if applied:
-                held = [replace(interval, v=v) for v in applied]
+                held = [interval._replace(v=v) for v in applied]
             for passed in held[:-1]:
                 estimator.update(None, passed)
             self.lost_samples += lost

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,8 +74,7 @@ class Bounds:
         )
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """What the controller did between two samples: v was applied, y_m and u_d led to it.
 
     f: the gain of (3.2) that was in use.

@@ -32,7 +32,7 @@ CAPACITY = 16384  # samples kept for replays
 REPLAY_SPEED = 3  # recorded samples per new one
 FIRST_REPLAY_SPEED = 8  # while no estimate is known at all
 LAST_REPLAY = CAPACITY * (REPLAY_SPEED - 1) // REPLAY_SPEED  # later ones would not catch up
-GROWTH_EARLY, GROWTH_LATE = 1.3, 3.0  # of the record between two replays
+GROWTH_EARLY, GROWTH_LATE = 1.3, 4.0  # of the record between two replays
 EARLY = 400  # samples during which a misread record still shows in the estimate
 MISREAD = 0.5  # standard deviations between the gap a record was read with and its estimate
 PAUSE = 5  # samples between two looks for a reason to read the record again
@@ -42,6 +42,7 @@ NULL_MARGIN = 15.0  # log-likelihood by which a gap must beat "v never engaged"
 COARSE_MARGIN = 10.0  # log-likelihood by which the fine bank may not fall behind the coarse one
 REPLAY_PRECISION = 0.5  # of the gap: known better, it is worth a fine bank
 NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
+REPLAY_MARGIN = 5.0  # log-likelihood by which a bank that read the record afresh may be worse
 COARSE_TOLERANCE = 0.1  # half of GRID_RATIO - 1
 FINE_TOLERANCE = 1e-6  # keeps the comparison finite when the estimate is exact
 SETTLED = 100  # samples of the fine bank after which the coarse one may rest
@@ -210,12 +211,16 @@ class GapSearch:
         for k in range(self._replayed, end):
             _advance(replay, float(self._y[k]), float(self._v[k]))
         self._replayed = end
-        if end == self.samples:
-            if self.fine is None or self._behind(self.fine):
-                self._fine_since = self.samples
-            replay.elect()
-            self.fine, self._replay = replay, None
-            self._read_with = replay.gaps
+        if end < self.samples:
+            return
+        self._replay = None
+        fine = self.fine
+        if fine is None or self._behind(fine):
+            self._fine_since = self.samples
+        elif replay.elect() < fine.elect() - REPLAY_MARGIN:
+            return  # reading the record afresh explained it worse
+        replay.elect()
+        self.fine, self._read_with = replay, replay.gaps
 
     def _bank(self, gaps: Array, with_null: bool, at: Crossings | None = None) -> GapBank:
         s = self._settings

@@ -65,12 +65,17 @@ class InputReconstruction:
         self._transition[:n, :n], self._transition[:n, n] = state.a, state.b / self._scale
         self._noise = max(noise_std / self._scale, NOISE_FLOOR * weakest) ** 2
         self._steady = self._stationary()
-        self._gain, self._lag_gain = self._gains(self._steady)
+        self._step = np.zeros((n + 1 + lag, n + 1 + lag))  # from k-1 to k before y(k)
+        self._step[:n + 1, :n + 1] = self._transition
+        self._step[n + 1:, n:-1] = np.eye(lag)
+        self._gain = self._gains(self._steady)
+        # While no sample is lost, prediction and correction are one map.
+        self._closed = self._step - np.outer(self._gain, self._c * self._step[0])
+        self._seen = self._c * self._step[0]
         self._after_steady = self._covariance = self._measured(self._steady)
         self.std = float(np.sqrt(self._after_steady.var[-1]))
-        self._x: Array = np.zeros(n + 1)
-        self._window = np.zeros(lag + 1)  # u_hat(k - i) given y(..k)
-        self._since_loss = LAGS_TO_STEADY * lag
+        self._z: Array = np.zeros(n + 1 + lag)  # x(k), u(k), u(k-1) .. u(k-lag) given y(..k)
+        self._steady_after = self._since_loss = LAGS_TO_STEADY * lag
 
     def _stationary(self) -> _Covariance:
         """Covariances before a measurement when no sample was ever lost."""
@@ -89,11 +94,11 @@ class InputReconstruction:
     @property
     def u_hat(self) -> float:
         """u_hat(k - lag) given y(..k)."""
-        return float(self._window[-1])
+        return float(self._z[-1])
 
     def newer(self, samples: int) -> float:
         """u_hat(k - lag + samples) given y(..k)."""
-        return float(self._window[-1 - samples])
+        return float(self._z[-1 - samples])
 
     @property
     def ready(self) -> bool:
@@ -105,45 +110,45 @@ class InputReconstruction:
     @property
     def x_hat(self) -> Array:
         """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-        return np.asarray(self._x[:-1] * self._scale)
+        return np.asarray(self._z[:self._n] * self._scale)
 
     def update(self, y: float | None) -> float:
         """Take in y(k), None if it was lost, and return u_hat(k - lag)."""
-        window = self._window
-        window[1:] = window[:-1].copy()
-        x = self._transition @ self._x
-        window[0] = x[-1]
+        self.samples += 1
         self._since_loss = 0 if y is None else self._since_loss + 1
-        steady = self._since_loss > LAGS_TO_STEADY * self.lag
-        if steady:
-            self._covariance, gain, lag_gain = self._after_steady, self._gain, self._lag_gain
-        else:
-            covariance = self._propagated(self._covariance)
-            gain, lag_gain = self._gains(covariance)
-            self._covariance = covariance if y is None else self._measured(covariance)
+        if y is not None and self._since_loss > self._steady_after:
+            scaled = y / self._scale
+            self.innovation = (scaled - float(self._seen @ self._z)) * self._scale
+            self._z = self._closed @ self._z + self._gain * scaled
+            self._covariance = self._after_steady
+            return float(self._z[-1])
+        covariance, z = self._propagated(self._covariance), self._step @ self._z
         if y is None:
             self.innovation = nan
+            self._covariance = covariance
         else:
-            e = y / self._scale - self._c * float(x[0])
-            window += lag_gain * e
-            x += gain * e
+            e = y / self._scale - self._c * float(z[0])
+            z += self._gains(covariance) * e
             self.innovation = e * self._scale
-        self._x = x
-        self.samples += 1
-        return float(window[-1])
+            self._covariance = self._measured(covariance)
+        self._z = z
+        return float(z[-1])
 
-    def _gains(self, covariance: _Covariance) -> tuple[Array, Array]:
-        """Gains of [x; u] (n + 1,) and of u(k-i) (lag + 1,)."""
+    def _gains(self, covariance: _Covariance) -> Array:
+        """Gain of [x; u] and of u(k-1) .. u(k-lag), shape (n + 1 + lag,)."""
         c = self._c
         variance = c * c * covariance.p[0, 0] + self._noise
-        return covariance.p[:, 0] * (c / variance), covariance.rows[:, 0] * (c / variance)
+        column = np.concatenate([covariance.p[:, 0], covariance.rows[1:, 0]])
+        return np.asarray(column * (c / variance))
 
     def _measured(self, covariance: _Covariance) -> _Covariance:
-        gain, lag_gain = self._gains(covariance)
-        row = self._c * covariance.p[0]
+        c = self._c
+        variance = c * c * covariance.p[0, 0] + self._noise
+        row, column = c * covariance.p[0], c * covariance.rows[:, 0]
         return _Covariance(
-            covariance.p - np.outer(gain, row), covariance.rows - np.outer(lag_gain, row),
-            covariance.var - lag_gain * self._c * covariance.rows[:, 0],
+            covariance.p - np.outer(row, row) / variance,
+            covariance.rows - np.outer(column, row) / variance,
+            covariance.var - column**2 / variance,
         )
 
     def _propagated(self, covariance: _Covariance) -> _Covariance:

@@ -29,6 +29,8 @@ RESTART_AFTER = 150  # inconsistent samples after which a search begins afresh
 NO_DATA_AFTER = 20  # lost samples in a row that are worth a status
 UNDECIDED_AFTER = 100  # samples after which a search without a sign of engagement says so
 PRECISE_SLOPE, PRECISE_GAP = 0.2, 0.3  # relative deviations below which an estimate is published
+ADOPTED_SLOPE, ADOPTED_GAP = 0.01, 0.05  # those below which it replaces an older one at once
+ADOPTED_AFTER = 300  # consistent samples after which it does so in any case
 
 
 class KalmanEstimator:
@@ -131,7 +133,14 @@ class KalmanEstimator:
         if challenger is None or challenger.inconsistent_for >= RESTART_AFTER:
             challenger = self._challenger = self._new_search()
         challenger.add(y, v)
-        if challenger.consistent_for >= PROVEN and self._usable(challenger) is not None:
+        found = self._usable(challenger) if challenger.consistent_for >= PROVEN else None
+        if found is None:
+            return
+        # A rough estimate is better than none at the start, but not than one that held for long.
+        precise = found.std_m < ADOPTED_SLOPE * found.m and challenger.search.precise(
+            found, ADOPTED_GAP
+        )
+        if precise or challenger.consistent_for >= ADOPTED_AFTER:
             self._search, self._challenger = challenger, None
 
     def _usable(self, watched: _Watched) -> Crossings | None:

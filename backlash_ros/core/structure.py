@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +11,7 @@ from backlash_ros.core.estimator import Estimate
 from backlash_ros.core.inverse import BacklashInverse
 
 
-@dataclass(frozen=True)
-class Situation:
+class Situation(NamedTuple):
     """What is known at a sample: reference, output, estimate and state of G with its covariance.
 
     x_hat (n,) and x_cov (n, n) are in the coordinates of StateModel; x_cov is None where the
@@ -27,8 +25,7 @@ class Situation:
     x_cov: NDArray[np.float64] | None = None
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """Desired input u_d of G, the control v that shall cause it, and the gain f in use."""
 
     u_d: float

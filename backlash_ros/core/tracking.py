@@ -26,7 +26,7 @@ REST_SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that 
 OFF_AT_REST = 6.0  # standard deviations of y that mean a deviation while the state is unknown
 STEADY = 0.01  # share of the tolerance by which an ideal trajectory at rest may still move
 
-WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is unknown
+WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.

@@ -1,0 +1,70 @@
+"""The gradient law of the four-block loop."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import RunRecord
+
+TRUTH = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
+
+
+def four_blocks(**changes: object) -> Parameters:
+    named = {name.replace('__', '.'): value for name, value in changes.items()}
+    return Parameters({
+        'structure': 'pole_placement', 'estimator.law': 'gradient', 'amplitude': 0.2, **named,
+    })
+
+
+def last(run: RunRecord) -> dict[str, float]:
+    return {name: float(run.column(name)[-1]) for name in TRUTH}
+
+
+@pytest.mark.parametrize('amplitude', [0.05, 0.2, 1.0])
+def test_learns_all_three_from_the_tracking_error(amplitude: float) -> None:
+    run = build_closed_loop(four_blocks(amplitude=amplitude)).run(2000)
+    assert last(run) == pytest.approx(TRUTH, rel=0.01)
+
+
+def test_true_estimates_stay_where_they_are() -> None:
+    run = build_closed_loop(four_blocks(
+        estimator__initial__m=1.3, estimator__initial__c_r=3.0, estimator__initial__c_l=-3.0,
+    )).run(600)
+    for name, value in TRUTH.items():
+        # Which side the shaft rests on is not known before the first engagement.
+        assert np.abs(run.column(name)[300:] - value).max() < 0.02 * abs(value)
+
+
+def test_estimates_never_leave_their_bounds() -> None:
+    run = build_closed_loop(four_blocks(
+        estimator__bounds__m=[0.6, 0.9], estimator__bounds__c_r=[0.2, 1.0],
+        estimator__bounds__c_l=[-1.0, -0.2],
+    )).run(400)
+    for name, (low, high) in {'m': (0.6, 0.9), 'c_r': (0.2, 1.0), 'c_l': (-1.0, -0.2)}.items():
+        assert run.column(name).min() >= low
+        assert run.column(name).max() <= high
+
+
+def test_unit_of_y_does_not_matter() -> None:
+    plain = build_closed_loop(four_blocks()).run(300)
+    scaled = build_closed_loop(four_blocks(
+        plant__numerator=[1e-2, 4e-2, 1e-2], amplitude=200.0, estimator__output_noise_std=1e-2,
+    )).run(300)
+    for name in TRUTH:
+        np.testing.assert_allclose(scaled.column(name), plain.column(name), rtol=1e-4)
+
+
+def test_lost_samples_teach_nothing_and_do_no_harm() -> None:
+    run = build_closed_loop(four_blocks(output_loss=0.02)).run(1500)
+    assert run.lost_samples > 10
+    assert np.abs(run.column('y')).max() < 1.0
+
+
+def test_gradient_without_its_structure_is_refused() -> None:
+    with pytest.raises(ParameterError, match='structure=.*must be pole_placement'):
+        build_controller(Parameters({'estimator.law': 'gradient'}))

@@ -1,0 +1,100 @@
+"""The four-block structure: gains from the Diophantine equation, and the loop they make."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants
+
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.pole_placement import place_poles
+from backlash_ros.core.transfer_function import TransferFunction
+
+PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
+
+
+def well_separated(model: TransferFunction) -> bool:
+    """Poles and zeros are so far apart that a solution is well determined."""
+    poles, zeros = model.poles, model.zeros
+    apart = [abs(p - z) for p in poles for z in zeros]
+    return min(apart, default=1.0) > 0.1 and abs(float(np.sum(model.numerator))) > 1e-3
+
+
+@settings(max_examples=40, deadline=None)
+@given(plants())
+def test_gains_solve_the_diophantine_equation(model: TransferFunction) -> None:
+    assume(well_separated(model))
+    closed = np.real(np.poly(np.full(model.order, 0.5)))
+    blocks = place_poles(model, closed, 0.3)
+    s = blocks.filter - np.concatenate([[0.0], blocks.theta_1])
+    r = blocks.theta_20 * blocks.filter + np.concatenate([[0.0], blocks.theta_2])
+    left = np.convolve(model.denominator, s)
+    left[1:] -= np.convolve(model.numerator[1:], r)
+    right = np.convolve(blocks.filter, closed)
+    np.testing.assert_allclose(left, right, atol=1e-6 * np.abs(right).max())
+
+
+@settings(max_examples=40, deadline=None)
+@given(plants())
+def test_reference_has_unit_gain_at_rest_and_cancels_no_zero(model: TransferFunction) -> None:
+    assume(well_separated(model))
+    closed = np.real(np.poly(np.full(model.order, 0.5)))
+    blocks = place_poles(model, closed, 0.3)
+    assert blocks.reference.response(np.array([1.0 + 0j]))[0] == pytest.approx(1.0)
+    np.testing.assert_allclose(
+        blocks.reference.numerator, blocks.theta_3 * model.numerator, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize('filter_pole', [0.0, 0.6, 0.9])
+def test_loop_without_backlash_answers_as_the_reference_model_says(filter_pole: float) -> None:
+    p = Parameters({
+        'structure': 'pole_placement', 'pole_placement.filter_pole': filter_pole,
+        'estimator.law': 'fixed', 'estimator.initial.m': 1.3, 'estimator.initial.c_r': 0.0,
+        'estimator.initial.c_l': 0.0, 'backlash.c_r': 1e-12, 'backlash.c_l': -1e-12,
+        'amplitude': 0.2,
+    })
+    run = build_closed_loop(p).run(300)
+    blocks = place_poles(PAPER, closed_of(p), filter_pole)
+    np.testing.assert_allclose(
+        run.column('y'), blocks.reference.simulate(run.column('y_m')), atol=1e-6
+    )
+
+
+def closed_of(p: Parameters) -> np.ndarray:
+    """A_m that the parameters lead to, read off the loop's own reference model."""
+    from backlash_ros.core.assembly import _four_blocks
+    return _four_blocks(p).reference.denominator
+
+
+def test_exact_inverse_makes_the_backlash_vanish() -> None:
+    known = {
+        'structure': 'pole_placement', 'estimator.law': 'fixed', 'estimator.initial.m': 1.3,
+        'amplitude': 0.2,
+    }
+    exact = build_closed_loop(Parameters({
+        **known, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0,
+    })).run(400)
+    gapless = build_closed_loop(Parameters({
+        **known, 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
+        'backlash.c_r': 1e-12, 'backlash.c_l': -1e-12,
+    })).run(400)
+    np.testing.assert_allclose(exact.column('y'), gapless.column('y'), atol=1e-6)
+
+
+def test_common_factor_of_numerator_and_denominator_is_refused() -> None:
+    model = TransferFunction([1.0, -0.5], [1.0, -1.4, 0.45])
+    with pytest.raises(ParameterError, match='common factors'):
+        place_poles(model, np.array([1.0, -0.6, 0.09]), 0.3)
+
+
+def test_delay_is_that_of_a_slow_reference() -> None:
+    p = Parameters({'structure': 'pole_placement', 'estimator.law': 'gradient'})
+    controller = build_controller(p)
+    blocks = place_poles(PAPER, closed_of(p), 0.6)
+    y = blocks.reference.simulate(np.arange(2000.0))
+    assert controller.structure.delay == round(1999.0 - float(y[-1]))

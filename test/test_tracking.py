@@ -1,0 +1,151 @@
+"""The tracking structure: y follows y_m as if there were no backlash."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.metrics import (
+    delayed_reference,
+    delayed_tracking_error_rms,
+    gap_crossings_per_reversal,
+    total_variation,
+    turns,
+)
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.reference_signal import ReferenceSignal
+from backlash_ros.core.run_record import COLUMNS, RunRecord
+
+NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
+KNOWN = {'estimator.law': 'fixed', 'estimator.initial.m': 1.3}
+GAPLESS = {**KNOWN, 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0}
+EXACT = {**KNOWN, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0}
+
+
+def tracking(**changes: object) -> Parameters:
+    named = {name.replace('__', '.'): value for name, value in changes.items()}
+    return Parameters({'structure': 'tracking', 'amplitude': 0.2, **named})
+
+
+def simulate(p: Parameters, samples: int, y_m: np.ndarray | None = None) -> RunRecord:
+    loop = build_closed_loop(p)
+    if y_m is not None:
+        loop.reference = ReferenceSignal('file', samples=tuple(y_m.tolist()))
+    return loop.run(samples)
+
+
+def error(p: Parameters, samples: int = 500) -> float:
+    value = delayed_tracking_error_rms(
+        simulate(p, samples), p.integer('tracking.preview'), since=2.0
+    )
+    assert value is not None
+    return value
+
+
+@pytest.mark.parametrize('amplitude', [0.2, 1.0, 10.0])
+def test_learned_backlash_costs_nothing(amplitude: float) -> None:
+    p = tracking(amplitude=amplitude)
+    ideal = error(p.replaced({**GAPLESS, **NO_GAP}))
+    assert error(p) <= 1.02 * ideal
+
+
+def test_uncompensated_backlash_costs_much() -> None:
+    p = tracking()
+    ideal = error(p.replaced({**GAPLESS, **NO_GAP}))
+    assert error(p.replaced({**GAPLESS, 'fixed.doubt': 0.5})) >= 10.0 * ideal
+
+
+@pytest.mark.parametrize('preview', [20, 60])
+def test_y_follows_late_by_the_preview_window(preview: int) -> None:
+    p = tracking(tracking__preview=preview, **{k.replace('.', '__'): v for k, v in EXACT.items()})
+    loop = build_closed_loop(p)
+    assert loop.controller.structure.delay == preview
+    run = loop.run(500)
+    y, y_m = run.column('y')[200:], run.column('y_m')
+    errors = [np.abs(y - y_m[200 - d:500 - d]).max() for d in range(preview - 5, preview + 6)]
+    assert int(np.argmin(errors)) == 5
+
+
+def test_start_away_from_the_reference_does_not_jump() -> None:
+    run = simulate(tracking(bias=1.0, amplitude=0.0), 40)
+    assert np.abs(run.column('v')[:20]).max() < 1.0
+
+
+@pytest.mark.parametrize('noise', [0.0, 1e-3])
+def test_v_rests_while_the_reference_rests(noise: float) -> None:
+    t = np.arange(700) * 0.01
+    y_m = np.where(t < 4.0, 0.2 * np.sin(12.6 * t), 0.2 * np.sin(12.6 * 4.0))
+    run = simulate(tracking(output_noise_std=noise), 700, y_m)
+    v = run.column('v')[550:]
+    # A loop that cycles moves v at every other sample.
+    assert np.mean(np.diff(v) != 0.0) < 0.15
+
+
+def test_nothing_moves_before_there_is_anything_to_do() -> None:
+    run = simulate(tracking(amplitude=0.0, output_noise_std=1e-3), 300)
+    assert not np.any(run.column('v'))
+
+
+def test_wrong_first_slope_stays_bounded_until_the_truth_is_learned() -> None:
+    for slope in (0.13, 13.0):
+        run = simulate(tracking(estimator__initial__m=slope), 400)
+        assert np.abs(run.column('y')).max() < 2.0
+        assert np.abs(run.column('y')[300:]).max() < 0.25
+
+
+def test_saturation_leaves_no_windup() -> None:
+    p = tracking(waveform='square', frequency=np.pi, control__max=200.0, control__min=-200.0)
+    run = simulate(p, 700)
+    assert np.abs(run.column('v')).max() == 200.0
+    assert np.abs(run.column('y')[260:]).max() < 0.26
+
+
+def test_noise_does_not_hammer_v_across_the_gap() -> None:
+    run = simulate(tracking(output_noise_std=1e-3, seed=4), 700)
+    exact = simulate(tracking(**{k.replace('.', '__'): v for k, v in EXACT.items()}), 700)
+    crossings = gap_crossings_per_reversal(run, since=2.0)
+    assert crossings is not None
+    assert crossings <= 1.3
+    way = [total_variation(r.column('v')[200:]) for r in (run, exact)]
+    assert way[0] <= 1.3 * way[1]
+
+
+def record(y_m: np.ndarray, y: np.ndarray, v: np.ndarray | None = None) -> RunRecord:
+    rows = np.zeros((len(y_m), len(COLUMNS)))
+    for name, values in {
+        't': np.arange(len(y_m)) * 0.01, 'y_m': y_m, 'y': y, 'v': y if v is None else v,
+        'true_c_r': 1.0, 'true_c_l': -1.0,
+    }.items():
+        rows[:, COLUMNS.index(name)] = values
+    return RunRecord(rows, 0.01)
+
+
+def test_delayed_copy_has_no_delayed_error() -> None:
+    y_m = np.sin(0.1 * np.arange(300))
+    y = np.concatenate([np.zeros(7), y_m[:-7]])
+    assert delayed_tracking_error_rms(record(y_m, y), 7) == pytest.approx(0.0, abs=1e-12)
+    assert delayed_tracking_error_rms(record(0.0 * y_m, y), 7) is None
+
+
+def test_delay_counts_sample_periods_where_samples_were_lost() -> None:
+    y_m = np.arange(100.0)
+    whole = record(y_m, y_m)
+    kept = RunRecord(np.delete(whole.rows, [40, 41], axis=0), 0.01, 2)
+    assert delayed_reference(kept, 5)[-1] == 94.0
+
+
+def test_turns_counts_what_turns_back_by_more_than_the_least() -> None:
+    assert turns(np.array([0.0, 2.0, 0.0, 2.0, 1.5, 3.0]), 1.0) == 2
+    assert turns(np.array([0.0, 2.0, 1.5, 2.0]), 1.0) == 0
+    assert turns(np.empty(0), 1.0) == 0
+
+
+def test_crossings_are_counted_per_reversal_of_the_reference() -> None:
+    y_m = np.sin(0.1 * np.arange(630))
+    v = 2.0 * y_m + np.sign(np.gradient(y_m))
+    assert gap_crossings_per_reversal(record(y_m, y_m, v)) == pytest.approx(1.0)
+    chatter = v + 2.0 * (np.arange(630) % 2)
+    value = gap_crossings_per_reversal(record(y_m, y_m, chatter))
+    assert value is not None
+    assert value > 10.0
