@@ -114,6 +114,16 @@ def paper_example(**changes: object) -> Parameters:
     return Parameters(values)
 
 
+class NoState:
+    """Stands where the state of G is asked for but not used."""
+
+    x_hat = np.zeros(1)
+    x_cov = None
+
+
+NO_STATE = NoState()
+
+
 class KnownInput:
     """Stands in for InputReconstruction where u is known: hand u(k-1) over as y(k)."""
 

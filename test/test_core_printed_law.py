@@ -5,11 +5,10 @@ from __future__ import annotations
 from fractions import Fraction
 from math import isfinite, isnan
 
-import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from strategies import KnownInput, Play, eighths, usual_plays
+from strategies import NO_STATE, KnownInput, Play, eighths, usual_plays
 
 from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
@@ -31,7 +30,7 @@ def law(initial: Estimate = START, bounds: Bounds = WIDE,
 
 
 def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
-    return Proportional().control(Situation(y_m, 0.0, estimate, np.zeros(1)), inverse)
+    return Proportional().control(Situation(y_m, 0.0, estimate, NO_STATE), inverse)
 
 
 def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from math import isfinite
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import Play, signals, usual_plays
+from strategies import NO_STATE, Play, signals, usual_plays
 
 from backlash_ros.core.estimator import Estimate
 from backlash_ros.core.inverse import BacklashInverse
@@ -25,7 +24,7 @@ def estimate_of(play: Play, f_over_m: float) -> Estimate:
 
 def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
     """The structure looks at the reference and the estimate alone."""
-    return Proportional().control(Situation(y_m, 0.0, estimate, np.zeros(1)), inverse)
+    return Proportional().control(Situation(y_m, 0.0, estimate, NO_STATE), inverse)
 
 
 def tolerance(play: Play, y_m: float, u_d: float) -> float:

@@ -36,7 +36,8 @@ class Limits:
 
     def apply(self, v: float, v_before: float) -> float:
         """v within the bounds and not too far from v_before."""
-        v = min(max(v, v_before - self.move), v_before + self.move)
+        if self.move < inf:
+            v = min(max(v, v_before - self.move), v_before + self.move)
         return min(max(v, self.low), self.high)
 
 
@@ -77,7 +78,7 @@ class AdaptiveController:
         call; the plant went on with the last v through all of them. applied: the v that was
         really applied in each of the lost + 1 intervals since then, if it is known.
         """
-        if not (plausible(y) and plausible(y_m) and all(map(plausible, applied))):
+        if not (plausible(y) and plausible(y_m)) or (applied and not all(map(plausible, applied))):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite and no larger than '
                 f'{LARGEST:g}'
@@ -87,22 +88,20 @@ class AdaptiveController:
         estimator = self.estimator
         interval = self._interval
         if interval is not None:
-            held = [interval] * (lost + 1)
-            if applied:
-                held = [interval._replace(v=v) for v in applied]
-            for passed in held[:-1]:
+            for i in range(lost):
+                passed = interval._replace(v=applied[i]) if applied else interval
                 estimator.update(None, passed)
             self.lost_samples += lost
-            estimator.update(y, held[-1])
+            estimator.update(y, interval._replace(v=applied[lost]) if applied else interval)
         inverse = self.inverse
         v_before = inverse.v
-        situation = Situation(y_m, y, estimator.estimate, estimator.x_hat, estimator.x_cov)
-        command = self.structure.control(situation, inverse)
+        estimate = estimator.estimate
+        command = self.structure.control(Situation(y_m, y, estimate, estimator), inverse)
         v = self.limits.apply(command.v, v_before)
         inverse.applied(v)
         self._interval = Interval(v, y_m, command.u_d, command.f)
         return ControlStep(
-            y_m, y, command.u_d, v, estimator.u_hat, estimator.innovation, estimator.estimate
+            y_m, y, command.u_d, v, estimator.u_hat, estimator.innovation, estimate
         )
 
     def refine(self) -> None:

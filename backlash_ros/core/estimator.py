@@ -86,7 +86,19 @@ class Interval(NamedTuple):
     f: float
 
 
-class Estimator(Protocol):
+class StateSource(Protocol):
+    """Knows the state of G."""
+
+    @property
+    def x_hat(self) -> NDArray[np.float64]:
+        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
+
+    @property
+    def x_cov(self) -> NDArray[np.float64] | None:
+        """Covariance of x_hat, shape (n, n); None where the law has none."""
+
+
+class Estimator(StateSource, Protocol):
     """Learns (m, c_r, c_l), and f where the law adapts it, from v and y alone."""
 
     @property
@@ -96,14 +108,6 @@ class Estimator(Protocol):
     @property
     def u_hat(self) -> float:
         """Newest reconstruction of u, `lag` samples old."""
-
-    @property
-    def x_hat(self) -> NDArray[np.float64]:
-        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-
-    @property
-    def x_cov(self) -> NDArray[np.float64] | None:
-        """Covariance of x_hat, shape (n, n); None where the law has none."""
 
     @property
     def innovation(self) -> float:

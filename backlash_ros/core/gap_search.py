@@ -29,12 +29,13 @@ REACH = 2.0  # standard deviations of the gap that a fine bank reaches to either
 LARGEST_SPREAD = 0.3  # of the gap: the standard deviation is not to be trusted beyond
 LOST = 3.0  # standard deviations between read and estimated gap from which both are tried
 CAPACITY = 16384  # samples kept for replays
-REPLAY_SPEED = 3  # recorded samples per new one
+REPLAY_SPEED = 5  # recorded samples per new one
 FIRST_REPLAY_SPEED = 8  # while no estimate is known at all
 LAST_REPLAY = CAPACITY * (REPLAY_SPEED - 1) // REPLAY_SPEED  # later ones would not catch up
 GROWTH_EARLY, GROWTH_LATE = 1.3, 4.0  # of the record between two replays
 EARLY = 400  # samples during which a misread record still shows in the estimate
-MISREAD = 0.5  # standard deviations between the gap a record was read with and its estimate
+# Standard deviations between the gap a record was read with and its estimate that are too many.
+MISREAD_EARLY, MISREAD_LATE = 0.5, 2.0
 PAUSE = 5  # samples between two looks for a reason to read the record again
 START_GATE = 8.0  # standard deviations; before the fine bank stands only gross outliers are told
 PATIENCE = 2  # outliers in a row that the coarse bank refuses before it believes them
@@ -193,10 +194,11 @@ class GapSearch:
             self._fine_since = self.samples
             self.fine = bank.part(max(best - 1, 1), min(best + 2, bank.active))
             return
-        misread = abs(found.gap - read_with[best]) > MISREAD * found.std_gap
-        if bank is self.fine and not misread:
+        early = self.samples < EARLY
+        limit = MISREAD_EARLY if early else MISREAD_LATE
+        if bank is self.fine and abs(found.gap - read_with[best]) <= limit * found.std_gap:
             return
-        growth = GROWTH_EARLY if self.samples < EARLY else GROWTH_LATE
+        growth = GROWTH_EARLY if early else GROWTH_LATE
         self._earliest = int(growth * self.samples)
         gaps = fine_gaps(found, FINE)
         if abs(found.gap - read_with[best]) > LOST * found.std_gap:

@@ -105,7 +105,8 @@ class InputReconstruction:
         """Whether the start is forgotten and u_hat about as good as without lost samples."""
         if self.samples <= 2 * self.lag:
             return False
-        return bool(self._covariance.var[-1] <= 4.0 * self.std**2)
+        steady = self._covariance is self._after_steady
+        return steady or bool(self._covariance.var[-1] <= 4.0 * self.std**2)
 
     @property
     def x_hat(self) -> Array:

@@ -5,6 +5,8 @@ from math import inf
 from backlash_ros.core.backlash import Region
 from backlash_ros.core.errors import ParameterError
 
+LEFT, GAP, RIGHT = Region.LEFT, Region.GAP, Region.RIGHT
+
 
 class BacklashInverse:
     """v = BI(u_d): crosses the gap whenever u_d turns, equations (2.2) and (2.3).
@@ -27,7 +29,7 @@ class BacklashInverse:
         self._least_band = direction_band
         self.limited = False  # whether the last v could not be applied as it was
         self.v = 0.0
-        self.side = Region.GAP  # line in use; GAP until u_d moves for the first time
+        self.side = GAP  # line in use; GAP until u_d moves for the first time
         self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
         self.taking_up = False  # whether v is still on its way to the line
 
@@ -40,25 +42,23 @@ class BacklashInverse:
 
         Asking does not advance the state.
         """
-        move = u_d - self.extreme
+        move, band = u_d - self.extreme, self.direction_band
         # Only a turn has to leave the band; going on in the same direction is never noise.
-        up = self.direction_band if self.side != Region.RIGHT else 0.0
-        down = self.direction_band if self.side != Region.LEFT else 0.0
-        if move > up:
-            return Region.RIGHT
-        if move < -down:
-            return Region.LEFT
-        return Region.GAP
+        if move > 0.0:
+            return RIGHT if band == 0.0 or self.side == RIGHT or move > band else GAP
+        if move < 0.0:
+            return LEFT if band == 0.0 or self.side == LEFT or move < -band else GAP
+        return GAP
 
     def step(self, u_d: float, m: float, c_r: float, c_l: float) -> float:
         """Return v(t) for u_d(t) and the parameters in use, equation (2.3)."""
         side = self.direction(u_d)
-        if side != Region.GAP:
+        if side != GAP:
             self.taking_up = self.taking_up or side != self.side
             self.side, self.extreme = side, u_d
         elif not self.taking_up:
             return self.v
-        target = self.extreme / m + (c_r if self.side == Region.RIGHT else c_l)
+        target = self.extreme / m + (c_r if self.side == RIGHT else c_l)
         move = target - self.v
         if self.taking_up and abs(move) > self.take_up:
             self.v += self.take_up if move > 0.0 else -self.take_up

@@ -74,12 +74,13 @@ class NormalisedLms:
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""
-        u = self._reconstruction.update(y)
+        reconstruction = self._reconstruction
+        u = reconstruction.update(y)
         self._past.append(u)
         past = self._history.push(interval)
-        if past is None or not self._reconstruction.ready:
+        if past is None or not reconstruction.ready:
             return
-        ahead = self._reconstruction.newer(STROKE) - u
+        ahead = reconstruction.newer(STROKE) - u
         behind = u - self._past[0]
         step, rising = u - self._past[-2], True
         if min(ahead, behind, step) < 0.0:

@@ -31,7 +31,8 @@ class Proportional:
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
         y_m, estimate = situation.y_m, situation.estimate
-        inverse.widen_band(NOISE_BAND * _deviation(y_m, estimate))
+        if not isnan(estimate.std_m):
+            inverse.widen_band(NOISE_BAND * _deviation(y_m, estimate))
         m, c_r, c_l = estimate.m, estimate.c_r, estimate.c_l
         f = min(estimate.f, LARGEST_F_OVER_M * m)
         right = m * (y_m + f * c_r) / (m - f)
@@ -42,7 +43,7 @@ class Proportional:
                 if inverse.side == side and inverse.direction(u_d) == Region.GAP:
                     v = inverse.step(u_d, m, c_r, c_l)  # u_d rests, v goes on to its line
                     return Command(y_m + f * v, v, f)
-        elif _rests(inverse, held):
+        elif inverse.direction(held) == Region.GAP or _rests(inverse, held):
             return Command(held, inverse.v, f)  # first case of (3.3): u_d rests, and so does v
         right_fits = inverse.direction(right) == Region.RIGHT
         left_fits = inverse.direction(left) == Region.LEFT
@@ -56,15 +57,12 @@ class Proportional:
 
 
 def _rests(inverse: BacklashInverse, u_d: float) -> bool:
-    """Whether u_d has not moved; u_d on a line and y_m + f v differ by rounding."""
-    near = abs(u_d - inverse.extreme) <= ROUNDING * (abs(u_d) + abs(inverse.v))
-    return near or inverse.direction(u_d) == Region.GAP
+    """Whether u_d has moved by no more than u_d on a line and y_m + f v differ in rounding."""
+    return abs(u_d - inverse.extreme) <= ROUNDING * (abs(u_d) + abs(inverse.v))
 
 
 def _deviation(y_m: float, estimate: Estimate) -> float:
-    """Standard deviation of u_d that comes from the estimates, 0 where they have none."""
-    if isnan(estimate.std_m):
-        return 0.0
+    """Standard deviation of u_d that comes from the estimates."""
     m, c = estimate.m, estimate.c_r
     f = min(estimate.f, LARGEST_F_OVER_M * m)
     by_m = f * (y_m + f * c) / (m - f) ** 2

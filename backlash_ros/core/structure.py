@@ -7,22 +7,27 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.estimator import Estimate, StateSource
 from backlash_ros.core.inverse import BacklashInverse
 
 
 class Situation(NamedTuple):
-    """What is known at a sample: reference, output, estimate and state of G with its covariance.
-
-    x_hat (n,) and x_cov (n, n) are in the coordinates of StateModel; x_cov is None where the
-    estimator has none.
-    """
+    """What is known at a sample: reference, output, estimate, and who knows the state of G."""
 
     y_m: float
     y: float
     estimate: Estimate
-    x_hat: NDArray[np.float64]
-    x_cov: NDArray[np.float64] | None = None
+    source: StateSource
+
+    @property
+    def x_hat(self) -> NDArray[np.float64]:
+        """State of G in the coordinates of StateModel, shape (n,)."""
+        return self.source.x_hat
+
+    @property
+    def x_cov(self) -> NDArray[np.float64] | None:
+        """Covariance of x_hat, shape (n, n); None where there is none."""
+        return self.source.x_cov
 
 
 class Command(NamedTuple):
