@@ -40,7 +40,7 @@ demo: run-environment
 test: dev-environment
 	@$(RUN) -m pytest $(ARGS)
 
-bench: run-environment
+bench: dev-environment
 	@$(RUN) benchmarks/run.py $(ARGS)
 
 lint: dev-environment

@@ -8,6 +8,8 @@ from math import nan
 
 import numpy as np
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import signal
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.transfer_function import TransferFunction
@@ -112,6 +114,11 @@ def paper_example(**changes: object) -> Parameters:
     values: dict[str, object] = {'estimator.law': 'lms', 'estimator.output_noise_std': 0.0}
     values.update({name.replace('__', '.'): value for name, value in changes.items()})
     return Parameters(values)
+
+
+def response(model: TransferFunction, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """y(0..N-1) for u(0..N-1) from rest, by scipy."""
+    return np.asarray(signal.lfilter(model.numerator, model.denominator, u))
 
 
 class NoState:

@@ -66,5 +66,5 @@ def test_lost_samples_teach_nothing_and_do_no_harm() -> None:
 
 
 def test_gradient_without_its_structure_is_refused() -> None:
-    with pytest.raises(ParameterError, match='structure=.*must be pole_placement'):
+    with pytest.raises(ParameterError, match=r'structure=.*must be pole_placement'):
         build_controller(Parameters({'estimator.law': 'gradient'}))

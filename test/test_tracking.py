@@ -94,11 +94,15 @@ def test_wrong_first_slope_stays_bounded_until_the_truth_is_learned() -> None:
         assert np.abs(run.column('y')[300:]).max() < 0.25
 
 
-def test_saturation_leaves_no_windup() -> None:
-    p = tracking(waveform='square', frequency=np.pi, control__max=200.0, control__min=-200.0)
-    run = simulate(p, 700)
-    assert np.abs(run.column('v')).max() == 200.0
-    assert np.abs(run.column('y')[260:]).max() < 0.26
+@pytest.mark.parametrize('law', ['kalman', 'fixed'])
+def test_saturation_and_rate_limit_leave_no_cycle_behind(law: str) -> None:
+    t = np.arange(900) * 0.01
+    y_m = np.where(t < 5.0, 0.3, 0.1) * np.sin(12.6 * t)
+    p = tracking(control__max=22.0, control__min=-22.0, control__rate_max=1280.0)
+    run = simulate(p if law == 'kalman' else p.replaced(EXACT), 900, y_m)
+    assert np.abs(run.column('v')).max() == 22.0
+    # Full feedback through these limits cycles with an amplitude of 7.
+    assert np.abs(run.column('y')[700:]).max() < 0.105
 
 
 def test_noise_does_not_hammer_v_across_the_gap() -> None:

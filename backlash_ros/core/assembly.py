@@ -36,7 +36,8 @@ from backlash_ros.core.transfer_function import TransferFunction
 DOUBT_OF_FIRST_GUESS = 0.5
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
-CAREFUL = 1e4  # times the input weight while the backlash is unknown
+# Times the input weight while v meets its limits; the last one while the backlash is unknown.
+SOFTER = (1e1, 1e2, 1e3, 1e4)
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -78,9 +79,13 @@ def _check_first_guess(p: Parameters) -> None:
         raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')
 
 
-def warnings_of(p: Parameters) -> list[str]:
-    """What is allowed but will make the estimate hard, a sentence each."""
-    return model_warnings(build_model(p), p.real('sample_period'), p.real('frequency'))
+def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
+    """What is allowed but will make the estimate hard, a sentence each.
+
+    with_reference: whether the parameters of the reference are those in use.
+    """
+    frequency = p.real('frequency') if with_reference else None
+    return model_warnings(build_model(p), p.real('sample_period'), frequency)
 
 
 def build_limits(p: Parameters) -> Limits:
@@ -208,10 +213,10 @@ def _tracking(p: Parameters) -> Structure:
     gains = preview_gains(
         state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview')
     )
-    careful = preview_gains(state, CAREFUL * weight, 0.0, 0)
+    softer = [preview_gains(state, more * weight, 0.0, 0).state for more in SOFTER]
     return Tracking(
-        state, gains, careful.state, p.real('inverse.caution'),
-        p.real('estimator.output_noise_std'),
+        state, gains, softer[-1], p.real('inverse.caution'),
+        p.real('estimator.output_noise_std'), softer,
     )
 
 

@@ -12,7 +12,8 @@ so that with zeta = W phi the estimation error is linear in the parameter error:
 
 xi = theta_hat' zeta - W u_d is the swapping term. P = diag(1/v_s^2, 1, 1) gives the slope and the
 crossings regressors of one size; v_s^2, u_s^2 and 10 a^2 are the means of v^2, u_d^2 and
-zeta' P zeta, so that no unit matters; a is larger where y is noisy. The side of phi is the one the inverse used.
+zeta' P zeta, so that no unit matters; a is larger where y is noisy. The side of phi is the one
+the inverse used.
 
 Reference: G. Tao, P. V. Kokotović, Adaptive Control of Systems with Actuator and Sensor
 Nonlinearities, Wiley 1996.
@@ -40,8 +41,8 @@ MEMORY = 200  # samples of the running means
 class GradientEstimator:
     """Learns (m, m c_r, m c_l) from the tracking error of the four-block loop.
 
-    step: 0 < step < 2. noise_std: of y. Only valid while v comes from PolePlacement with the same blocks, which
-    are the model that explains y.
+    step: 0 < step < 2. noise_std: of y. Only valid while v comes from PolePlacement with the
+    same blocks, which are the model that explains y.
     """
 
     def __init__(
@@ -118,4 +119,4 @@ class _Filter:
     def step(self, inputs: Array) -> Array:
         """Take in u(k-1) of each signal and return y(k), shape (signals,)."""
         self._x = self._a @ self._x + np.outer(self._b, inputs)
-        return self._x[0]
+        return np.asarray(self._x[0])

@@ -27,7 +27,7 @@ NIS_TRUSTED = 2.0  # mean normalised innovation squared below which an estimate 
 PROVEN = 25  # samples a new search must be consistent for before it replaces an estimate
 RESTART_AFTER = 150  # inconsistent samples after which a search begins afresh
 NO_DATA_AFTER = 20  # lost samples in a row that are worth a status
-UNDECIDED_AFTER = 100  # samples after which a search without a sign of engagement says so
+UNDECIDED_AFTER = 100  # samples after which a search says that nothing usable comes out
 PRECISE_SLOPE, PRECISE_GAP = 0.2, 0.3  # relative deviations below which an estimate is published
 ADOPTED_SLOPE, ADOPTED_GAP = 0.01, 0.05  # those below which it replaces an older one at once
 ADOPTED_AFTER = 300  # consistent samples after which it does so in any case
@@ -153,12 +153,12 @@ class KalmanEstimator:
         values = (found.m, found.c_r, found.c_l)
         slack = (found.std_m, found.std_c_r, found.std_c_l)
         inside = self._bounds.project(*values)
-        if any(
+        outside = any(
             abs(a - b) > 3.0 * s + 1e-9 * abs(b)
             for a, b, s in zip(values, inside, slack, strict=True)
-        ):
-            return None
-        return found
+        )
+        watched.outside_for = watched.outside_for + 1 if outside else 0
+        return None if outside else found
 
     def _publish(self) -> None:
         status = self._status()
@@ -189,6 +189,8 @@ class KalmanEstimator:
             return Status.NOT_EXCITED if waited else self._in_vain
         if fine.since_motion > self._settings.model.memory:
             return Status.NOT_EXCITED
+        if watched.outside_for >= UNDECIDED_AFTER:
+            return Status.INCONSISTENT
         return Status.TRACKING if self._known else self._in_vain
 
 
@@ -199,6 +201,7 @@ class _Watched:
         self.search = search
         self.consistent_for = 0  # samples
         self.inconsistent_for = 0  # samples
+        self.outside_for = 0  # samples for which a precise estimate lay outside the bounds
         self.contradicted = False
         self._waiting: tuple[float | None, float, bool] | None = None
         self._proven = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from math import isnan, sqrt
 
 import numpy as np
@@ -18,14 +19,15 @@ Array = NDArray[np.float64]
 
 # While the reference rests, v rests as well as long as |x - x*| is within so many standard
 # deviations of the noise on y (StateModel scales x so that |x| is the energy of the free response
-# of y over some 50 samples: 7 stands for an error of the size of the noise). Feedback through a gap that is not
-# known to the last digit would cross it for ever.
+# of y over some 50 samples: 7 stands for an error of the size of the noise). Feedback through a
+# gap that is not known to the last digit would cross it for ever.
 REST_TOLERANCE = 7.0
 REST_DOUBT = 2.0  # the same in standard deviations of x, where that is more
 REST_SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
 OFF_AT_REST = 6.0  # standard deviations of y that mean a deviation while the state is unknown
 STEADY = 0.01  # share of the tolerance by which an ideal trajectory at rest may still move
 
+HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
 WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
@@ -42,12 +44,13 @@ class Tracking:
     While the backlash is unknown, `careful` replaces K: little feedback cannot destabilise a loop
     whose gain is unknown, and the trajectory itself excites it.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
-    noise_std: of y; while the trajectory rests and y is on it within the noise, v rests as well.
+    softer: gains to replace K with, step by step, while v meets its limits: full feedback through
+    a limited actuator cycles between the limits. noise_std: of y; while the trajectory rests and y is on it within the noise, v rests as well.
     """
 
     def __init__(
         self, model: StateModel, gains: PreviewGains, careful: Array, caution: float,
-        noise_std: float = 0.0,
+        noise_std: float = 0.0, softer: Sequence[Array] = (),
     ) -> None:
         self.delay = len(gains.preview) - 1
         self._model, self._gains = model, gains
@@ -57,6 +60,8 @@ class Tracking:
         self._q = 0.0
         self._integral = 0.0
         self._noise_std, self._reach, self._u_reach = noise_std, 0.0, 0.0
+        self._soft = (gains.state, *softer)
+        self._level = self._free = 0  # gain in use, samples since v last met a limit
         self._resting: float | None = 0.0  # u* at which v rests, None while it moves
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
@@ -69,7 +74,7 @@ class Tracking:
         deviation = situation.x_hat - self._x
         trusted = _trusted(situation.estimate)
         if trusted:
-            u_d = ideal - float(gains.state @ deviation)
+            u_d = ideal - float(self._gain(inverse.limited) @ deviation)
             u_d -= gains.integral * (self._integral - self._q)
         else:
             u_d = ideal - self._careful_feedback(situation.estimate, deviation, ideal)
@@ -95,6 +100,15 @@ class Tracking:
             self._window.extend([situation.y_m if near else start] * (self.delay + 1))
             self._x = situation.x_hat.copy()
         self._window.append(situation.y_m)
+
+    def _gain(self, limited: bool) -> Array:
+        """K, or a softer one the longer v meets its limits; back step by step once it is free."""
+        self._free = 0 if limited else self._free + 1
+        if limited:
+            self._level = min(self._level + 1, len(self._soft) - 1)
+        elif self._level > 0 and self._free % HARDEN_AFTER == 0:
+            self._level -= 1
+        return self._soft[self._level]
 
     def _careful_feedback(self, estimate: Estimate, deviation: Array, ideal: float) -> float:
         """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.

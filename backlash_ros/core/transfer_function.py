@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
 
 from backlash_ros.core.errors import ParameterError
 
@@ -68,10 +67,6 @@ class TransferFunction:
         a[:, 0] = -self.denominator[1:]
         a[:-1, 1:] = np.eye(n - 1)
         return a, self.numerator[1:].copy(), np.eye(n)[0]
-
-    def simulate(self, u: Array) -> Array:
-        """y(0..N-1) for u(0..N-1) from rest, shape (N,)."""
-        return np.asarray(signal.lfilter(self.numerator, self.denominator, u), dtype=np.float64)
 
 
 def _polynomial(name: str, coefficients: Sequence[float]) -> Array:

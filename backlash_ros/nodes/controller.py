@@ -14,7 +14,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_controller, build_limits
+from backlash_ros.core.assembly import build_controller, build_limits, warnings_of
 from backlash_ros.core.controller import ControlStep, plausible
 from backlash_ros.core.estimator import Status
 from backlash_ros.core.lms import NormalisedLms
@@ -53,7 +53,8 @@ STATES: dict[Status, tuple[bytes, str]] = {
     Status.INCONSISTENT: (
         DiagnosticStatus.ERROR,
         'frozen: plant_output does not follow from v through G(z) and a backlash; '
-        'check the sensor, G(z), whether v is applied in time, and estimator.output_noise_std',
+        'check the sensor, G(z), whether v is applied in time, estimator.output_noise_std '
+        'and estimator.bounds',
     ),
 }
 
@@ -70,6 +71,8 @@ class ControllerNode(ProcessNode):
         p = self.settings
         period = p.real('sample_period')
         self._core = build_controller(p)
+        for warning in warnings_of(p, with_reference=False):
+            self.log.warning(warning)
         self._lockstep = p.flag('lockstep')
         self._use_applied = p.flag('estimator.use_applied_control')
         self._counter, self._commands = SampleCounter(period), CommandHistory(period)

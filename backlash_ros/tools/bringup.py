@@ -19,7 +19,7 @@ from backlash_ros.core.assembly import build_controller, build_plant, build_refe
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import command_line, processes
-from backlash_ros.tools.command_line import DONE, FAILED, OptionParser
+from backlash_ros.tools.command_line import DONE, FAILED, OptionParser, print_warnings
 from backlash_ros.tools.configuration import effective_parameters, write_config
 from backlash_ros.tools.errors import InputError
 from backlash_ros.tools.processes import Event, ProcessPlan, ProcessSupervisor, RunError
@@ -283,6 +283,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     build_controller(parameters)
     build_plant(parameters)
     build_reference(parameters)
+    print_warnings('bringup', parameters)
     if options.out is not None and (options.out / BAG).exists():
         raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
     # The nodes need a path that holds wherever it is read.

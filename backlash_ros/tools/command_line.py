@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from backlash_ros.core.assembly import warnings_of
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.errors import BrokenOffError, InputError
@@ -86,6 +87,12 @@ def run_tool(name: str, tool: Callable[[], None]) -> int:
 
 def _interrupt(number: int, frame: object) -> None:
     raise KeyboardInterrupt
+
+
+def print_warnings(name: str, parameters: Parameters) -> None:
+    """Say on stderr what is allowed but will make the estimate hard."""
+    for warning in warnings_of(parameters):
+        print(f'{name}: warning: {warning}', file=sys.stderr)
 
 
 def _fail(name: str, message: str, code: int) -> int:

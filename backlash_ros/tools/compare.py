@@ -7,6 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, nan
+from operator import methodcaller
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -174,8 +175,8 @@ def _measure(contender: Contender, parameters: Parameters, samples: int) -> Resu
     try:
         run = run_loop(loop, samples)
         times, operations = _costs(loop)
-    except BrokenOffError as error:
-        return Result(contender, None, delay, note=str(error))
+    except BrokenOffError as broken:
+        return Result(contender, None, delay, note=str(broken))
     result = Result(
         contender, run, delay, _number(control_error_rms(run)),
         way=total_variation(_late(run, run.column('v'))),
@@ -211,10 +212,11 @@ def _costs(loop: ClosedLoop) -> tuple[list[float], float]:
     for k in range(TIMED + COUNTED):
         y, y_m = loop.plant.measure(), loop.reference(loop.plant.sample * loop.sample_period)
         if k >= TIMED:
-            operations.append(sum(
-                count(loop.controller, lambda controller: controller.step(y, y_m))
-                for count in (scalar_operations, array_operations)
-            ))
+            step_once = methodcaller('step', y, y_m)
+            operations.append(
+                scalar_operations(loop.controller, step_once)
+                + array_operations(loop.controller, step_once)
+            )
         begin = perf_counter()
         step = loop.controller.step(y, y_m)
         times.append(perf_counter() - begin)

@@ -15,7 +15,12 @@ from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import batch, command_line
 from backlash_ros.tools.batch import Job, Outcome
-from backlash_ros.tools.command_line import DEFAULT_DURATION_S, format_table, number_of_samples
+from backlash_ros.tools.command_line import (
+    DEFAULT_DURATION_S,
+    format_table,
+    number_of_samples,
+    print_warnings,
+)
 from backlash_ros.tools.configuration import effective_parameters, write_config
 from backlash_ros.tools.errors import InputError
 from backlash_ros.tools.files import write_atomically
@@ -66,6 +71,7 @@ def _once(parameters: Parameters, duration: float | None, out: Path | None) -> N
     from backlash_ros.tools.report import PAGE, report_run
     samples = number_of_samples(parameters, duration)
     loop = prepare(parameters)
+    print_warnings('simulate', parameters)
     _refuse_bad(out)
     # disable=None: no bar where stderr is not a terminal.
     with tqdm(total=samples, desc='simulate', unit='sample', disable=None) as bar:
