@@ -116,7 +116,7 @@ def paper_example(**changes: object) -> Parameters:
     return Parameters(values)
 
 
-def response(model: TransferFunction, u: NDArray[np.float64]) -> NDArray[np.float64]:
+def output_of(model: TransferFunction, u: NDArray[np.float64]) -> NDArray[np.float64]:
     """y(0..N-1) for u(0..N-1) from rest, by scipy."""
     return np.asarray(signal.lfilter(model.numerator, model.denominator, u))
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from strategies import paper_example, plants, response
+from strategies import output_of, paper_example, plants
 
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.controller import AdaptiveController, ControlStep
@@ -150,7 +150,7 @@ def test_row_holds_the_signals_of_one_sample() -> None:
     assert (u <= 1.3 * (v + 3.0) + 1e-9).all()
     assert (u >= 1.3 * (v - 3.0) - 1e-9).all()
     model = TransferFunction((1e-5, 4e-5, 1e-5), (1.0, -2.88504, 2.77196, -0.88692))
-    np.testing.assert_allclose(run.column('y'), response(model, u), atol=1e-9)
+    np.testing.assert_allclose(run.column('y'), output_of(model, u), atol=1e-9)
     assert run.has_truth
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants, response
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, output_of, plants
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.input_reconstruction import InputReconstruction
@@ -36,7 +36,7 @@ def error(model: TransferFunction, noise_std: float = 0.0, lag: int = LAG,
           lost: tuple[int, ...] = (), samples: int = 400) -> Array:
     """u_hat(k) - u(k) from k = 2 lag on, as long as y reaches."""
     u = play_output(samples)
-    u_hat = reconstructed(InputReconstruction(model, noise_std, lag), response(model, u), lost)
+    u_hat = reconstructed(InputReconstruction(model, noise_std, lag), output_of(model, u), lost)
     return (u_hat - u)[2 * lag: samples - lag]
 
 
@@ -77,7 +77,7 @@ def test_unit_of_y_does_not_matter(
 ) -> None:
     u = play_output()
     original, scaled = (
-        (InputReconstruction(model, factor * noise_std, LAG), response(model, u))
+        (InputReconstruction(model, factor * noise_std, LAG), output_of(model, u))
         for factor in (1.0, unit)
         for model in [TransferFunction([factor * b for b in numerator], denominator)]
     )
@@ -99,7 +99,7 @@ def test_lost_samples_do_not_put_it_out_of_step(model: TransferFunction, lost: s
 def test_a_lost_sample_costs_hardly_any_accuracy(lost: tuple[int, ...]) -> None:
     """y before and after it still determine u to well below 1 % of its amplitude of 10."""
     u = 10.0 * np.sin(0.126 * np.arange(400))
-    u_hat = reconstructed(InputReconstruction(PAPER, 0.0, LAG), response(PAPER, u), lost)
+    u_hat = reconstructed(InputReconstruction(PAPER, 0.0, LAG), output_of(PAPER, u), lost)
     assert np.abs(u_hat - u)[2 * LAG: -LAG].max() < 0.05
 
 
@@ -108,9 +108,9 @@ def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: fl
     """Against one batch solution over all samples, which knows no recursion."""
     samples, lag = 200, 20
     rng = np.random.default_rng(3)
-    y = response(PAPER, np.cumsum(rng.standard_normal(samples)))
+    y = output_of(PAPER, np.cumsum(rng.standard_normal(samples)))
     y += noise_std * rng.standard_normal(samples)
-    impulse = response(PAPER, np.eye(1, samples)[0])
+    impulse = output_of(PAPER, np.eye(1, samples)[0])
     response = np.array([[impulse[i - j] if i >= j else 0.0 for j in range(samples)]
                          for i in range(samples)])
     walk = np.eye(samples) - np.eye(samples, k=-1)
@@ -128,7 +128,7 @@ def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: fl
 def test_std_is_the_spread_of_the_error_for_a_random_walk(noise_std: float) -> None:
     rng = np.random.default_rng(4)
     u = np.cumsum(rng.standard_normal(4000))
-    y = response(PAPER, u) + noise_std * rng.standard_normal(4000)
+    y = output_of(PAPER, u) + noise_std * rng.standard_normal(4000)
     reconstruction = InputReconstruction(PAPER, noise_std, LAG)
     spread = np.nanstd((reconstructed(reconstruction, y) - u)[200:])
     assert reconstruction.std == pytest.approx(spread, rel=0.1)
@@ -167,7 +167,7 @@ def test_lag_shorter_than_the_delay_of_the_plant_is_refused() -> None:
 
 def test_innovation_is_small_for_a_known_input_and_nan_for_a_lost_sample() -> None:
     reconstruction = InputReconstruction(PAPER, 0.0, LAG)
-    for value in response(PAPER, np.full(300, 2.0)):
+    for value in output_of(PAPER, np.full(300, 2.0)):
         reconstruction.update(float(value))
     assert reconstruction.innovation == pytest.approx(0.0, abs=1e-6)
     reconstruction.update(None)

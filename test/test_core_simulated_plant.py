@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import Play, paper_example, plants, response, signals, usual_plays
+from strategies import Play, output_of, paper_example, plants, signals, usual_plays
 
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.backlash import Backlash
@@ -44,7 +44,7 @@ def test_y_is_g_of_the_backlash_output_plus_the_disturbance(
     )
     backlash = Backlash(play.m, play.c_r, play.c_l)
     u = np.array([backlash.step(v) for v in control])
-    expected = response(model, u + disturbance)
+    expected = output_of(model, u + disturbance)
     np.testing.assert_allclose(
         outputs(simulated, control), expected, atol=1e-9 * (1.0 + np.abs(expected).max())
     )

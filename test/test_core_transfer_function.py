@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
-from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants, response
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, output_of, plants
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.transfer_function import TransferFunction
@@ -26,7 +26,7 @@ def test_state_space_and_simulation_agree_with_scipy(model: TransferFunction, se
         x = a @ x + b * value
     size = np.abs(expected).max() + 1.0
     np.testing.assert_allclose(by_states, expected[:, 0], atol=1e-8 * size)
-    np.testing.assert_allclose(response(model, u), expected[:, 0], atol=1e-8 * size)
+    np.testing.assert_allclose(output_of(model, u), expected[:, 0], atol=1e-8 * size)
 
 
 @given(model=plants())
@@ -63,7 +63,7 @@ def test_common_factor_of_both_polynomials_cancels(scale: float) -> None:
 def test_leading_zeros_of_the_numerator_are_delay(numerator: list[float], delay: int) -> None:
     model = TransferFunction(numerator, [1.0, -0.5, 0.1])
     assert model.delay == delay
-    impulse = response(model, np.eye(1, 10)[0])
+    impulse = output_of(model, np.eye(1, 10)[0])
     assert np.flatnonzero(impulse)[0] == delay
 
 

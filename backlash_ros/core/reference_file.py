@@ -21,6 +21,8 @@ def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
     if parameters.word('waveform') != 'file':
         return ()
     name, period = parameters.word('file'), parameters.real('sample_period')
+    if not name:
+        raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
     try:
         with Path(name).open(newline='', encoding='utf-8') as file:
             header, *rows = list(csv.reader(file)) or [[]]
