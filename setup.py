@@ -34,6 +34,7 @@ setup(
             f'bringup = {PACKAGE}.tools.bringup:main',
             f'simulate = {PACKAGE}.tools.simulate:main',
             f'report = {PACKAGE}.tools.report:main',
+            f'compare = {PACKAGE}.tools.compare:main',
         ],
     },
 )

@@ -258,7 +258,7 @@ def fine_gaps(found: Crossings, count: int) -> Array:
     least = 1e-3 * found.std_gap
     gap = max(found.gap, least)
     spread = min(REACH * found.std_gap, max(LARGEST_SPREAD * gap, found.std_gap))
-    return np.maximum(gap + spread * np.linspace(-1.0, 1.0, count), least)
+    return np.asarray(np.maximum(gap + spread * np.linspace(-1.0, 1.0, count), least))
 
 
 def drift_in_products(at: Estimate | Crossings, std: tuple[float, float, float]) -> Array:

@@ -53,13 +53,13 @@ class GradientEstimator:
         self.step = step
         self.innovation = nan
         self.u_hat = 0.0
-        self.x_hat = np.zeros(order)
+        self.x_hat: Array = np.zeros(order)
         self.x_cov = None
         self._bounds, self._noise_square = bounds, (NOISE_MARGIN * noise_std) ** 2
         self._reference = _Filter(blocks.reference, 1)
         # W of phi and of u_d side by side.
         self._disturbance = _Filter(blocks.disturbance, 4)
-        self._phi = np.zeros(3)
+        self._phi: Array = np.zeros(3)
         self._v_square = self._u_square = self._size = 0.0  # running means
         self._samples = 0
 
@@ -114,7 +114,7 @@ class _Filter:
 
     def __init__(self, model: TransferFunction, signals: int) -> None:
         self._a, self._b, _ = model.state_space()
-        self._x = np.zeros((model.order, signals))
+        self._x: Array = np.zeros((model.order, signals))
 
     def step(self, inputs: Array) -> Array:
         """Take in u(k-1) of each signal and return y(k), shape (signals,)."""

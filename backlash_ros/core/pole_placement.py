@@ -95,7 +95,8 @@ class PolePlacement:
         size = len(blocks.filter) - 1
         self._companion = np.eye(size, k=-1)
         self._companion[:1] = -blocks.filter[1:]
-        self._w_1, self._w_2 = np.zeros(size), np.zeros(size)
+        self._w_1: Array = np.zeros(size)
+        self._w_2: Array = np.zeros(size)
         self.delay = round(_delay_of(blocks.reference))
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:

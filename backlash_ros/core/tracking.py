@@ -45,7 +45,8 @@ class Tracking:
     whose gain is unknown, and the trajectory itself excites it.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
     softer: gains to replace K with, step by step, while v meets its limits: full feedback through
-    a limited actuator cycles between the limits. noise_std: of y; while the trajectory rests and y is on it within the noise, v rests as well.
+    a limited actuator cycles between the limits. noise_std: of y; while the trajectory rests and
+    y is on it within the noise, v rests as well.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class Tracking:
         self._model, self._gains = model, gains
         self._careful, self._caution = careful, caution
         self._window: deque[float] = deque(maxlen=self.delay + 1)  # r(k) .. r(k + delay)
-        self._x = np.zeros(model.order)  # x* and q* of the trajectory
+        self._x: Array = np.zeros(model.order)  # x* and q* of the trajectory
         self._q = 0.0
         self._integral = 0.0
         self._noise_std, self._reach, self._u_reach = noise_std, 0.0, 0.0

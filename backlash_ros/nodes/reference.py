@@ -17,10 +17,12 @@ from backlash_ros.core.parameter_table import REFERENCE
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.messages import DEPTH, KEPT, stamp_ns_of
 from backlash_ros.nodes.sample_counter import SampleCounter
-from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
+from backlash_ros.nodes.spin import ProcessNode, run
 
 # plant_output counts as silent after this; then the own clock takes over.
 SILENT_PERIODS, SHORTEST_SILENCE_S = 3.0, 0.1
+LONGEST_SLEEP_S = 0.05  # so that the end of the process is noticed
+CALLBACKS_AT_ONCE = 3
 
 
 class ReferenceNode(ProcessNode):
@@ -59,7 +61,33 @@ class ReferenceNode(ProcessNode):
         if self._lockstep:
             super().work(executor)
         else:
-            spin_paced(self, executor, self._sample_period, self._on_tick, lambda: True)
+            self._follow(executor)
+
+    def _follow(self, executor: SingleThreadedExecutor) -> None:
+        """Publish y_m half a period after each output, by the own clock where none comes.
+
+        In between the process sleeps: woken by each output it would take the processor from the
+        controller, which has to answer it.
+        """
+        period = self._sample_period
+        silence = max(SILENT_PERIODS * period, SHORTEST_SILENCE_S)
+        due = time.monotonic()
+        while not self.stopping:
+            remaining = due - time.monotonic()
+            if remaining > 0.0:
+                time.sleep(min(remaining, LONGEST_SLEEP_S))
+                continue
+            # The newest output, and whatever else has come in.
+            for _ in range(CALLBACKS_AT_ONCE):
+                executor.spin_once(timeout_sec=0.0)
+            self._publish(self._sample)
+            now = time.monotonic()
+            if now <= self._heard_at + silence:
+                due = max(self._heard_at + 1.5 * period, now)
+            else:
+                due = max(due + period, now)
+                if self._counter.index >= 0 or not self._waits:
+                    self._sample += 1
 
     def _start(self) -> None:
         self._started = True
@@ -75,17 +103,12 @@ class ReferenceNode(ProcessNode):
     def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
         before = self._counter.index
         self._counter.count(info['source_timestamp'], info['publication_sequence_number'])
-        self._sample += self._counter.index - before if before >= 0 else 1
-        self._heard_at = time.monotonic()
-        self._publish(self._sample)
-
-    def _on_tick(self, tick: int, due_ns: int) -> bool:
-        silence = max(SILENT_PERIODS * self._sample_period, SHORTEST_SILENCE_S)
-        if time.monotonic() > self._heard_at + silence:
-            self._publish(self._sample)
-            if self._counter.index >= 0 or not self._waits:
-                self._sample += 1
-        return True
+        if before < 0 and self._waits:
+            self._sample = self._counter.index + 1
+        else:
+            self._sample += self._counter.index - before if before >= 0 else 1
+        age_s = (time.time_ns() - info['received_timestamp']) * 1e-9
+        self._heard_at = time.monotonic() - max(age_s, 0.0)
 
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.
