@@ -19,7 +19,9 @@ from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64
 
 ROOT = Path(__file__).resolve().parents[1]
-EXECUTABLES = {'controller', 'plant', 'reference', 'recorder', 'bringup', 'simulate', 'report'}
+EXECUTABLES = {
+    'controller', 'plant', 'reference', 'recorder', 'bringup', 'simulate', 'report', 'compare',
+}
 ROS_PREFIXES = ('rclpy', 'ament_')
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
 DEADLINE_S = 30.0

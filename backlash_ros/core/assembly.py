@@ -170,9 +170,14 @@ def _fixed(p: Parameters) -> Estimator:
     )
 
 
+def law_fits(law: str, structure: str) -> bool:
+    """Whether a law can learn in a structure: the gradient one only from the four-block loop."""
+    return law != 'gradient' or structure == 'pole_placement'
+
+
 def _gradient(p: Parameters) -> Estimator:
     structure = p.word('structure')
-    if structure != 'pole_placement':
+    if not law_fits('gradient', structure):
         raise ParameterError(
             'structure', structure, 'must be pole_placement for estimator.law: gradient',
             'the law learns from the response of that loop; every other law fits any structure',

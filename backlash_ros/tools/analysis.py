@@ -9,7 +9,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.assembly import ESTIMATORS
+from backlash_ros.core.assembly import ESTIMATORS, law_fits
 from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Status
@@ -113,6 +113,8 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
     own = parameters.word('estimator.law')
     traces = []
     for law in ESTIMATORS:
+        if not law_fits(law, parameters.word('structure')):
+            continue
         if law == own:
             t, e, note = times[compared], control_error(run)[compared], ''
         else:
