@@ -33,7 +33,10 @@ def start_loop(
     world: RosWorld, parameters: dict[str, object], bag: str = '', storage: str = 'mcap',
 ) -> dict[str, NodeProcess]:
     """Start recorder, controller, reference and plant, none of which begins before the others."""
+    # In real time the reference listens to plant_output as well.
+    outputs = 2 if parameters.get('lockstep') else 3
     own: dict[str, dict[str, object]] = {
+        'plant': {'wait_for_subscribers': outputs},
         'recorder': {'wait_for_publishers': True, 'bag': f"'{bag}'", 'storage': storage},
     }
     listeners = {'wait_for_subscribers': 2}
