@@ -44,13 +44,14 @@ class ClosedLoop:
             else:
                 step = self.controller.step(y, self.reference(t), lost)
                 self.controller.refine()
+                estimator = self.controller.estimator
                 lost, v = 0, step.v
                 truth = self.plant.backlash
                 u = self.plant.step(v)
                 e = step.estimate
                 rows[kept] = (
                     t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f, e.std_m, e.std_c_r,
-                    e.std_c_l, step.u_hat, step.innovation, e.status, truth.m, truth.c_r,
+                    e.std_c_l, estimator.u_hat, estimator.innovation, e.status, truth.m, truth.c_r,
                     truth.c_l,
                 )
                 kept += 1

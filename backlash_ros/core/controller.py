@@ -48,16 +48,23 @@ class ControlStep(NamedTuple):
     y: float
     u_d: float
     v: float
-    u_hat: float
-    innovation: float
     estimate: Estimate
+
+
+class _Lesson(NamedTuple):
+    """An output that is still to be learned from."""
+
+    y: float
+    interval: Interval
+    lost: int
+    applied: Sequence[float]
 
 
 class AdaptiveController:
     """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
 
-    Call `step` once per received y. The estimator is updated before v is computed, so that
-    v(k) uses everything up to y(k). Call `refine` when v is on its way.
+    Call `step` once per received y, and `refine` when v is on its way. Learning from y(k) comes
+    before v(k) only where the structure feeds y back; else v(k) need not wait for it.
     """
 
     def __init__(
@@ -68,6 +75,7 @@ class AdaptiveController:
         self.inverse, self.limits = inverse, limits
         self.lost_samples = 0
         self._interval: Interval | None = None
+        self._lesson: _Lesson | None = None
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
@@ -85,25 +93,34 @@ class AdaptiveController:
             )
         if lost < 0 or len(applied) not in (0, lost + 1):
             raise ValueError(f'lost={lost!r} must be >= 0 and applied have lost + 1 values')
-        estimator = self.estimator
-        interval = self._interval
-        if interval is not None:
-            for i in range(lost):
-                passed = interval._replace(v=applied[i]) if applied else interval
-                estimator.update(None, passed)
-            self.lost_samples += lost
-            estimator.update(y, interval._replace(v=applied[lost]) if applied else interval)
-        inverse = self.inverse
+        if self._lesson is not None:
+            self._learn()
+        if self._interval is not None:
+            self._lesson = _Lesson(y, self._interval, lost, applied)
+            if self.structure.needs_output:
+                self._learn()
+        estimate, inverse = self.estimator.estimate, self.inverse
         v_before = inverse.v
-        estimate = estimator.estimate
-        command = self.structure.control(Situation(y_m, y, estimate, estimator), inverse)
+        command = self.structure.control(Situation(y_m, y, estimate, self.estimator), inverse)
         v = self.limits.apply(command.v, v_before)
         inverse.applied(v)
         self._interval = Interval(v, y_m, command.u_d, command.f)
-        return ControlStep(
-            y_m, y, command.u_d, v, estimator.u_hat, estimator.innovation, estimate
-        )
+        return ControlStep(y_m, y, command.u_d, v, estimate)
 
     def refine(self) -> None:
-        """Do what the command did not have to wait for; optional, the next step makes up for it."""
+        """Do what the command did not have to wait for; the next step makes up for it if need be."""
+        if self._lesson is not None:
+            self._learn()
         self.estimator.refine()
+
+    def _learn(self) -> None:
+        lesson, self._lesson = self._lesson, None
+        assert lesson is not None
+        interval, applied = lesson.interval, lesson.applied
+        for i in range(lesson.lost):
+            passed = interval._replace(v=applied[i]) if applied else interval
+            self.estimator.update(None, passed)
+        self.lost_samples += lesson.lost
+        self.estimator.update(
+            lesson.y, interval._replace(v=applied[-1]) if applied else interval
+        )

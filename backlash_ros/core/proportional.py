@@ -27,6 +27,7 @@ class Proportional:
     """
 
     delay = 0
+    needs_output = False
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""

@@ -45,5 +45,9 @@ class Structure(Protocol):
     def delay(self) -> int:
         """Samples by which y is meant to follow y_m."""
 
+    @property
+    def needs_output(self) -> bool:
+        """Whether u_d(k) depends on y(k); else v(k) may leave before y(k) was learned from."""
+
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""

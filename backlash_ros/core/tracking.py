@@ -49,6 +49,8 @@ class Tracking:
     y is on it within the noise, v rests as well.
     """
 
+    needs_output = True
+
     def __init__(
         self, model: StateModel, gains: PreviewGains, careful: Array, caution: float,
         noise_std: float = 0.0, softer: Sequence[Array] = (),

@@ -38,6 +38,9 @@ DIAGNOSTICS_PERIOD_S = 1.0
 # A controller that was held up for a few samples still learns from them; after a longer stall it
 # goes on with the newest ones.
 KEPT_OUTPUTS = 10
+# After the command the controller gives way for this share of a period: a busy processor is where
+# the driver, woken by the command, would have to wait.
+GIVE_WAY = 0.05
 LOOK_S = 0.1  # between two looks for a silent plant_output
 # Gaps beyond this are not stepped over to the end: nothing is left to predict from them, and the
 # command must not wait for it.
@@ -69,7 +72,7 @@ class ControllerNode(ProcessNode):
     def __init__(self) -> None:
         super().__init__(CONTROLLER)
         p = self.settings
-        period = p.real('sample_period')
+        period = self._sample_period = p.real('sample_period')
         self._core = build_controller(p)
         for warning in warnings_of(p, with_reference=False):
             self.log.warning(warning)
@@ -186,11 +189,13 @@ class ControllerNode(ProcessNode):
         self._control.publish(self._message)
         now_ns = time.time_ns()
         self._commands.publish(step.v, now_ns)
+        if not self._lockstep:
+            time.sleep(GIVE_WAY * self._sample_period)
         latency = (now_ns - stamp_ns) * 1e-9
         statistics.used += 1
         statistics.latencies.append(latency)
-        self._publish_rows(step, latency)
         self._core.refine()
+        self._publish_rows(step, latency)
         changed = self._last is None or self._last.estimate.status != step.estimate.status
         self._last = step
         if changed or self._silent:
@@ -223,9 +228,10 @@ class ControllerNode(ProcessNode):
 
     def _publish_rows(self, step: ControlStep, latency: float) -> None:
         e, sample = step.estimate, float(self._counter.index)
+        estimator = self._core.estimator
         self._signals.publish((
-            step.y_m, step.y, step.u_d, step.v, step.u_hat, step.innovation, float(e.status),
-            sample, latency,
+            step.y_m, step.y, step.u_d, step.v, estimator.u_hat, estimator.innovation,
+            float(e.status), sample, latency,
         ))
         self._estimates.publish((
             e.m, e.c_r, e.c_l, e.f, e.std_m, e.std_c_r, e.std_c_l, nan, sample,
