@@ -41,7 +41,7 @@ CASE_ERROR, CASE_SHARE = 0.02, 0.99
 CASES = 500
 QUIET_EVERY = 4  # of the cases again with hardly any noise
 QUANTUM = 1e-3
-DRIFT_STD = (0.013, 0.013, 0.013)  # what m, c_r, c_l may move by in a second
+DRIFT_STD = (0.01, 0.01, 0.01)  # about 1 % of m in a second
 HOUR = 360_000  # samples at 100 Hz
 
 

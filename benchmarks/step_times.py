@@ -14,7 +14,7 @@ from reporting import Check
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimator import Status
-from backlash_ros.core.gap_bank import GapBank, Prior
+from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
 from backlash_ros.core.state_model import StateModel
@@ -215,7 +215,7 @@ def bank_timings() -> list[Timing]:
 def _bank_timer(parameters: Parameters, count: int, run: RunRecord) -> Timed:
     model = StateModel(build_model(parameters))
     prior = Prior(np.array([1.0, 1.0, -1.0]), 10.0)
-    bank = GapBank(np.geomspace(0.1, 6.0, count + 1)[1:], model, prior, NOISE**2)
+    bank = GapBank(np.geomspace(0.1, 6.0, count + 1)[1:], model, prior, Noise(NOISE))
     v, y = run.column('v').tolist(), run.column('y').tolist()
     k = 0
 

@@ -80,7 +80,7 @@ def test_quantised_output_still_gives_two_per_mille_after_one_second() -> None:
 @pytest.mark.parametrize('seed', [1, 2])
 def test_wear_and_a_step_of_a_crossing_are_followed(seed: int) -> None:
     result = run_wear(SeedJob(seed, changes={
-        'output_noise_std': 1e-3, 'estimator.drift_std': (0.013, 0.013, 0.013),
+        'output_noise_std': 1e-3, 'estimator.drift_std': (0.01, 0.01, 0.01),
     }))
     assert result.m <= 0.02
     assert max(result.c_r) <= 0.03

@@ -108,7 +108,7 @@ class AdaptiveController:
         return ControlStep(y_m, y, command.u_d, v, estimate)
 
     def refine(self) -> None:
-        """Do what the command did not have to wait for; the next step makes up for it if need be."""
+        """Do what the command did not have to wait for; if left out, the next step does it."""
         if self._lesson is not None:
             self._learn()
         self.estimator.refine()

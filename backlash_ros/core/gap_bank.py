@@ -32,6 +32,8 @@ SYMMETRISE_EVERY = 16
 CROSSING_REACH = 2.0  # standard deviation of a crossing before the first sample, in gaps
 STATE_REACH = 30.0  # standard deviation of x at the start, in terms of what was seen of y and v
 PRECISION = 1e-7  # least ratio of the deviations of the noise and of x at the start
+IMPLAUSIBLE = 1e4  # standard deviations of the prior that no theta is away from 0
+IMPOSSIBLE = -1e12  # log-likelihood of a hypothesis that is out
 ELECT_EVERY = 4  # corrections between two looks for the most likely hypothesis
 NIS_MEMORY = 1.0 / 40.0  # the mean of a true hypothesis is 1, its standard deviation then 0.16
 NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
@@ -99,6 +101,7 @@ class GapBank:
         diagonal = np.arange(n, n + 3)
         widest = np.where(gaps > 0.0, gaps, gaps.max())  # the null hypothesis may hold any u
         self.cov[:, diagonal, diagonal] = prior.variances(widest)
+        self._plausible = IMPLAUSIBLE * np.sqrt(prior.variances(widest).max(axis=1))
         self.log_likelihood = np.zeros(count)
         self.active = 0  # hypotheses [:active] have started
         self.since_motion = 0  # samples since u last moved under the leader
@@ -144,6 +147,9 @@ class GapBank:
         """
         rows = slice(self._first, self.active)
         gaps, theta, cov = self.gaps[rows], self.theta[rows], self.theta_cov[rows]
+        lost = ~(np.abs(theta).max(axis=1, initial=0.0) <= self._plausible[rows])
+        if lost.any():
+            self._give_up(np.flatnonzero(lost) + self._first)
         weights = np.empty((len(gaps), 3))
         weights[:, 0], weights[:, 1], weights[:, 2] = -gaps, 1.0, -1.0
         mismatch = (weights * theta).sum(axis=1)
@@ -159,6 +165,12 @@ class GapBank:
             self.doubt = (apart.T * (share / share.sum())) @ apart
         return float(score[leader])
 
+    def _give_up(self, rows: NDArray[np.intp]) -> None:
+        """Take hypotheses out that contradict the data so much that rounding has taken over."""
+        self.mean[rows], self.cov[rows] = 0.0, 0.0
+        self.mean[rows, self._n] = 1.0
+        self.log_likelihood[rows] = IMPOSSIBLE
+
     def found(self) -> Crossings | None:
         """Estimate of the leader, the doubt about the gap included; None unless m > 0."""
         return crossings_of(self.theta[self.leader], self.theta_cov[self.leader] + self.doubt)
@@ -172,7 +184,8 @@ class GapBank:
         part = copy.copy(self)
         rows = slice(first, last)
         for name in (
-            'gaps', 'mean', 'cov', 'log_likelihood', '_transition', '_reach', '_left', '_phi',
+            'gaps', 'mean', 'cov', 'log_likelihood', '_plausible', '_transition', '_reach',
+            '_left', '_phi',
         ):
             setattr(part, name, getattr(self, name)[rows].copy())
         part.active, part._first = last - first, 0
