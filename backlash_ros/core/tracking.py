@@ -33,6 +33,8 @@ WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is un
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.
 NOISE_BAND = 0.5
+# The same while the ideal trajectory, which has no noise, still goes on in the present direction.
+ONWARD_BAND = 4.0
 
 
 class Tracking:
@@ -62,6 +64,7 @@ class Tracking:
         self._x: Array = np.zeros(model.order)  # x* and q* of the trajectory
         self._q = 0.0
         self._integral = 0.0
+        self._ideal = 0.0  # u* of the sample before
         self._noise_std, self._reach, self._u_reach = noise_std, 0.0, 0.0
         self._soft = (gains.state, *softer)
         self._level = self._free = 0  # gain in use, samples since v last met a limit
@@ -87,7 +90,10 @@ class Tracking:
             inverse.widen_band(0.0)
         elif situation.x_cov is not None:
             variance = float(gains.state @ situation.x_cov @ gains.state)
-            inverse.widen_band(NOISE_BAND * sqrt(max(variance, 0.0)))
+            onward = (ideal - self._ideal) * inverse.side >= 0.0
+            band = ONWARD_BAND if onward else NOISE_BAND
+            inverse.widen_band(band * sqrt(max(variance, 0.0)))
+        self._ideal = ideal
         # A single move cannot start a limit cycle, and should leave as little drift as possible.
         caution = self._caution if self._resting is None else 0.0
         c_r, c_l = cautious_crossings(situation.estimate, caution)
