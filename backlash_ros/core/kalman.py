@@ -29,7 +29,7 @@ RESTART_AFTER = 150  # inconsistent samples after which a search begins afresh
 NO_DATA_AFTER = 20  # lost samples in a row that are worth a status
 UNDECIDED_AFTER = 100  # samples after which a search says that nothing usable comes out
 PRECISE_SLOPE, PRECISE_GAP = 0.2, 0.3  # relative deviations below which an estimate is published
-ADOPTED_SLOPE, ADOPTED_GAP = 0.01, 0.05  # those below which it replaces an older one at once
+ADOPTED_SLOPE, ADOPTED_GAP = 0.008, 0.05  # those below which it replaces an older one at once
 ADOPTED_AFTER = 300  # consistent samples after which it does so in any case
 
 
