@@ -1,0 +1,71 @@
+"""What the Kalman law makes of data that do not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.estimator import Status
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import RunRecord
+
+NOISE = 1e-3
+NAMES = ('m', 'c_r', 'c_l')
+
+
+def run(samples: int, fault: Callable[[int, float], float], **changes: float) -> RunRecord:
+    """The paper's example with noise, y as the sensor with this fault shows it."""
+    loop = build_closed_loop(Parameters({'output_noise_std': NOISE, **changes}))
+    measure = loop.plant.measure
+    loop.plant.measure = lambda: fault(loop.plant.sample, measure())  # type: ignore[method-assign]
+    return loop.run(samples)
+
+
+def errors(record: RunRecord, k: int) -> np.ndarray:
+    """Relative errors of m, c_r, c_l in row k."""
+    return np.array([
+        abs(record.column(name)[k] / record.column(f'true_{name}')[k] - 1.0) for name in NAMES
+    ])
+
+
+def test_one_wild_sample_moves_no_estimate_by_more_than_its_deviation() -> None:
+    record = run(320, lambda k, y: y + 100.0 * NOISE * (k == 300))
+    for name in NAMES:
+        moved = abs(record.column(name)[303] - record.column(name)[299])
+        assert moved <= record.column(f'std_{name}')[299]
+    assert record.column('status')[303] == Status.TRACKING
+
+
+def test_broken_sensor_freezes_the_estimates_and_says_so() -> None:
+    record = run(700, lambda k, y: -y if k >= 300 else y)
+    status = record.column('status')
+    assert np.all(status[330:] == Status.INCONSISTENT)
+    for name in NAMES:
+        assert np.ptp(record.column(name)[330:]) == 0.0
+    assert errors(record, -1).max() < 0.01
+
+
+def test_sensor_that_comes_back_ends_the_freeze() -> None:
+    record = run(900, lambda k, y: -y if 300 <= k < 500 else y)
+    assert record.column('status')[450] == Status.INCONSISTENT
+    assert record.column('status')[-1] == Status.TRACKING
+    assert errors(record, -1).max() < 0.01
+
+
+@pytest.mark.parametrize('disturbance', [2.0, -1.0])
+def test_constant_disturbance_is_cancelled_by_effective_crossings(disturbance: float) -> None:
+    record = run(500, lambda k, y: y, input_disturbance=disturbance)
+    shifted = record.column('true_c_r') - disturbance / 1.3
+    assert record.column('c_r')[-1] == pytest.approx(shifted[-1], rel=0.01)
+    e = record.column('u') + disturbance - record.column('u_d')
+    assert np.abs(e[300:]).max() < 0.05
+
+
+def test_plant_without_a_gap_is_recognised() -> None:
+    record = run(300, lambda k, y: y, **{'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9})
+    assert record.column('status')[-1] == Status.TRACKING
+    assert record.column('m')[-1] == pytest.approx(1.3, rel=0.01)
+    assert record.column('c_r')[-1] - record.column('c_l')[-1] < 0.05
