@@ -15,12 +15,9 @@ from __future__ import annotations
 
 from collections import deque
 
-import numpy as np
-from numpy.typing import NDArray
-
 from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
-from backlash_ros.core.history import History
 from backlash_ros.core.input_reconstruction import InputReconstruction
+from backlash_ros.core.lagged_law import LaggedLaw
 
 # A side is engaged when the reconstructed u moves on in one direction over this many samples to
 # either side, by more than so many standard deviations of its error: smoothing rounds the corners.
@@ -29,7 +26,7 @@ MOTION_THRESHOLD = 2.0
 LEAST_SHARE = 0.25  # of the mean motion of the stroke, below which the sample itself rests
 
 
-class NormalisedLms:
+class NormalisedLms(LaggedLaw):
     """LMS on (m, m c_r, m c_l) and f, fed with u reconstructed from y.
 
     step: 0 < step < 2. step_f: 0 keeps f. The side comes from the motion of u: it rises only on
@@ -40,37 +37,13 @@ class NormalisedLms:
         self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
         reconstruction: InputReconstruction, step: float = 1.0, step_f: float = 0.0,
     ) -> None:
+        super().__init__(reconstruction)
         self.estimate = initial
         self.step, self.step_f = step, step_f
         self._bounds, self._f_bounds = bounds, f_bounds
-        self._reconstruction = reconstruction
-        self._history = History(reconstruction.lag)
         self._threshold = MOTION_THRESHOLD * reconstruction.std
         self._past: deque[float] = deque([0.0, 0.0], maxlen=STROKE + 1)
         self._v_max = 0.0
-
-    @property
-    def u_hat(self) -> float:
-        """Reconstruction of u, `lag` samples old."""
-        return self._reconstruction.u_hat
-
-    @property
-    def x_hat(self) -> NDArray[np.float64]:
-        """State of G in the coordinates of StateModel, shape (n,)."""
-        return self._reconstruction.x_hat
-
-    @property
-    def x_cov(self) -> None:
-        """No covariance."""
-        return None
-
-    @property
-    def innovation(self) -> float:
-        """y(k) minus its prediction; nan where y(k) was lost."""
-        return self._reconstruction.innovation
-
-    def refine(self) -> None:
-        """Nothing is left to do after the command."""
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""

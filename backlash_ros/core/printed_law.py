@@ -12,12 +12,9 @@ from __future__ import annotations
 
 from math import isfinite, nan
 
-import numpy as np
-from numpy.typing import NDArray
-
 from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
-from backlash_ros.core.history import History
 from backlash_ros.core.input_reconstruction import InputReconstruction
+from backlash_ros.core.lagged_law import LaggedLaw
 
 
 def printed_f(u: float, y_m: float, m: float, w: float) -> float:
@@ -43,7 +40,7 @@ def printed_c(u: float, y_m: float, f: float, m: float) -> float:
     return numerator / denominator if denominator != 0.0 else nan
 
 
-class PrintedLaw:
+class PrintedLaw(LaggedLaw):
     """Equations (3.11), evaluated in the printed order with the newest values.
 
     u is reconstructed from y and therefore `lag` samples old; the law is evaluated for that time.
@@ -54,36 +51,12 @@ class PrintedLaw:
         self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
         reconstruction: InputReconstruction,
     ) -> None:
+        super().__init__(reconstruction)
         self.estimate = initial
         self.skipped = 0
         self._bounds, self._f_bounds = bounds, f_bounds
-        self._reconstruction = reconstruction
-        self._history = History(reconstruction.lag)
         self._upward = True
         self._u_before = 0.0
-
-    @property
-    def u_hat(self) -> float:
-        """Reconstruction of u, `lag` samples old."""
-        return self._reconstruction.u_hat
-
-    @property
-    def x_hat(self) -> NDArray[np.float64]:
-        """State of G in the coordinates of StateModel, shape (n,)."""
-        return self._reconstruction.x_hat
-
-    @property
-    def x_cov(self) -> None:
-        """No covariance."""
-        return None
-
-    @property
-    def innovation(self) -> float:
-        """y(k) minus its prediction; nan where y(k) was lost."""
-        return self._reconstruction.innovation
-
-    def refine(self) -> None:
-        """Nothing is left to do after the command."""
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and apply (3.11) to the sample that the reconstruction has reached."""
