@@ -46,10 +46,10 @@ def build_model(p: Parameters) -> TransferFunction:
     return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator') + delay)
 
 
-def build_controller(p: Parameters) -> AdaptiveController:
+def build_controller(p: Parameters, inherited: Estimate | None = None) -> AdaptiveController:
     """The controller with the law and the structure that the parameters name.
 
-    Raises ParameterError for parameters that contradict each other and for a G(z) through which
+    inherited: what was learned before; it takes the place of estimator.initial. Raises ParameterError for parameters that contradict each other and for a G(z) through which
     the backlash cannot be learned.
     """
     check_model(build_model(p))
@@ -59,9 +59,14 @@ def build_controller(p: Parameters) -> AdaptiveController:
         p.real('inverse.direction_band'), p.real('inverse.take_up_rate') * period
     )
     return AdaptiveController(
-        ESTIMATORS[p.word('estimator.law')](p), STRUCTURES[p.word('structure')](p), inverse,
-        build_limits(p),
+        ESTIMATORS[p.word('estimator.law')](p, inherited or _initial(p)), build_structure(p),
+        inverse, build_limits(p),
     )
+
+
+def build_structure(p: Parameters) -> Structure:
+    """The linear part alone."""
+    return STRUCTURES[p.word('structure')](p)
 
 
 def _check_first_guess(p: Parameters) -> None:
@@ -137,35 +142,35 @@ def _reconstruction(p: Parameters) -> InputReconstruction:
     return InputReconstruction(build_model(p), noise_std, p.integer('estimator.lag'))
 
 
-def _kalman(p: Parameters) -> Estimator:
+def _kalman(p: Parameters, initial: Estimate) -> Estimator:
     observer = None
     if p.word('structure') != 'proportional':
-        gapless = replace(_initial(p), c_r=0.0, c_l=0.0)
+        given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
         observer = FixedBacklash(
-            gapless, StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+            given, StateModel(build_model(p)), p.real('estimator.output_noise_std'),
             DOUBT_OF_FIRST_GUESS,
         )
     return KalmanEstimator(
-        _initial(p), _bounds(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+        initial, _bounds(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
         p.real('estimator.input_noise_std'), p.triple('estimator.drift_std'),
         p.real('sample_period'), observer,
     )
 
 
-def _lms(p: Parameters) -> Estimator:
+def _lms(p: Parameters, initial: Estimate) -> Estimator:
     return NormalisedLms(
-        _initial(p), _bounds(p), p.pair('proportional.bounds'), _reconstruction(p),
+        initial, _bounds(p), p.pair('proportional.bounds'), _reconstruction(p),
         p.real('lms.step'), p.real('lms.step_f'),
     )
 
 
-def _printed(p: Parameters) -> Estimator:
-    return PrintedLaw(_initial(p), _bounds(p), p.pair('proportional.bounds'), _reconstruction(p))
+def _printed(p: Parameters, initial: Estimate) -> Estimator:
+    return PrintedLaw(initial, _bounds(p), p.pair('proportional.bounds'), _reconstruction(p))
 
 
-def _fixed(p: Parameters) -> Estimator:
+def _fixed(p: Parameters, initial: Estimate) -> Estimator:
     return FixedBacklash(
-        _initial(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+        initial, StateModel(build_model(p)), p.real('estimator.output_noise_std'),
         p.real('fixed.doubt'),
     )
 
@@ -175,7 +180,7 @@ def law_fits(law: str, structure: str) -> bool:
     return law != 'gradient' or structure == 'pole_placement'
 
 
-def _gradient(p: Parameters) -> Estimator:
+def _gradient(p: Parameters, initial: Estimate) -> Estimator:
     structure = p.word('structure')
     if not law_fits('gradient', structure):
         raise ParameterError(
@@ -184,7 +189,7 @@ def _gradient(p: Parameters) -> Estimator:
         )
     blocks = _four_blocks(p)
     return GradientEstimator(
-        _initial(p), _bounds(p), blocks, build_model(p).order, p.real('gradient.step'),
+        initial, _bounds(p), blocks, build_model(p).order, p.real('gradient.step'),
         p.real('estimator.output_noise_std'),
     )
 
@@ -225,7 +230,7 @@ def _tracking(p: Parameters) -> Structure:
     )
 
 
-ESTIMATORS: dict[str, Callable[[Parameters], Estimator]] = {
+ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Estimator]] = {
     'kalman': _kalman, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
     'gradient': _gradient,
 }

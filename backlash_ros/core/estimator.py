@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import isnan
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -42,6 +43,11 @@ class Estimate:
     std_c_r: float = float('nan')
     std_c_l: float = float('nan')
     status: Status = Status.ACQUIRING
+
+    @property
+    def learned(self) -> bool:
+        """Whether it comes from data: a first guess has no deviations."""
+        return not isnan(self.std_m)
 
 
 @dataclass(frozen=True)
@@ -104,6 +110,9 @@ class Estimator(StateSource, Protocol):
     @property
     def estimate(self) -> Estimate:
         """Newest estimate; reading it changes nothing."""
+
+    adapting: bool
+    """Whether it learns; otherwise it goes on following the state of G alone."""
 
     @property
     def u_hat(self) -> float:

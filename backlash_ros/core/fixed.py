@@ -34,6 +34,7 @@ class FixedBacklash:
         self.estimate = replace(
             initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING
         )
+        self.adapting = False
         self.innovation = nan
         n = model.order
         # A gap of exactly 0 has c_l = c_r, which (2.1) does not know: then u = m (v - c).

@@ -44,16 +44,23 @@ class Prior:
     """What is believed of theta = (m, m c_r, m c_l) before the first sample.
 
     theta: shape (3,). slope_std: of m. Given g, neither crossing is further from 0 than g, which
-    bounds what is believed of the products.
+    bounds what is believed of the products. inherited: covariance of theta (3, 3) where it was
+    learned before; it replaces both.
     """
 
     theta: Array
     slope_std: float
+    inherited: Array | None = None
 
-    def variances(self, gaps: Array) -> Array:
-        """Variances of theta per hypothesis, shape (H, 3)."""
+    def covariances(self, gaps: Array) -> Array:
+        """Covariance of theta per hypothesis, shape (H, 3, 3)."""
+        if self.inherited is not None:
+            return np.tile(self.inherited, (len(gaps), 1, 1))
         product = (CROSSING_REACH * self.slope_std * gaps) ** 2
-        return np.stack([np.full(len(gaps), self.slope_std**2), product, product], axis=1)
+        covariances = np.zeros((len(gaps), 3, 3))
+        covariances[:, 0, 0] = self.slope_std**2
+        covariances[:, 1, 1] = covariances[:, 2, 2] = product
+        return covariances
 
 
 @dataclass(frozen=True)
@@ -88,20 +95,17 @@ class GapBank:
             gaps = np.concatenate([[0.0], gaps])
         n, count = model.order, len(gaps)
         self.gaps = gaps.copy()
-        self.noise_var, self.tolerance = noise.output_std**2, tolerance
-        self._process_var: Array | None = None
-        if noise.input_std > 0.0 or noise.drift_var is not None:
-            self._process_var = np.zeros((n + 3, n + 3))
-            self._process_var[:n, :n] = noise.input_std**2 * np.outer(model.b, model.b)
-            if noise.drift_var is not None:
-                self._process_var[n:, n:] = noise.drift_var
+        self._model, self._n, self._first = model, n, 1 if with_null else 0
+        self.tolerance = tolerance
+        self._least_noise_var = 0.0
+        self.set_noise(noise)
         self.mean = np.zeros((count, n + 3))
         self.mean[:, n:] = prior.theta
         self.cov = np.zeros((count, n + 3, n + 3))
-        diagonal = np.arange(n, n + 3)
         widest = np.where(gaps > 0.0, gaps, gaps.max())  # the null hypothesis may hold any u
-        self.cov[:, diagonal, diagonal] = prior.variances(widest)
-        self._plausible = IMPLAUSIBLE * np.sqrt(prior.variances(widest).max(axis=1))
+        believed = prior.covariances(widest)
+        self.cov[:, n:, n:] = believed
+        self._plausible = IMPLAUSIBLE * np.sqrt(believed.diagonal(axis1=1, axis2=2).max(axis=1))
         self.log_likelihood = np.zeros(count)
         self.active = 0  # hypotheses [:active] have started
         self.since_motion = 0  # samples since u last moved under the leader
@@ -111,7 +115,6 @@ class GapBank:
         self.innovation = nan  # of the leader
         self.innovation_var = self.noise_var
         self.nis = 1.0  # running mean of the leader's normalised innovation squared
-        self._model, self._n, self._first = model, n, 1 if with_null else 0
         self._transition = np.tile(np.eye(n + 3), (count, 1, 1))
         self._transition[:, :n, :n] = model.a
         self._reach = np.zeros(count)  # q of the play operator: clamped between v and v + g
@@ -122,6 +125,17 @@ class GapBank:
         self._y_low, self._y_high, self._y = inf, -inf, 0.0  # swing of y so far, newest y
         self._kick = float(np.linalg.norm(model.b)) * float(prior.theta[0])
         self._corrections = 0
+
+    def set_noise(self, noise: Noise) -> None:
+        """Expect this noise from now on."""
+        n, b = self._n, self._model.b
+        self.noise_var = max(noise.output_std**2, self._least_noise_var)
+        self._process_var: Array | None = None
+        if noise.input_std > 0.0 or noise.drift_var is not None:
+            self._process_var = np.zeros((n + 3, n + 3))
+            self._process_var[:n, :n] = noise.input_std**2 * np.outer(b, b)
+            if noise.drift_var is not None:
+                self._process_var[n:, n:] = noise.drift_var
 
     @property
     def swing(self) -> float:
@@ -228,7 +242,8 @@ class GapBank:
         swing = max(self._y_high - self._y_low, 0.0)
         std = STATE_REACH * (swing + self._kick * largest + sqrt(self.noise_var))
         # Covariances of doubles do not span more orders of magnitude than this.
-        self.noise_var = max(self.noise_var, (PRECISION * std) ** 2)
+        self._least_noise_var = (PRECISION * std) ** 2
+        self.noise_var = max(self.noise_var, self._least_noise_var)
         self.mean[new, :n] = self._model.equilibrium * self._y
         diagonal = np.arange(n)
         self.cov[new, diagonal, diagonal] = std**2

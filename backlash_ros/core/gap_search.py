@@ -10,7 +10,7 @@ so that noise-free data lead to the exact parameters and not to a residue of the
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil, inf, isnan, log, nan
+from math import ceil, hypot, inf, isnan, log, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +51,8 @@ NIS_SETTLED = 1.6  # normalised innovation squared of a fine bank that may be tr
 # Without noise the filter still needs some, this far below what one sample of u does to x.
 NOISE_FLOOR = 1e-6
 SLOPE_REACH = 30.0  # standard deviation of the slope before the first sample, in first guesses
+# Share of the slope and of the gap that may have changed while nobody looked.
+CHANGED_MEANWHILE = 0.01
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,13 @@ class SearchSettings:
 class GapSearch:
     """Finds and refines the gap from (y, v), sample by sample."""
 
-    def __init__(self, settings: SearchSettings) -> None:
+    def __init__(self, settings: SearchSettings, inherited: Estimate | None = None) -> None:
+        """inherited: what was learned before; it is believed until the data contradict it."""
         self.fine: GapBank | None = None
         self.coarse: GapBank | None = None
         self.samples = 0
         self._settings = settings
+        self._inherited = None if inherited is None else _aged(inherited)
         self._y, self._v = np.empty(CAPACITY), np.empty(CAPACITY)
         self._replay: GapBank | None = None
         self._replayed = 0
@@ -141,9 +145,16 @@ class GapSearch:
         widest = bounds.c_r[1] - bounds.c_l[0]
         steps = ceil(-log(SMALLEST_GAP) / log(GRID_RATIO))
         grid = widest * SMALLEST_GAP ** np.linspace(1.0, 0.0, steps + 1)
-        self.coarse = self._bank(np.asarray(grid, dtype=np.float64), with_null=True)
+        banks = [self._bank(np.asarray(grid, dtype=np.float64), with_null=True)]
+        self.coarse = banks[0]
+        if self._inherited is not None:
+            self._read_with = fine_gaps(self._inherited, FINE)
+            self.fine = self._bank(self._read_with, with_null=False, at=self._inherited)
+            self._fine_since = count
+            banks.append(self.fine)
         for y, v in zip(self._y[:count], self._v[:count], strict=True):
-            _advance(self.coarse, y, v)
+            for bank in banks:
+                _advance(bank, y, v)
 
     def _step_coarse(self, y: float, v: float) -> None:
         coarse = self.coarse
@@ -168,7 +179,7 @@ class GapSearch:
     def _behind(self, fine: GapBank) -> bool:
         """Whether the coarse bank explains the data better than the fine one."""
         coarse = self.coarse
-        if self._settled or coarse is None:
+        if self._settled or coarse is None or not fine.active:
             return False
         return coarse.elect() - fine.elect() > COARSE_MARGIN
 
@@ -179,10 +190,13 @@ class GapSearch:
         if self.fine is not None and self.samples >= LAST_REPLAY:
             return
         bank, read_with = self.fine, self._read_with
+        if bank is not None and not bank.active:
+            return
         if bank is None or self._behind(bank):
             bank = self.coarse
             assert bank is not None
             read_with = bank.gaps
+            self._inherited = None
         bank.elect()
         best = bank.leader
         self._earliest = self.samples + PAUSE
@@ -225,17 +239,42 @@ class GapSearch:
         self.fine, self._read_with = replay, replay.gaps
 
     def _bank(self, gaps: Array, with_null: bool, at: Crossings | None = None) -> GapBank:
-        s = self._settings
-        i, b = s.initial, s.bounds
+        s, known = self._settings, None if with_null else self._inherited
+        i = known or s.initial
         prior = Prior(
-            np.array([i.m, i.m * i.c_r, i.m * i.c_l]), min(SLOPE_REACH * i.m, b.m[1])
-        )
-        noise = Noise(
-            max(s.noise_std, self._noise_floor), s.input_noise_std,
-            drift_in_products(at or i, s.drift_std) if any(s.drift_std) else None,
+            np.array([i.m, i.m * i.c_r, i.m * i.c_l]),
+            min(SLOPE_REACH * i.m, s.bounds.m[1]),
+            None if known is None else covariance_of_products(
+                known, (known.std_m, known.std_c_r, known.std_c_l)
+            ),
         )
         tolerance = COARSE_TOLERANCE if with_null else FINE_TOLERANCE
-        return GapBank(gaps, s.model, prior, noise, tolerance, with_null)
+        return GapBank(gaps, s.model, prior, self._noise(at or i), tolerance, with_null)
+
+    def set_noise(self, settings: SearchSettings) -> None:
+        """Expect the noise of these settings from now on; whatever was learned stays."""
+        self._settings = settings
+        for bank in (self.coarse, self.fine, self._replay):
+            if bank is not None:
+                bank.set_noise(self._noise(bank.found() or settings.initial))
+
+    def _noise(self, at: Estimate | Crossings) -> Noise:
+        s = self._settings
+        return Noise(
+            max(s.noise_std, self._noise_floor), s.input_noise_std,
+            covariance_of_products(at, s.drift_std) if any(s.drift_std) else None,
+        )
+
+
+def _aged(estimate: Estimate) -> Crossings:
+    """An estimate from before, with the deviations that it may be trusted for today."""
+    least = CHANGED_MEANWHILE * (estimate.c_r - estimate.c_l)
+    std_c_r, std_c_l = max(estimate.std_c_r, least), max(estimate.std_c_l, least)
+    return Crossings(
+        estimate.m, estimate.c_r, estimate.c_l,
+        max(estimate.std_m, CHANGED_MEANWHILE * estimate.m), std_c_r, std_c_l,
+        hypot(std_c_r, std_c_l),
+    )
 
 
 def _advance(bank: GapBank, y: float, v: float) -> None:
@@ -261,7 +300,7 @@ def fine_gaps(found: Crossings, count: int) -> Array:
     return np.asarray(np.maximum(gap + spread * np.linspace(-1.0, 1.0, count), least))
 
 
-def drift_in_products(at: Estimate | Crossings, std: tuple[float, float, float]) -> Array:
-    """Covariance (3, 3) that one sample of drift of (m, c_r, c_l) adds to theta."""
+def covariance_of_products(at: Estimate | Crossings, std: tuple[float, float, float]) -> Array:
+    """Covariance (3, 3) of theta that follows from deviations of m, c_r, c_l, independent."""
     jacobian = np.array([[1.0, 0.0, 0.0], [at.c_r, at.m, 0.0], [at.c_l, 0.0, at.m]])
     return np.asarray(jacobian @ np.diag(np.square(std)) @ jacobian.T)

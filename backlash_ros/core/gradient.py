@@ -51,6 +51,7 @@ class GradientEstimator:
     ) -> None:
         self.estimate = initial
         self.step = step
+        self.adapting = True
         self.innovation = nan
         self.u_hat = 0.0
         self.x_hat: Array = np.zeros(order)
@@ -88,7 +89,7 @@ class GradientEstimator:
         self._size += share * (size - self._size)
         norm = size + max(FLOOR * self._size, self._noise_square / self._u_square)
         norm += xi**2 / self._u_square
-        if norm == 0.0:
+        if norm == 0.0 or not self.adapting:
             return
         theta = theta + (self.step * eps / norm) * scaled
         low, high = self._bounds.m

@@ -37,8 +37,9 @@ class KalmanEstimator:
     """Learns (m, c_r, c_l) from y alone with a bank of Kalman filters over the gap width.
 
     noise_std, input_noise_std: standard deviations of white noise on y and on u. drift_std: random
-    walk of m, c_r, c_l per square root of a second. Nothing else needs tuning. observer: gives the
-    state of G until the bank can, for structures that want it.
+    walk of m, c_r, c_l per square root of a second. Nothing else needs tuning. initial: a first
+    guess, or with its deviations what was learned before. observer: gives the state of G until
+    the bank can, for structures that want it.
     """
 
     def __init__(
@@ -46,18 +47,20 @@ class KalmanEstimator:
         input_noise_std: float, drift_std: tuple[float, float, float], sample_period: float,
         observer: FixedBacklash | None = None,
     ) -> None:
-        self.estimate = initial
+        self.estimate = replace(initial, status=Status.ACQUIRING)
+        self.adapting = True
         self.outliers = 0
-        root = sample_period**0.5
-        drift = (drift_std[0] * root, drift_std[1] * root, drift_std[2] * root)
+        self._sample_period = sample_period
         self._settings = SearchSettings(
-            model, bounds, initial, noise_std, input_noise_std, drift
+            model, bounds, initial, noise_std, input_noise_std, self._per_sample(drift_std)
         )
         self._bounds = bounds
         self._observer, self._no_state = observer, np.zeros(model.order)
-        self._search = self._new_search()
+        self._inherited = initial if initial.learned else None
+        self._search = self._new_search(self._inherited)
         self._challenger: _Watched | None = None
-        self._known = False  # an estimate was published
+        self._known = initial.learned  # the estimate comes from data
+        self._confirmed = 0  # samples since these data first gave an estimate
         self._in_vain = Status.ACQUIRING  # why the last first search ended without an estimate
         self._lost_in_a_row = 0
 
@@ -83,7 +86,9 @@ class KalmanEstimator:
 
     @property
     def _trusted(self) -> GapBank | None:
-        known = self._known and not self._search.contradicted
+        # A bank that was there before the data has to find the state of G first.
+        unsure = 2 * self._settings.model.order if self._inherited is not None else 0
+        known = self._confirmed > unsure and not self._search.contradicted
         return self._search.search.fine if known else None
 
     @property
@@ -98,15 +103,33 @@ class KalmanEstimator:
         watched = self._search
         if self._observer is not None:
             self._observer.update(y, interval)
-        if not watched.add(y, interval.v):
+        if not watched.add(y, interval.v, self.adapting):
             self.outliers += 1
-        if not self._known:
+        if not self.adapting:
+            self._challenger = None
+        elif not self._confirmed:
             self._restart_in_vain(watched)
         elif watched.contradicted:
             self._challenge(y, interval.v)
         else:
             self._challenger = None
         self._publish()
+
+    def set_noise(
+        self, noise_std: float, input_noise_std: float, drift_std: tuple[float, float, float],
+    ) -> None:
+        """Expect this noise from now on; whatever was learned stays."""
+        self._settings = replace(
+            self._settings, noise_std=noise_std, input_noise_std=input_noise_std,
+            drift_std=self._per_sample(drift_std),
+        )
+        for watched in (self._search, self._challenger):
+            if watched is not None:
+                watched.search.set_noise(self._settings)
+
+    def _per_sample(self, std: tuple[float, float, float]) -> tuple[float, float, float]:
+        root = self._sample_period**0.5
+        return std[0] * root, std[1] * root, std[2] * root
 
     def refine(self) -> None:
         """Search on: read the record again, compare all gaps."""
@@ -122,17 +145,17 @@ class KalmanEstimator:
             self._in_vain = Status.NOT_EXCITED
         else:
             return
-        self._search = self._new_search()
+        self._search = self._new_search(self._inherited)
 
-    def _new_search(self) -> _Watched:
-        return _Watched(GapSearch(self._settings))
+    def _new_search(self, inherited: Estimate | None = None) -> _Watched:
+        return _Watched(GapSearch(self._settings, inherited))
 
     def _challenge(self, y: float | None, v: float) -> None:
         """Search afresh beside an estimate that the data contradict."""
         challenger = self._challenger
         if challenger is None or challenger.inconsistent_for >= RESTART_AFTER:
             challenger = self._challenger = self._new_search()
-        challenger.add(y, v)
+        challenger.add(y, v, adapting=True)
         found = self._usable(challenger) if challenger.consistent_for >= PROVEN else None
         if found is None:
             return
@@ -164,12 +187,13 @@ class KalmanEstimator:
         status = self._status()
         # A first estimate may come out of an inconsistent start, a later one has to be consistent.
         frozen = status.frozen and (self._known or status != Status.INCONSISTENT)
-        found = None if frozen else self._usable(self._search)
+        found = None if frozen or not self.adapting else self._usable(self._search)
         if found is None:
             if self.estimate.status != status:
                 self.estimate = replace(self.estimate, status=status)
             return
         self._known = True
+        self._confirmed += 1
         m, c_r, c_l = self._bounds.project(found.m, found.c_r, found.c_l)
         self.estimate = Estimate(
             m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
@@ -191,7 +215,7 @@ class KalmanEstimator:
             return Status.NOT_EXCITED
         if watched.outside_for >= UNDECIDED_AFTER:
             return Status.INCONSISTENT
-        return Status.TRACKING if self._known else self._in_vain
+        return Status.TRACKING if self._confirmed else self._in_vain
 
 
 class _Watched:
@@ -216,7 +240,7 @@ class _Watched:
             return None
         return fine.found()
 
-    def add(self, y: float | None, v: float) -> bool:
+    def add(self, y: float | None, v: float, adapting: bool) -> bool:
         """Take in a sample; return False if y was refused as an outlier."""
         self.refine()
         search = self.search
@@ -224,14 +248,15 @@ class _Watched:
         if fine is not None:
             fine.predict(v)
             if y is not None:
-                learn = fine.since_motion <= search.memory and not self.contradicted
+                learn = fine.since_motion <= search.memory and not self.contradicted and adapting
                 accepted = fine.correct(y, GATE if self._proven else inf, learn)
                 self._judge(fine, accepted)
-            if search.settled and fine.turned:
+            if search.settled and fine.turned and adapting:
                 self._follow(fine)
         elif search.coarse is not None:
             self._count(search.coarse.nis < NIS_TRUSTED)
-        self._waiting = (y, v, accepted)
+        if adapting:
+            self._waiting = (y, v, accepted)
         return accepted
 
     def refine(self) -> None:

@@ -13,6 +13,7 @@ class LaggedLaw:
     """Reconstruction of u, and what was applied when it acted."""
 
     def __init__(self, reconstruction: InputReconstruction) -> None:
+        self.adapting = True
         self._reconstruction = reconstruction
         self._history = History(reconstruction.lag)
 

@@ -51,7 +51,7 @@ class NormalisedLms(LaggedLaw):
         u = reconstruction.update(y)
         self._past.append(u)
         past = self._history.push(interval)
-        if past is None or not reconstruction.ready:
+        if past is None or not (reconstruction.ready and self.adapting):
             return
         ahead = reconstruction.newer(STROKE) - u
         behind = u - self._past[0]

@@ -62,7 +62,7 @@ class PrintedLaw(LaggedLaw):
         """Take in y(k) and apply (3.11) to the sample that the reconstruction has reached."""
         u = self._reconstruction.update(y)
         past = self._history.push(interval)
-        if past is None or not self._reconstruction.ready:
+        if past is None or not (self._reconstruction.ready and self.adapting):
             return
         old = self.estimate
         # w is c_r in the upward region, c_l in the downward one, and kept in the gap.

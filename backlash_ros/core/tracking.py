@@ -72,12 +72,13 @@ class Tracking:
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
+        first = not self._window
         self._take_in(situation)
         gains = self._gains
         window = np.fromiter(self._window, np.float64, self.delay + 1)
         ideal = -float(gains.state @ self._x) - gains.integral * self._q
         ideal -= float(gains.preview @ window)
-        deviation = situation.x_hat - self._x
+        deviation = np.zeros(len(self._x)) if first else situation.x_hat - self._x
         trusted = _trusted(situation.estimate)
         if trusted:
             u_d = ideal - float(self._gain(inverse.limited) @ deviation)
@@ -107,7 +108,8 @@ class Tracking:
             # What may be noise is no distance to go: a loop at rest stays at rest.
             near = abs(start - situation.y_m) <= noise
             self._window.extend([situation.y_m if near else start] * (self.delay + 1))
-            self._x = situation.x_hat.copy()
+            # No v has acted yet, so nobody knows the state better than rest at y.
+            self._x = self._model.equilibrium * self._window[0]
         self._window.append(situation.y_m)
 
     def _gain(self, limited: bool) -> Array:
@@ -168,7 +170,8 @@ class Tracking:
 
 
 def _trusted(estimate: Estimate) -> bool:
-    return not isnan(estimate.std_m) and estimate.status != Status.INCONSISTENT
+    # What was learned before a restart says nothing yet about the state of G.
+    return estimate.learned and estimate.status not in (Status.ACQUIRING, Status.INCONSISTENT)
 
 
 def cautious_crossings(estimate: Estimate, deviations: float) -> tuple[float, float]:
