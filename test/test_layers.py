@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = 'backlash_ros'
-SHARED = {PACKAGE, f'{PACKAGE}.topics'}
+SHARED = {PACKAGE, f'{PACKAGE}.topics', f'{PACKAGE}.files'}
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
 ROS_PREFIXES = ('rclpy', 'rosidl', 'launch')
@@ -50,7 +50,8 @@ def is_allowed(module: str, imported: str) -> bool:
     """Return whether the layers let `module` import `imported`."""
     top = imported.split('.')[0]
     if within(module, 'core'):
-        return top in sys.stdlib_module_names | NUMERIC or within(imported, 'core')
+        known = top in sys.stdlib_module_names | NUMERIC or within(imported, 'core')
+        return known or imported == f'{PACKAGE}.files'
     if within(module, 'nodes'):
         return not within(imported, 'tools')
     if within(module, 'tools'):

@@ -14,7 +14,7 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimator import Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.controller import STATES
+from backlash_ros.nodes.diagnosis import STATES
 
 
 class Driver:

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.nodes.command_history import CommandHistory
-from backlash_ros.nodes.sample_counter import SampleCounter
+from backlash_ros.nodes.sample_counter import Arrival, SampleCounter
 
 PERIOD_S, PERIOD_NS = 0.01, 10_000_000
 START_NS = 1_800_000_000_000_000_000
@@ -29,7 +29,7 @@ def stamps_of(gaps: list[int], delays: list[float]) -> list[int]:
 @given(gaps, delays)
 def test_time_stamps_alone_tell_every_missing_sample(gaps: list[int], delays: list[float]) -> None:
     counter = SampleCounter(PERIOD_S)
-    counted = [counter.count(stamp) for stamp in stamps_of(gaps, delays)]
+    counted = [counter.count(stamp).missing for stamp in stamps_of(gaps, delays)]
     assert counted == [0, *gaps]
     assert counter.index == sum(gaps) + len(gaps)
 
@@ -40,16 +40,16 @@ def test_outputs_never_published_show_in_time_though_the_numbers_have_no_gap(
 ) -> None:
     counter = SampleCounter(PERIOD_S)
     stamps = stamps_of(gaps, delays)
-    assert [counter.count(stamp, 1 + i) for i, stamp in enumerate(stamps)] == [0, *gaps]
+    assert [counter.count(stamp, 1 + i).missing for i, stamp in enumerate(stamps)] == [0, *gaps]
 
 
 @given(gaps)
 def test_a_gap_in_the_numbers_counts_though_messages_come_in_a_burst(gaps: list[int]) -> None:
     counter = SampleCounter(PERIOD_S)
-    sequence, counted = 7, [counter.count(START_NS, 7)]
+    sequence, counted = 7, [counter.count(START_NS, 7).missing]
     for gap in gaps:
         sequence += 1 + gap
-        counted.append(counter.count(START_NS, sequence))
+        counted.append(counter.count(START_NS, sequence).missing)
     assert counted == [0, *gaps]
     assert counter.index == sequence - 1
 
@@ -58,20 +58,20 @@ def test_a_gap_in_the_numbers_counts_though_messages_come_in_a_burst(gaps: list[
 def test_jitter_below_a_period_is_no_loss(delays: list[float]) -> None:
     counter = SampleCounter(PERIOD_S)
     stamps = [START_NS + int((k + delay) * PERIOD_NS) for k, delay in enumerate(delays)]
-    assert sum(counter.count(stamp) for stamp in stamps) == 0
+    assert sum(counter.count(stamp).missing for stamp in stamps) == 0
 
 
 @given(st.floats(0.995, 1.005))
 def test_a_sender_with_a_slightly_wrong_clock_loses_nothing(ratio: float) -> None:
     counter = SampleCounter(PERIOD_S)
     stamps = [START_NS + int(k * PERIOD_NS * ratio) for k in range(1000)]
-    assert sum(counter.count(stamp, 1 + k) for k, stamp in enumerate(stamps)) == 0
+    assert sum(counter.count(stamp, 1 + k).missing for k, stamp in enumerate(stamps)) == 0
 
 
 def test_a_sender_that_was_started_anew_is_counted_by_time() -> None:
     counter = SampleCounter(PERIOD_S)
     counter.count(START_NS, 500)
-    assert counter.count(START_NS + 5 * PERIOD_NS, 1) == 4
+    assert counter.count(START_NS + 5 * PERIOD_NS, 1) == Arrival(True, 4, anew=True)
 
 
 def test_a_command_in_time_needs_no_correction() -> None:

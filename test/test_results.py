@@ -13,9 +13,9 @@ import pytest
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.files import write_atomically
 from backlash_ros.tools import results
 from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.files import write_atomically
 
 FIELDS = [
     'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'final', 'final_std',

@@ -17,6 +17,7 @@ from backlash_ros.core.gradient import GradientEstimator
 from backlash_ros.core.input_reconstruction import InputReconstruction
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.kalman import KalmanEstimator
+from backlash_ros.core.last_command import check_last_commands
 from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.lq_preview import preview_gains
 from backlash_ros.core.model_check import check_model, model_warnings
@@ -49,11 +50,13 @@ def build_model(p: Parameters) -> TransferFunction:
 def build_controller(p: Parameters, inherited: Estimate | None = None) -> AdaptiveController:
     """The controller with the law and the structure that the parameters name.
 
-    inherited: what was learned before; it takes the place of estimator.initial. Raises ParameterError for parameters that contradict each other and for a G(z) through which
-    the backlash cannot be learned.
+    inherited: what was learned before; it takes the place of estimator.initial. Raises
+    ParameterError for parameters that contradict each other and for a G(z) through which the
+    backlash cannot be learned.
     """
     check_model(build_model(p))
     _check_first_guess(p)
+    check_last_commands(p)
     period = p.real('sample_period')
     inverse = BacklashInverse(
         p.real('inverse.direction_band'), p.real('inverse.take_up_rate') * period

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from typing import NamedTuple
 
@@ -33,6 +33,11 @@ class Limits:
             raise ParameterError(
                 'control.min', self.low, f'must be < control.max={self.high!r}'
             )
+
+    @property
+    def zero(self) -> float:
+        """The v nearest to 0 within the bounds."""
+        return min(max(0.0, self.low), self.high)
 
     def apply(self, v: float, v_before: float) -> float:
         """v within the bounds and not too far from v_before."""
@@ -65,6 +70,8 @@ class AdaptiveController:
 
     Call `step` once per received y, and `refine` when v is on its way. Learning from y(k) comes
     before v(k) only where the structure feeds y back; else v(k) need not wait for it.
+
+    compensating: False inverts the slope alone, as if there were no gap.
     """
 
     def __init__(
@@ -73,6 +80,7 @@ class AdaptiveController:
     ) -> None:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
+        self.compensating = True
         self.lost_samples = 0
         self._interval: Interval | None = None
         self._lesson: _Lesson | None = None
@@ -101,11 +109,16 @@ class AdaptiveController:
                 self._learn()
         estimate, inverse = self.estimator.estimate, self.inverse
         v_before = inverse.v
-        command = self.structure.control(Situation(y_m, y, estimate, self.estimator), inverse)
+        used = estimate if self.compensating else replace(estimate, c_r=0.0, c_l=0.0)
+        command = self.structure.control(Situation(y_m, y, used, self.estimator), inverse)
         v = self.limits.apply(command.v, v_before)
         inverse.applied(v)
         self._interval = Interval(v, y_m, command.u_d, command.f)
         return ControlStep(y_m, y, command.u_d, v, estimate)
+
+    def start_from(self, v: float) -> None:
+        """Say which v acts now, so that the first command goes on from there."""
+        self.inverse.start_from(v)
 
     def refine(self) -> None:
         """Do what the command did not have to wait for; if left out, the next step does it."""

@@ -116,6 +116,10 @@ class GapSearch:
         likelihood = coarse.log_likelihood
         return bool(likelihood[coarse.leader] - likelihood[0] > NULL_MARGIN)
 
+    def forget_record(self) -> None:
+        """Go on with what the banks know; nothing is read again."""
+        self.samples, self._replay = max(self.samples, CAPACITY), None
+
     def add(self, y: float | None, v: float, accepted: bool = True) -> None:
         """Take in a sample; y is None if it was lost, not accepted if it is an outlier."""
         value = nan if y is None or not accepted else y

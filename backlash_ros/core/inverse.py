@@ -33,6 +33,10 @@ class BacklashInverse:
         self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
         self.taking_up = False  # whether v is still on its way to the line
 
+    def set_band(self, band: float) -> None:
+        """Use this band, and none narrower from now on."""
+        self.direction_band = self._least_band = band
+
     def widen_band(self, band: float) -> None:
         """Use this band while it is wider than the one set: the noise of u_d may vary."""
         self.direction_band = max(self._least_band, band)
@@ -71,6 +75,10 @@ class BacklashInverse:
         if self.direction_band == 0.0:
             self.extreme = u_d
         return self.v
+
+    def start_from(self, v: float) -> None:
+        """Say which v acts before the first step."""
+        self.v = v
 
     def applied(self, v: float) -> None:
         """Say which v was really applied (limits), so that the next move starts from there."""

@@ -48,7 +48,7 @@ class KalmanEstimator:
         observer: FixedBacklash | None = None,
     ) -> None:
         self.estimate = replace(initial, status=Status.ACQUIRING)
-        self.adapting = True
+        self._adapting = True
         self.outliers = 0
         self._sample_period = sample_period
         self._settings = SearchSettings(
@@ -103,9 +103,9 @@ class KalmanEstimator:
         watched = self._search
         if self._observer is not None:
             self._observer.update(y, interval)
-        if not watched.add(y, interval.v, self.adapting):
+        if not watched.add(y, interval.v, self._adapting):
             self.outliers += 1
-        if not self.adapting:
+        if not self._adapting:
             self._challenger = None
         elif not self._confirmed:
             self._restart_in_vain(watched)
@@ -114,6 +114,21 @@ class KalmanEstimator:
         else:
             self._challenger = None
         self._publish()
+
+    @property
+    def adapting(self) -> bool:
+        """Whether it learns; otherwise it goes on following the state of G alone."""
+        return self._adapting
+
+    @adapting.setter
+    def adapting(self, adapting: bool) -> None:
+        if adapting and not self._adapting:
+            # The record has a hole now: it cannot be read again.
+            if self._search.search.settled:
+                self._search.search.forget_record()
+            else:
+                self._search = self._new_search(self.estimate if self._known else None)
+        self._adapting = adapting
 
     def set_noise(
         self, noise_std: float, input_noise_std: float, drift_std: tuple[float, float, float],
@@ -187,7 +202,7 @@ class KalmanEstimator:
         status = self._status()
         # A first estimate may come out of an inconsistent start, a later one has to be consistent.
         frozen = status.frozen and (self._known or status != Status.INCONSISTENT)
-        found = None if frozen or not self.adapting else self._usable(self._search)
+        found = None if frozen or not self._adapting else self._usable(self._search)
         if found is None:
             if self.estimate.status != status:
                 self.estimate = replace(self.estimate, status=status)

@@ -70,6 +70,14 @@ class Tracking:
         self._level = self._free = 0  # gain in use, samples since v last met a limit
         self._resting: float | None = 0.0  # u* at which v rests, None while it moves
 
+    def go_on_from(self, other: Tracking) -> None:
+        """Take over the trajectory of a structure with the same model and preview."""
+        self._window, self._x, self._q = other._window, other._x, other._q
+        self._integral, self._ideal = other._integral, other._ideal
+        self._reach, self._u_reach = other._reach, other._u_reach
+        self._level, self._free = other._level, other._free
+        self._resting = other._resting
+
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
         first = not self._window

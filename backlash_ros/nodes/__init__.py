@@ -1,1 +1,18 @@
-"""ROS 2 nodes: each converts messages, calls the core and publishes."""
+"""ROS 2 nodes. Importing them takes a while, in which a signal has to end the process as well."""
+
+import os
+import signal
+import sys
+from types import FrameType
+
+EXECUTABLES = ('controller', 'plant', 'reference', 'recorder')
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    os._exit(0)
+
+
+# With -m, sys.argv[0] is '-m' until the module is found; else it is the installed script.
+if sys.argv and (sys.argv[0] == '-m' or os.path.basename(sys.argv[0]) in EXECUTABLES):
+    for _number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(_number, _end)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from math import nan
 
 # Commands that may be under way: more than a stall of the controller can leave behind.
 REMEMBERED = 256
@@ -46,6 +47,10 @@ class CommandHistory:
     def begin(self, end_ns: int) -> None:
         """Note the first output: reports up to here belong to nothing."""
         self._output_ns = end_ns
+
+    def newest_report(self) -> float:
+        """The newest reported v, nan before the first."""
+        return self._reported[-1][1] if self._reported else nan
 
     def reported_over(self, intervals: int, end_ns: int) -> list[float]:
         """Reports since the last output; empty, and counted, unless there is one per interval."""

@@ -6,24 +6,31 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from math import isfinite, nan
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_controller, build_limits, warnings_of
-from backlash_ros.core.controller import ControlStep, plausible
+from backlash_ros.core.assembly import build_controller, warnings_of
+from backlash_ros.core.controller import ControlStep
+from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimator import Status
-from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.parameter_table import CONTROLLER
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.command_history import CommandHistory
+from backlash_ros.core.saved_estimates import load_estimate, worth_saving
+from backlash_ros.nodes.control_loop import ControlLoop
+from backlash_ros.nodes.controller_services import offer_services
 from backlash_ros.nodes.declare import LiveParameters
+from backlash_ros.nodes.diagnosis import OK, STATES, WARN, Finding, counts_of, values_of, worst
+from backlash_ros.nodes.driver_io import DriverIo, Output
+from backlash_ros.nodes.estimate_saver import EstimateSaver
 from backlash_ros.nodes.events import emit
-from backlash_ros.nodes.loop_statistics import LoopStatistics
+from backlash_ros.nodes.lifecycle import ManagedNode
 from backlash_ros.nodes.messages import (
     DEPTH,
     KEPT,
@@ -31,8 +38,7 @@ from backlash_ros.nodes.messages import (
     LabelledArrayPublisher,
     stamp_ns_of,
 )
-from backlash_ros.nodes.sample_counter import SampleCounter
-from backlash_ros.nodes.spin import ProcessNode, run
+from backlash_ros.nodes.spin import run
 
 DIAGNOSTICS_PERIOD_S = 1.0
 # A controller that was held up for a few samples still learns from them; after a longer stall it
@@ -41,28 +47,12 @@ KEPT_OUTPUTS = 10
 # After the command the controller gives way for this share of a period: a busy processor is where
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
-LOOK_S = 0.1  # between two looks for a silent plant_output
-# Gaps beyond this are not stepped over to the end: nothing is left to predict from them, and the
-# command must not wait for it.
-LONGEST_GAP = 1000
-
-STATES: dict[Status, tuple[bytes, str]] = {
-    Status.ACQUIRING: (DiagnosticStatus.OK, 'acquiring: the estimate still moves freely'),
-    Status.TRACKING: (DiagnosticStatus.OK, 'tracking'),
-    Status.NOT_EXCITED: (
-        DiagnosticStatus.WARN, 'frozen: v did not swing past the gap lately; move it wider',
-    ),
-    Status.NO_DATA: (DiagnosticStatus.WARN, 'frozen: plant_output is missing'),
-    Status.INCONSISTENT: (
-        DiagnosticStatus.ERROR,
-        'frozen: plant_output does not follow from v through G(z) and a backlash; '
-        'check the sensor, G(z), whether v is applied in time, estimator.output_noise_std '
-        'and estimator.bounds',
-    ),
-}
+LOOK_S = 0.05  # between two looks for a silent plant_output or reference
+SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
+LAST_WORD_S = 0.1  # longest wait for the driver to confirm the last command
 
 
-class ControllerNode(ProcessNode):
+class ControllerNode(ManagedNode):
     """Answers every plant_output with a control; estimates and signals follow after it.
 
     In lockstep the k-th tick of /clock, reference and plant_output belong together, so that
@@ -72,77 +62,139 @@ class ControllerNode(ProcessNode):
     def __init__(self) -> None:
         super().__init__(CONTROLLER)
         p = self.settings
-        period = self._sample_period = p.real('sample_period')
-        self._core = build_controller(p)
+        if p.flag('lockstep') and p.word('io.style') != 'native':
+            raise ParameterError('lockstep', True, 'needs io.style: native')
+        # Whatever is wrong with the parameters ends the process before it takes part in anything.
+        build_controller(p, load_estimate(p))
         for warning in warnings_of(p, with_reference=False):
             self.log.warning(warning)
+        self.loop: ControlLoop | None = None  # None while unconfigured
         self._lockstep = p.flag('lockstep')
-        self._use_applied = p.flag('estimator.use_applied_control')
-        self._counter, self._commands = SampleCounter(period), CommandHistory(period)
-        self._statistics = LoopStatistics()
-        self._y_m = nan  # the newest one
-        self._missing = 0  # outputs since the newest one that was used
-        self._last: ControlStep | None = None
+        self._give_way = 0.0 if self._lockstep else GIVE_WAY * p.real('sample_period')
+        self._io = DriverIo(self, p)
+        self._saver = EstimateSaver(p.word('estimates.file'))
+        self._saved_at = time.monotonic()
         self._queues: tuple[deque[Any], deque[Any], deque[Any]] = (deque(), deque(), deque())
         self._ticks, self._references, self._outputs = self._queues
-        self._timeout = 0.0 if self._lockstep else p.real('timeout.plant_output')
-        self._heard_at: float | None = None  # on the steady clock [s]
-        self._silent = False
-        self._message = Float64()
-        self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+        self._reference_at: float | None = None  # on the steady clock [s]
+        self._told: Status | None = None  # the newest one that /diagnostics has
+        self._driver: Subscription | None = None  # plant_output, once it may begin
+        self._to_zero: Timer | None = None  # sends the commands of on_timeout
+        self._io.advertise()
         self._signals = LabelledArrayPublisher(self, topics.SIGNALS, topics.SIGNAL_LABELS)
         self._estimates = LabelledArrayPublisher(self, topics.ESTIMATES, topics.ESTIMATE_LABELS)
         self._diagnostics = DiagnosticsPublisher(self)
-        self._live = LiveParameters(self, p, build_controller, self._take_up)
-        self._subscribe()
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
-        if self._timeout > 0.0:
-            self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
-
-    def finish(self) -> None:
-        counts = self._counts()
-        self.log.info(', '.join(
-            f'{key}: {count}' for key, count in counts.items() if count or key == 'samples'
-        ))
-
-    def _subscribe(self) -> None:
-        """Subscribe; plant_output only when everything else is there, for it starts the loop."""
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
-        reference = self.create_subscription(
+        self._reference = self.create_subscription(
             Float64, topics.REFERENCE, self._on_reference, KEPT if self._lockstep else 1
         )
-        if self._use_applied:
+        if p.flag('estimator.use_applied_control'):
             self.listen(Float64, topics.APPLIED_CONTROL, self._on_applied_control, DEPTH)
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
-        needed: list[Callable[[], bool]] = []
-        wanted = max(self.settings.integer('wait_for_subscribers'), int(self._lockstep))
-        if wanted:
-            # Beside the driver, those who listen want to hear everything.
-            needed += [
-                lambda: self._control.get_subscription_count() >= wanted,
-                lambda: min(self._signals.listeners, self._estimates.listeners) >= wanted - 1,
-            ]
-            needed.append(
-                (lambda: reference.get_publisher_count() > 0) if self._lockstep
-                else (lambda: isfinite(self._y_m))
+        offer_services(self, self)
+        self._live = LiveParameters(self, p, build_controller, self._take_up)
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
+        if not self._lockstep:
+            self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
+        if p.flag('autostart'):
+            self.start()
+
+    @property
+    def estimates_file(self) -> str:
+        """Where estimates are saved, empty for nowhere."""
+        return self._saver.file
+
+    def save_estimates(self) -> Future[str]:
+        """Begin to save the estimates; the result says why it failed, empty if it did not."""
+        assert self.loop is not None
+        return self._saver.save(self.loop.estimate, self._live.parameters)
+
+    def configure(self) -> None:
+        p = self._live.parameters
+        inherited = load_estimate(p)
+        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited)
+        if inherited is not None:
+            self.log.info(
+                f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
+                f'c_r={inherited.c_r:.6g}, c_l={inherited.c_l:.6g}'
             )
+
+    def activate(self) -> None:
+        assert self.loop is not None
+        if self._driver is not None:
+            # v goes on from the last command, but what the plant did meanwhile is unknown.
+            self.loop.renew(self.loop.estimate)
+            return
+        needed = self._conditions_of_start()
         self.call_when(
-            lambda: all(condition() for condition in needed), self._start,
-            f'{topics.REFERENCE} and the listeners of {topics.CONTROL}',
+            lambda: all(condition() for condition in needed), self._listen_to_driver,
+            f'{topics.REFERENCE} and the listeners of {self._io.control_topic}',
         )
 
-    def _start(self) -> None:
-        self.listen(Float64, topics.PLANT_OUTPUT, self._on_output, KEPT_OUTPUTS)
+    def deactivate(self) -> None:
+        """Send the last command as on_stop says, and save what was learned."""
+        loop, p = self.loop, self._live.parameters
+        assert loop is not None
+        self._end_ramp()
+        if loop.last is not None:
+            self._send_last_commands(loop, p.word('on_stop'), p.real('timeout.ramp'))
+            self._save(loop)
+        self._diagnose()
+
+    def _send_last_commands(self, loop: ControlLoop, action: str, longest_s: float) -> None:
+        deadline = time.monotonic() + longest_s
+        step_s = max(self.settings.real('sample_period'), SHORTEST_STEP_S)
+        for v in loop.last_commands(action):
+            loop.send(v)
+            if action != 'ramp' or v == loop.zero:
+                break
+            if time.monotonic() + step_s > deadline:
+                self.log.warning(
+                    f'v={v:.6g} is held: it did not reach zero within timeout.ramp={longest_s:g} s'
+                )
+                break
+            time.sleep(step_s)
+        self._io.wait_until_received(LAST_WORD_S)
+
+    def cleanup(self) -> None:
+        self.loop = None
+        self._diagnose()
+
+    def finish(self) -> None:
+        super().finish()
+        self._saver.close()
+        if self.loop is not None:
+            self.log.info(', '.join(
+                f'{key}: {count}' for key, count in counts_of(self.loop).items()
+                if count or key == 'samples'
+            ))
+
+    def _conditions_of_start(self) -> list[Callable[[], bool]]:
+        """What has to be there before plant_output is listened to, for that starts the loop."""
+        wanted = max(self.settings.integer('wait_for_subscribers'), int(self._lockstep))
+        if not wanted:
+            return []
+        return [
+            lambda: self._io.listeners >= wanted,
+            # Beside the driver, those who listen want to hear everything.
+            lambda: min(self._signals.listeners, self._estimates.listeners) >= wanted - 1,
+            (lambda: self._reference.get_publisher_count() > 0) if self._lockstep
+            else (lambda: self._reference_at is not None),
+        ]
+
+    def _listen_to_driver(self) -> None:
+        self._driver = self._io.listen(self._on_output, KEPT_OUTPUTS)
         emit('ready')
 
     def _on_reference(self, message: Float64) -> None:
-        if plausible(message.data):
-            self._y_m = message.data
-        else:
-            self._statistics.dropped += 1
+        loop = self.loop
+        if loop is None:
+            return
+        if loop.take_reference(message.data):
+            self._reference_at = time.monotonic()
         if self._lockstep:
-            self._references.append(self._y_m)
+            self._references.append(loop.y_m)
             self._pair()
 
     def _on_clock(self, message: Clock) -> None:
@@ -150,137 +202,144 @@ class ControllerNode(ProcessNode):
         self._pair()
 
     def _on_applied_control(self, message: Float64, info: dict[str, Any]) -> None:
-        if plausible(message.data):
-            self._commands.report(message.data, info['source_timestamp'])
-        else:
-            self._statistics.dropped += 1
+        if self.loop is not None:
+            self.loop.take_applied(message.data, info['source_timestamp'])
 
-    def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
-        stamp_ns = info['source_timestamp']
+    def _on_output(self, output: Output) -> None:
+        loop = self.loop
+        if loop is None or not self.active:
+            return
         if self._lockstep:
-            self._outputs.append((message.data, stamp_ns))
+            self._outputs.append(output)
             self._pair()
             return
-        lost = self._counter.count(stamp_ns, info['publication_sequence_number'])
-        self._answer(message.data, self._y_m, stamp_ns, lost)
+        was_silent = loop.silent
+        step = loop.answer(output)
+        if step is not None:
+            self._follow_up(loop, step, was_silent)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
-        while all(self._queues):
-            lost = self._counter.count(self._ticks.popleft())
-            y, stamp_ns = self._outputs.popleft()
-            self._answer(y, self._references.popleft(), stamp_ns, lost)
+        while self.loop is not None and self.active and all(self._queues):
+            arrival = self.loop.counter.count(self._ticks.popleft())
+            y_m = self._references.popleft()
+            step = self.loop.step(self._outputs.popleft(), arrival, y_m)
+            if step is not None:
+                self._follow_up(self.loop, step, was_silent=False)
 
-    def _answer(self, y: float, y_m: float, stamp_ns: int, lost: int) -> None:
-        """Use y(k), which left the driver at stamp_ns, and publish v(k)."""
-        statistics = self._statistics
-        statistics.lost += lost
-        self._missing += lost
-        self._heard_at = time.monotonic()
-        if not (plausible(y) and plausible(y_m)):
-            if plausible(y):
-                statistics.without_reference += 1
-            else:
-                statistics.dropped += 1
-            self._missing += 1
-            return
-        step = self._step(y, y_m, stamp_ns)
-        self._message.data = step.v
-        self._control.publish(self._message)
-        now_ns = time.time_ns()
-        self._commands.publish(step.v, now_ns)
-        if not self._lockstep:
-            time.sleep(GIVE_WAY * self._sample_period)
-        latency = (now_ns - stamp_ns) * 1e-9
-        statistics.used += 1
-        statistics.latencies.append(latency)
-        self._core.refine()
-        self._publish_rows(step, latency)
-        changed = self._last is None or self._last.estimate.status != step.estimate.status
-        self._last = step
-        if changed or self._silent:
-            self._note_return()
+    def _follow_up(self, loop: ControlLoop, step: ControlStep, was_silent: bool) -> None:
+        """Do what the command did not have to wait for."""
+        if self._give_way:
+            time.sleep(self._give_way)
+        loop.core.refine()
+        self._publish_rows(loop, step)
+        if was_silent:
+            self._end_ramp()
+            self.log.info(f'{self._io.output_topic} is back')
+        if was_silent or step.estimate.status != self._told:
+            self._told = step.estimate.status
             self._diagnose()
 
-    def _step(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
-        """Step the core over the missing outputs to y, with the v that was really applied."""
-        lost = min(self._missing, LONGEST_GAP)
-        self._missing = 0
-        if self._last is None:
-            self._commands.begin(stamp_ns)
-            return self._core.step(y, y_m)
-        applied: list[float] = []
-        if not self._lockstep:
-            if self._use_applied:
-                applied = self._commands.reported_over(lost + 1, stamp_ns)
-            applied = applied or self._commands.over(lost + 1, stamp_ns)
-        return self._core.step(y, y_m, lost, applied)
-
-    def _take_up(self, p: Parameters) -> None:
-        """Take up limits, inverse and step sizes without touching what was learned."""
-        core = self._core
-        core.limits = build_limits(p)
-        core.inverse.direction_band = p.real('inverse.direction_band')
-        core.inverse.take_up = p.real('inverse.take_up_rate') * p.real('sample_period')
-        if isinstance(core.estimator, NormalisedLms):
-            core.estimator.step = p.real('lms.step')
-            core.estimator.step_f = p.real('lms.step_f')
-
-    def _publish_rows(self, step: ControlStep, latency: float) -> None:
-        e, sample = step.estimate, float(self._counter.index)
-        estimator = self._core.estimator
+    def _publish_rows(self, loop: ControlLoop, step: ControlStep) -> None:
+        e, sample = step.estimate, float(loop.counter.index)
+        estimator = loop.core.estimator
         self._signals.publish((
             step.y_m, step.y, step.u_d, step.v, estimator.u_hat, estimator.innovation,
-            float(e.status), sample, latency,
+            float(e.status), sample, loop.statistics.latencies[-1],
         ))
         self._estimates.publish((
             e.m, e.c_r, e.c_l, e.f, e.std_m, e.std_c_r, e.std_c_l, nan, sample,
         ))
 
+    def _take_up(self, p: Parameters) -> None:
+        if self.loop is not None:
+            self.loop.take_up(p)
+
     def _look_for_silence(self) -> None:
-        if self._heard_at is None or self._silent:
+        loop = self.loop
+        if loop is None or not self.active:
             return
-        if time.monotonic() > self._heard_at + self._timeout:
-            self._silent = True
+        self._save_now_and_then(loop)
+        timeout = self._live.parameters.real('timeout.plant_output')
+        if loop.heard_at is None or loop.silent or timeout == 0.0:
+            return
+        if time.monotonic() > loop.heard_at + timeout:
+            loop.give_up()
+            action = self._live.parameters.word('on_timeout')
             self.log.warning(
-                f'no {topics.PLANT_OUTPUT} for {self._timeout:g} s: is the driver running?'
+                f'no {self._io.output_topic} for {timeout:g} s: is the driver running? '
+                f'on_timeout: {action}'
             )
+            self._begin_ramp(loop, action)
             self._diagnose()
 
-    def _note_return(self) -> None:
-        if self._silent:
-            self._silent = False
-            self.log.info(f'{topics.PLANT_OUTPUT} is back')
+    def _begin_ramp(self, loop: ControlLoop, action: str) -> None:
+        commands = loop.last_commands(action)
+
+        def send_next() -> None:
+            v = next(commands, None)
+            if v is None:
+                self._end_ramp()
+            else:
+                loop.send(v)
+
+        self._end_ramp()
+        period = max(self.settings.real('sample_period'), SHORTEST_STEP_S)
+        self._to_zero = self.create_timer(period, send_next, clock=self.steady_clock)
+
+    def _end_ramp(self) -> None:
+        if self._to_zero is not None:
+            self.destroy_timer(self._to_zero)
+            self._to_zero = None
+
+    def _save_now_and_then(self, loop: ControlLoop) -> None:
+        period = self._live.parameters.real('estimates.save_period')
+        if period > 0.0 and time.monotonic() > self._saved_at + period:
+            self._saved_at = time.monotonic()
+            self._save(loop)
+
+    def _save(self, loop: ControlLoop) -> None:
+        if self.estimates_file and worth_saving(loop.estimate):
+            self.save_estimates().add_done_callback(
+                lambda saved: self.log.error(saved.result()) if saved.result() else None
+            )
 
     def _diagnose(self) -> None:
-        level, text = self._state()
-        values: dict[str, object] = dict(self._counts())
-        if self._last is not None:
-            e = self._last.estimate
-            values.update({
-                'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
-                'std_m': e.std_m, 'std_c_r': e.std_c_r, 'std_c_l': e.std_c_l,
-                'latency p50 [ms]': self._statistics.latency_ms(0.5),
-                'latency p99 [ms]': self._statistics.latency_ms(0.99),
-            })
-        self._diagnostics.publish(level, text, values)
+        values = values_of(self.loop) if self.loop is not None else {}
+        self._diagnostics.publish(*worst(self._findings()), values)
 
-    def _state(self) -> tuple[bytes, str]:
-        if self._silent:
-            return DiagnosticStatus.WARN, f'no {topics.PLANT_OUTPUT}: is the driver running?'
-        if self._last is None:
-            missing = topics.PLANT_OUTPUT if isfinite(self._y_m) else topics.REFERENCE
-            return DiagnosticStatus.WARN, f'waiting for {missing}'
-        return STATES[self._last.estimate.status]
-
-    def _counts(self) -> dict[str, int]:
-        statistics, commands = self._statistics, self._commands
-        return {
-            'samples': statistics.used, 'lost': statistics.lost, 'late': commands.late,
-            'non-finite dropped': statistics.dropped,
-            'before the first reference': statistics.without_reference,
-            'without applied_control': commands.unreported,
-        }
+    def _findings(self) -> list[Finding]:
+        loop, io = self.loop, self._io
+        if loop is None:
+            return [(OK, 'unconfigured')]
+        if not self.active:
+            return [(OK, 'inactive: no control is published')]
+        findings: list[Finding] = []
+        if self._driver is not None and self._driver.get_publisher_count() > 1:
+            findings.append((
+                WARN, f'{self._driver.get_publisher_count()} publishers of {io.output_topic}, '
+                'the first one is used: stop the others',
+            ))
+        if io.skipped:
+            findings.append((
+                WARN, f'{io.skipped} messages of {io.output_topic} without joint '
+                f'{self.settings.word("io.joint")!r}: set io.joint and io.field',
+            ))
+        if loop.silent:
+            findings.append((WARN, f'no {io.output_topic}: is the driver running?'))
+        elif loop.last is None:
+            missing = io.output_topic if isfinite(loop.y_m) else topics.REFERENCE
+            findings.append((WARN, f'waiting for {missing}'))
+        else:
+            findings.append(STATES[loop.last.estimate.status])
+        timeout = self._live.parameters.real('timeout.reference')
+        if timeout > 0.0 and self._reference_at is not None and not self._lockstep \
+                and time.monotonic() > self._reference_at + timeout:
+            findings.append((
+                WARN, f'no {topics.REFERENCE} for more than {timeout:g} s, the last one is held: '
+                'publish it every sample, or set timeout.reference to 0',
+            ))
+        return findings
 
 
 def main(args: list[str] | None = None) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from math import inf
-from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
@@ -14,6 +13,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.parameter_table import REFERENCE
+from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.messages import DEPTH, KEPT, stamp_ns_of
 from backlash_ros.nodes.sample_counter import SampleCounter
@@ -41,6 +41,7 @@ class ReferenceNode(ProcessNode):
         self._sample_period = p.real('sample_period')
         self._lockstep = p.flag('lockstep')
         self._started = False
+        self._io = DriverIo(self, p)
         self._counter = SampleCounter(self._sample_period)
         self._sample = 0  # the one that comes next
         self._heard_at = -inf  # on the steady clock [s]
@@ -94,20 +95,21 @@ class ReferenceNode(ProcessNode):
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         else:
-            self.listen(Float64, topics.PLANT_OUTPUT, self._on_output, 1)
+            self._io.listen(self._on_output, depth=1)
         emit('ready')
 
     def _on_clock(self, message: Clock) -> None:
         self._publish(round(stamp_ns_of(message) * 1e-9 / self._sample_period))
 
-    def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
+    def _on_output(self, output: Output) -> None:
         before = self._counter.index
-        self._counter.count(info['source_timestamp'], info['publication_sequence_number'])
+        if not self._counter.count(output.stamp_ns, output.sequence).is_sample:
+            return
         if before < 0 and self._waits:
             self._sample = self._counter.index + 1
         else:
             self._sample += self._counter.index - before if before >= 0 else 1
-        age_s = (time.time_ns() - info['received_timestamp']) * 1e-9
+        age_s = (time.time_ns() - output.received_ns) * 1e-9
         self._heard_at = time.monotonic() - max(age_s, 0.0)
 
     def _publish(self, sample: int) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 # What the middleware reports where it does not number messages.
 UNNUMBERED = 2**64 - 1
 # A stamp never comes before its sample, so a missing one shows as a full period of lateness.
@@ -9,6 +11,31 @@ UNNUMBERED = 2**64 - 1
 JITTER = 0.85
 # Share of a period by which the sender's clock may run slow per sample.
 CLOCK_SLACK = 0.01
+# A sender that once kept time for so many samples in a row is held to it: what comes earlier than
+# the next sample is due, by more than a share of a period, is a repetition or from someone else.
+KEEPS_TIME_AFTER = 20
+EARLY = 0.3
+# Samples that numbers may jump further than time has passed, and still come from the same sender.
+NUMBER_SLACK = 3
+# Another sender, or a clock that was set back, is believed after so many messages and periods
+# without a sample in between.
+STRANGERS, SILENCE = 5, 3.0
+
+
+class Arrival(NamedTuple):
+    """What a message is.
+
+    is_sample: False for repetitions, floods, old messages and second senders. missing: samples
+    that never came before this one. anew: sender or clock began anew, so nothing is known of what
+    the plant did in between.
+    """
+
+    is_sample: bool
+    missing: int = 0
+    anew: bool = False
+
+
+NO_SAMPLE = Arrival(is_sample=False)
 
 
 class SampleCounter:
@@ -16,7 +43,8 @@ class SampleCounter:
 
     Sequence numbers tell what the middleware lost; they cannot tell what was never published, or
     what a relay that numbers anew has lost. Time stamps can: sample k is due one period after
-    sample k-1. The larger count is believed.
+    sample k-1. The larger count is believed. A sender that does not keep time, like one that
+    answers each control at once, is counted by number alone as long as it is not late.
 
     index: of the newest sample, -1 before the first. Where messages are numbered, it is the count
     of the sender, which begins with 1.
@@ -25,23 +53,61 @@ class SampleCounter:
     def __init__(self, sample_period_s: float) -> None:
         self.index = -1
         self._period_ns = sample_period_s * 1e9
-        self._sequence = 0
+        self._sequence = 0  # of the newest sample
+        self._repeated = 0  # of the newest message that followed it too early to be a sample
         self._due_ns = 0.0  # when the newest sample was due at the sender
+        self._stamp_ns = 0  # of the newest sample
+        self._on_time = 0  # samples in a row that came when they were due
+        self._strange = 0  # messages in a row that do not follow the newest sample
 
-    def count(self, stamp_ns: int, sequence: int = UNNUMBERED) -> int:
-        """Take in a message; return how many samples are missing since the one before."""
+    def count(self, stamp_ns: int, sequence: int = UNNUMBERED) -> Arrival:
+        """Take in a message and say what it is."""
         numbered = sequence != UNNUMBERED
         if self.index < 0:
             self.index = max(sequence - 1, 0) if numbered else 0
-            self._sequence, self._due_ns = sequence, float(stamp_ns)
-            return 0
+            self._begin(stamp_ns, sequence)
+            return Arrival(is_sample=True)
         period = self._period_ns
+        if stamp_ns < self._stamp_ns:
+            return self._stranger(stamp_ns, sequence)
         due = self._due_ns + period
-        by_time = int((stamp_ns - due) / period + 1.0 - JITTER) if stamp_ns > due else 0
-        # A sender that was started anew begins with 1 again.
-        by_number = sequence - self._sequence - 1 if numbered and sequence > self._sequence else 0
+        late = (stamp_ns - due) / period  # may be negative
+        keeps_time = self._on_time >= KEEPS_TIME_AFTER
+        by_time = max(int(late + 1.0 - JITTER), 0)
+        by_number = 0
+        if numbered:
+            passed = self._repeated if self._repeated < sequence else self._sequence
+            by_number = sequence - passed - 1
+            if by_number < 0 and not keeps_time:
+                return self._anew(stamp_ns, sequence, by_time)
+            if by_number < 0 or (keeps_time and by_number > late + 1.0 + NUMBER_SLACK):
+                silent = stamp_ns - self._stamp_ns > SILENCE * period
+                return self._stranger(stamp_ns, sequence, by_time) if silent else NO_SAMPLE
+        if keeps_time and late < -EARLY:
+            if by_number == 0:
+                self._repeated = sequence
+            return NO_SAMPLE
         missing = max(by_time, by_number)
-        self._sequence = sequence
+        if missing == 0 and not keeps_time:
+            self._on_time = self._on_time + 1 if late >= -EARLY else 0
+        self._sequence = self._repeated = sequence
+        self._stamp_ns, self._strange = stamp_ns, 0
         self._due_ns = min(due + period * (missing + CLOCK_SLACK), float(stamp_ns))
         self.index += 1 + missing
-        return missing
+        return Arrival(is_sample=True, missing=missing)
+
+    def _stranger(self, stamp_ns: int, sequence: int, missing: int = 0) -> Arrival:
+        self._strange += 1
+        if self._strange < STRANGERS:
+            return NO_SAMPLE
+        return self._anew(stamp_ns, sequence, missing)
+
+    def _anew(self, stamp_ns: int, sequence: int, missing: int) -> Arrival:
+        self.index += 1 + missing
+        self._begin(stamp_ns, sequence)
+        return Arrival(is_sample=True, missing=missing, anew=True)
+
+    def _begin(self, stamp_ns: int, sequence: int) -> None:
+        self._sequence = self._repeated = sequence
+        self._due_ns, self._stamp_ns = float(stamp_ns), stamp_ns
+        self._on_time = self._strange = 0

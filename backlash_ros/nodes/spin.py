@@ -21,6 +21,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.guard_condition import GuardCondition
 from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
@@ -56,12 +57,12 @@ class ProcessNode(Node):
 
     def listen(
         self, message_type: type[Any], topic: str,
-        callback: Callable[[Any, dict[str, Any]], None], depth: int, raw: bool = False,
+        callback: Callable[[Any, dict[str, Any]], None], qos: QoSProfile | int, raw: bool = False,
     ) -> Subscription:
         """Subscribe with a callback that also gets time stamp and number of the message."""
         # rclpy takes such callbacks but does not say so in its types.
         plain = cast(Callable[[Any], None], callback)
-        return self.create_subscription(message_type, topic, plain, depth, raw=raw)
+        return self.create_subscription(message_type, topic, plain, qos, raw=raw)
 
     def work(self, executor: SingleThreadedExecutor) -> None:
         """Do what the node is for until `stopping`."""

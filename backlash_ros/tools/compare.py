@@ -27,11 +27,11 @@ from backlash_ros.core.metrics import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
+from backlash_ros.files import write_atomically
 from backlash_ros.tools import command_line
 from backlash_ros.tools.command_line import number_of_samples
 from backlash_ros.tools.configuration import effective_parameters
 from backlash_ros.tools.errors import BrokenOffError
-from backlash_ros.tools.files import write_atomically
 from backlash_ros.tools.operation_count import array_operations, scalar_operations
 from backlash_ros.tools.simulation import run_loop
 

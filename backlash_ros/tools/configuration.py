@@ -13,8 +13,8 @@ import yaml
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Value
 from backlash_ros.core.parameters import Parameters, check_names, check_value
+from backlash_ros.files import write_atomically
 from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.files import write_atomically
 
 PACKAGE = 'backlash_ros'
 DEFAULT_CONFIG = 'paper_example.yaml'

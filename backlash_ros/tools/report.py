@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.files import write_atomically
 from backlash_ros.tools import figures
 from backlash_ros.tools.analysis import (
     compare_laws,
@@ -26,7 +27,6 @@ from backlash_ros.tools.command_line import OptionParser, run_tool
 from backlash_ros.tools.configuration import effective_parameters, load_config, write_config
 from backlash_ros.tools.drawing import png
 from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.files import write_atomically
 from backlash_ros.tools.html_report import Picture, render_page
 from backlash_ros.tools.results import (
     BACKLASH,

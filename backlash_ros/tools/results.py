@@ -23,8 +23,8 @@ from backlash_ros.core.metrics import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.files import point_link, write_atomically
 from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.files import point_link, write_atomically
 
 RESULTS = Path('results')
 LATEST = 'latest'

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.files import write_atomically
 from backlash_ros.tools import batch, command_line
 from backlash_ros.tools.batch import Job, Outcome
 from backlash_ros.tools.command_line import (
@@ -23,7 +24,6 @@ from backlash_ros.tools.command_line import (
 )
 from backlash_ros.tools.configuration import effective_parameters, write_config
 from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.files import write_atomically
 from backlash_ros.tools.html_report import relative_error
 from backlash_ros.tools.results import BACKLASH, CONFIG, result_directory, write_table
 from backlash_ros.tools.simulation import prepare, run_loop

@@ -11,7 +11,11 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     data = content.encode('utf-8') if isinstance(content, str) else content
     temporary = _beside(path)
     try:
-        temporary.write_bytes(data)
+        with temporary.open('wb') as file:
+            file.write(data)
+            file.flush()
+            # Otherwise a power cut may leave the new name with nothing behind it.
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         temporary.unlink(missing_ok=True)

@@ -1,0 +1,34 @@
+"""What becomes of v when the loop ends or y stays away: it is held, zeroed or ramped to zero."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import inf
+
+from backlash_ros.core.controller import Limits
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters import Parameters
+
+
+def last_commands(action: str, v: float, limits: Limits) -> Iterator[float]:
+    """Commands that follow v, one per sample; the last one stays in force.
+
+    action: hold (no further command), zero or ramp. Zero is the v nearest to 0 within the limits;
+    it comes at once or, with ramp, as fast as the limits allow.
+    """
+    if action == 'zero':
+        yield limits.zero
+    while action == 'ramp' and v != limits.zero:
+        before, v = v, limits.apply(limits.zero, v)
+        if v == before:
+            return  # v is so large that a step at rate_max does not change it
+        yield v
+
+
+def check_last_commands(p: Parameters) -> None:
+    """Raise ParameterError for a ramp without a slope."""
+    for name in ('on_stop', 'on_timeout'):
+        if p.word(name) == 'ramp' and p.real('control.rate_max') == inf:
+            raise ParameterError(
+                name, 'ramp', 'needs a finite control.rate_max', 'set it, or take hold or zero'
+            )

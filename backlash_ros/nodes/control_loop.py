@@ -1,0 +1,197 @@
+"""From an output to a command: which sample it is, what was lost, what the core says to it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from math import isfinite, nan
+
+from backlash_ros.core.assembly import build_controller, build_limits, build_structure
+from backlash_ros.core.controller import ControlStep, plausible
+from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.kalman import KalmanEstimator
+from backlash_ros.core.last_command import last_commands
+from backlash_ros.core.lms import NormalisedLms
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.tracking import Tracking
+from backlash_ros.nodes.command_history import CommandHistory
+from backlash_ros.nodes.driver_io import Output
+from backlash_ros.nodes.loop_statistics import LoopStatistics
+from backlash_ros.nodes.sample_counter import Arrival, SampleCounter
+
+# Live parameters that only a new structure takes up.
+OF_THE_STRUCTURE = (
+    'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution',
+    'estimator.output_noise_std',
+)
+# Longer gaps are not stepped over: nothing is left to predict from them.
+LONGEST_GAP = 1000
+
+
+class ControlLoop:
+    """Answers outputs with commands, whatever the driver does.
+
+    send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
+    learned before. v: the newest command. silent: the driver was given up for the time being.
+    """
+
+    def __init__(
+        self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
+        inherited: Estimate | None,
+    ) -> None:
+        self.statistics = LoopStatistics()
+        self.counter = SampleCounter(p.real('sample_period'))
+        self.commands = CommandHistory(p.real('sample_period'))
+        self.y_m = nan  # the newest one
+        self.v = 0.0
+        self.silent = False
+        self.adapting = self.compensating = True
+        self.last: ControlStep | None = None
+        self.heard_at: float | None = None  # on the steady clock [s]
+        self._p, self._send, self._now_ns = p, send, now_ns
+        self._lockstep = p.flag('lockstep')
+        self._use_applied = p.flag('estimator.use_applied_control') and not self._lockstep
+        self._missing = 0  # outputs since the newest one that was used
+        self._begun = False  # whether the present core has taken a step
+        self.core = build_controller(p, inherited)
+
+    @property
+    def estimate(self) -> Estimate:
+        """What is known of the backlash."""
+        return self.core.estimator.estimate
+
+    def renew(self, inherited: Estimate | None) -> None:
+        """Go on with a new core from the present v: nothing is known of the state of the plant.
+
+        inherited: estimates to begin with, None for those of the parameters.
+        """
+        self.core = build_controller(self._p, inherited)
+        self.core.compensating = self.compensating
+        self.core.estimator.adapting = self.adapting
+        self._begun, self._missing = False, 0
+
+    def adapt(self, adapting: bool) -> None:
+        """Learn, or hold the estimates."""
+        self.adapting = self.core.estimator.adapting = adapting
+
+    def compensate(self, compensating: bool) -> None:
+        """Cancel the gap, or invert the slope alone."""
+        self.compensating = self.core.compensating = compensating
+
+    def take_reference(self, y_m: float) -> bool:
+        """Take in a reference; an absurd one is counted and the last one holds."""
+        if not plausible(y_m):
+            self.statistics.dropped += 1
+            return False
+        self.y_m = y_m
+        return True
+
+    def take_applied(self, v: float, stamp_ns: int) -> None:
+        """Take in a v that the driver reports to have applied."""
+        if plausible(v):
+            self.commands.report(v, stamp_ns)
+        else:
+            self.statistics.dropped += 1
+
+    def answer(self, output: Output) -> ControlStep | None:
+        """Send v(k) for y(k); None where the message brings no command."""
+        return self.step(output, self.counter.count(output.stamp_ns, output.sequence), self.y_m)
+
+    def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
+        """The same for a sample that was counted already, with the reference that belongs to it."""
+        statistics = self.statistics
+        if not arrival.is_sample:
+            statistics.extra += 1
+            return None
+        self.heard_at = time.monotonic()
+        self._interrupt_if_long(arrival)
+        if not (plausible(output.y) and plausible(y_m)):
+            if plausible(output.y):
+                statistics.without_reference += 1
+            else:
+                statistics.dropped += 1
+            self._missing += 1
+            return None
+        step = self._step_core(output.y, y_m, output.stamp_ns)
+        self.send(step.v)
+        statistics.note(
+            step.v, self.core.inverse.limited, (time.time_ns() - output.sent_ns) * 1e-9
+        )
+        self.last = step
+        return step
+
+    def send(self, v: float) -> None:
+        """Send a command and note when it left."""
+        self.v = v
+        self._send(v)
+        self.commands.publish(v, self._now_ns())
+
+    @property
+    def zero(self) -> float:
+        """The v nearest to 0 within the limits."""
+        return self.core.limits.zero
+
+    def last_commands(self, action: str) -> Iterator[float]:
+        """Commands that end the loop as on_stop or on_timeout say, from the present v on."""
+        return last_commands(action, self.v, self.core.limits)
+
+    def give_up(self) -> None:
+        """The driver is silent: whenever it comes back, its state will be unknown."""
+        self.silent = True
+        self.renew(self.estimate)
+
+    def take_up(self, p: Parameters) -> None:
+        """Use other values of the live parameters; what was learned stays."""
+        before, self._p = self._p, p
+        core = self.core
+        core.limits = build_limits(p)
+        core.inverse.set_band(p.real('inverse.direction_band'))
+        core.inverse.take_up = p.real('inverse.take_up_rate') * p.real('sample_period')
+        if isinstance(core.estimator, NormalisedLms):
+            core.estimator.step = p.real('lms.step')
+            core.estimator.step_f = p.real('lms.step_f')
+        if isinstance(core.estimator, KalmanEstimator):
+            core.estimator.set_noise(
+                p.real('estimator.output_noise_std'), p.real('estimator.input_noise_std'),
+                p.triple('estimator.drift_std'),
+            )
+        if any(p[name] != before[name] for name in OF_THE_STRUCTURE):
+            structure = build_structure(p)
+            if isinstance(structure, Tracking) and isinstance(core.structure, Tracking):
+                structure.go_on_from(core.structure)
+            core.structure = structure
+
+    def _interrupt_if_long(self, arrival: Arrival) -> None:
+        """Count what is missing; where that is too much to step over, begin with a new core."""
+        timeout = self._p.real('timeout.plant_output')
+        missing = self._missing + arrival.missing
+        too_long = missing > LONGEST_GAP or (
+            not self._lockstep and 0.0 < timeout < missing * self._p.real('sample_period')
+        )
+        if self.silent or arrival.anew or too_long:
+            self.statistics.interruptions += 1
+            if self._begun:
+                self.renew(self.estimate)
+        else:
+            self._missing = missing
+        if not (self.silent or arrival.anew):
+            self.statistics.lost += arrival.missing
+        self.silent = False
+
+    def _step_core(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
+        """Step the core over the missing outputs to y, with the v that was really applied."""
+        core, commands = self.core, self.commands
+        lost, self._missing = self._missing, 0
+        if not self._begun:
+            self._begun = True
+            reported = commands.newest_report() if self._use_applied else nan
+            core.start_from(reported if isfinite(reported) else self.v)
+            commands.begin(stamp_ns)
+            return core.step(y, y_m)
+        applied: list[float] = []
+        if self._use_applied:
+            applied = commands.reported_over(lost + 1, stamp_ns)
+        if not (applied or self._lockstep):
+            applied = commands.over(lost + 1, stamp_ns)
+        return core.step(y, y_m, lost, applied)
+

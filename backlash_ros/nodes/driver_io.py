@@ -1,0 +1,132 @@
+"""How y comes from the driver and v goes to it: plain numbers, or the messages of ros2_control."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray
+
+from backlash_ros import topics
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.messages import DEPTH
+from backlash_ros.nodes.sample_counter import UNNUMBERED
+from backlash_ros.nodes.spin import ProcessNode
+
+
+class Output(NamedTuple):
+    """A measured y, when it was sampled, sent and received [ns], and its number."""
+
+    y: float
+    stamp_ns: int
+    sent_ns: int
+    received_ns: int
+    sequence: int
+
+
+class DriverIo:
+    """What a node says to the driver and hears from it, in the messages that io.style names.
+
+    skipped: messages in which the joint was not found.
+    """
+
+    def __init__(self, node: ProcessNode, p: Parameters) -> None:
+        self.skipped = 0
+        self._node = node
+        self._ros2_control = p.word('io.style') == 'ros2_control'
+        self._joint, self._field = p.word('io.joint'), p.word('io.field')
+        self._best_effort = p.flag('io.best_effort')
+        # On simulated time the stamps of the middleware, which are real time, say nothing.
+        self._simulated_time = bool(node.get_parameter('use_sim_time').value)
+        self._publisher: Publisher | None = None
+
+    @property
+    def output_topic(self) -> str:
+        """Name of the topic that y comes from."""
+        return topics.JOINT_STATES if self._ros2_control else topics.PLANT_OUTPUT
+
+    @property
+    def control_topic(self) -> str:
+        """Name of the topic that v goes to."""
+        return topics.JOINT_COMMANDS if self._ros2_control else topics.CONTROL
+
+    @property
+    def listeners(self) -> int:
+        """How many subscribers v has."""
+        return 0 if self._publisher is None else self._publisher.get_subscription_count()
+
+    def now_ns(self) -> int:
+        """Time on the clock of the stamps."""
+        # time.time_ns() is the system clock of ROS, without the detour.
+        return self._node.get_clock().now().nanoseconds if self._simulated_time \
+            else time.time_ns()
+
+    def listen(self, hear: Callable[[Output], None], depth: int) -> Subscription:
+        """Call hear with every y."""
+        node = self._node
+        qos = QoSProfile(
+            depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT if self._best_effort
+            else ReliabilityPolicy.RELIABLE,
+        )
+
+        def hear_number(message: Float64, info: dict[str, Any]) -> None:
+            sent_ns = info['source_timestamp']
+            stamp_ns = self.now_ns() if self._simulated_time else sent_ns
+            hear(Output(
+                message.data, stamp_ns, sent_ns, info['received_timestamp'],
+                info['publication_sequence_number'],
+            ))
+
+        def hear_joint(message: JointState, info: dict[str, Any]) -> None:
+            values = getattr(message, self._field)
+            row = self._row(message.name, len(values))
+            if row < 0:
+                self.skipped += 1
+                return
+            stamp = message.header.stamp
+            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+            # Drivers that leave the header empty are known by the stamp of the middleware.
+            hear(Output(
+                values[row], stamp_ns or info['source_timestamp'], info['source_timestamp'],
+                info['received_timestamp'], UNNUMBERED,
+            ))
+
+        if self._ros2_control:
+            return node.listen(JointState, topics.JOINT_STATES, hear_joint, qos)
+        return node.listen(Float64, topics.PLANT_OUTPUT, hear_number, qos)
+
+    def advertise(self) -> Publisher:
+        """Make the publisher of v."""
+        kind = Float64MultiArray if self._ros2_control else Float64
+        publisher: Publisher = self._node.create_publisher(kind, self.control_topic, DEPTH)
+        self._message = kind()
+        self._publisher = publisher
+        return publisher
+
+    def publish(self, v: float) -> None:
+        """Send v to the driver."""
+        assert self._publisher is not None
+        self._message.data = array('d', (v,)) if self._ros2_control else v
+        self._publisher.publish(self._message)
+
+    def wait_until_received(self, timeout_s: float) -> None:
+        """Wait until the driver has confirmed the newest v, or the timeout is over."""
+        assert self._publisher is not None
+        self._publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
+
+    def _row(self, names: list[str], count: int) -> int:
+        """Row of the joint, -1 where it is missing."""
+        if not self._joint:
+            return 0 if count == 1 else -1
+        try:
+            row = names.index(self._joint)
+        except ValueError:
+            return -1
+        return row if row < count else -1
