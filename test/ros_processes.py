@@ -117,6 +117,10 @@ class Probe:
         """Listen until condition holds."""
         wait_until(condition, what, lambda: self._executor.spin_once(timeout_sec=0.02))
 
+    def spin(self, seconds: float) -> None:
+        """Listen for a moment."""
+        self._executor.spin_once(timeout_sec=seconds)
+
     def close(self) -> None:
         """Leave the domain."""
         self._executor.shutdown()

@@ -284,7 +284,11 @@ class _Watched:
         self._refused = 0 if accepted else self._refused + 1
         if self.contradicted:
             self._recover(fine, accepted)
-        elif self._refused >= REFUSED_IN_A_ROW or (self._proven and fine.nis > NIS_LIMIT):
+        elif (
+            self._refused >= REFUSED_IN_A_ROW or (self._proven and fine.nis > NIS_LIMIT)
+            # An estimate that never was consistent with the data is not to be called so.
+            or self.inconsistent_for >= RESTART_AFTER
+        ):
             self.contradicted = True
             self._calm.clear()
         self._count(not self.contradicted and accepted and fine.nis < NIS_TRUSTED)

@@ -11,12 +11,14 @@ UNNUMBERED = 2**64 - 1
 JITTER = 0.85
 # Share of a period by which the sender's clock may run slow per sample.
 CLOCK_SLACK = 0.01
-# A sender that once kept time for so many samples in a row is held to it: what comes earlier than
-# the next sample is due, by more than a share of a period, is a repetition or from someone else.
-KEEPS_TIME_AFTER = 20
+# A sender that has kept time for so many samples is held to it: what comes earlier than the next
+# sample is due, by more than a share of a period, is a repetition or from someone else. Before,
+# one that came early outweighs two that were due.
+KEEPS_TIME_AFTER, OUTWEIGHED = 20, 2
 EARLY = 0.3
-# Samples that numbers may jump further than time has passed, and still come from the same sender.
-NUMBER_SLACK = 3
+# Samples that numbers may jump further than time has passed, and periods to wait for a message that
+# fits when they jump further still.
+NUMBER_SLACK, PATIENCE = 3, 1.5
 # Another sender, or a clock that was set back, is believed after so many messages and periods
 # without a sample in between.
 STRANGERS, SILENCE = 5, 3.0
@@ -57,7 +59,7 @@ class SampleCounter:
         self._repeated = 0  # of the newest message that followed it too early to be a sample
         self._due_ns = 0.0  # when the newest sample was due at the sender
         self._stamp_ns = 0  # of the newest sample
-        self._on_time = 0  # samples in a row that came when they were due
+        self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
     def count(self, stamp_ns: int, sequence: int = UNNUMBERED) -> Arrival:
@@ -80,16 +82,21 @@ class SampleCounter:
             by_number = sequence - passed - 1
             if by_number < 0 and not keeps_time:
                 return self._anew(stamp_ns, sequence, by_time)
-            if by_number < 0 or (keeps_time and by_number > late + 1.0 + NUMBER_SLACK):
+            if by_number < 0:
                 silent = stamp_ns - self._stamp_ns > SILENCE * period
                 return self._stranger(stamp_ns, sequence, by_time) if silent else NO_SAMPLE
+            if keeps_time and by_number > late + 1.0 + NUMBER_SLACK:
+                # A second sender, or a flood of which the middleware has dropped a part.
+                if late < PATIENCE:
+                    return NO_SAMPLE
+                by_number = 0
         if keeps_time and late < -EARLY:
             if by_number == 0:
                 self._repeated = sequence
             return NO_SAMPLE
         missing = max(by_time, by_number)
         if missing == 0 and not keeps_time:
-            self._on_time = self._on_time + 1 if late >= -EARLY else 0
+            self._on_time = max(self._on_time + (1 if late >= -EARLY else -OUTWEIGHED), 0)
         self._sequence = self._repeated = sequence
         self._stamp_ns, self._strange = stamp_ns, 0
         self._due_ns = min(due + period * (missing + CLOCK_SLACK), float(stamp_ns))

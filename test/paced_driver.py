@@ -1,0 +1,162 @@
+"""A driver that the test plays in real time: a plant behind a backlash, and whatever goes wrong."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.publisher import Publisher
+from ros_processes import NodeProcess, Probe, RosWorld, wait_until
+from std_msgs.msg import Float64, Float64MultiArray
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core.parameters import Parameters
+
+NOISE = 1e-3
+TRUTH = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
+# Beyond every swing of the paper's example: a loop that goes there is unstable.
+LARGEST_V, LARGEST_Y = 100.0, 100.0
+LATEST = 0.5  # of a period, after which it is too late to send an output
+
+Sent = Callable[[int, float], list[float]]
+
+
+def as_measured(k: int, y: float) -> list[float]:
+    """What a sound driver sends at sample k."""
+    return [y]
+
+
+class PacedDriver:
+    """Applies the newest v and publishes y every sample period, and the reference with it.
+
+    sent: what of y(k) leaves the driver, as many messages as it likes. heard: which of the
+    controls the driver gets. referred: whether y_m is published.
+    """
+
+    def __init__(self, probe: Probe, period_s: float = 0.01, reports_applied: bool = False) -> None:
+        p = Parameters({'output_noise_std': NOISE, 'sample_period': period_s})
+        self.probe = probe
+        self.plant, self._signal = build_plant(p), build_reference(p)
+        self.rng = np.random.default_rng(7)
+        self.sent: Sent = as_measured
+        self.heard: Callable[[], bool] = lambda: True
+        self.referred = True
+        self.k = 0
+        self.v = 0.0
+        self.y: list[float] = []
+        self._period_s, self._start = period_s, time.monotonic()
+        self.controls = probe.collect(topics.CONTROL, Float64)
+        self.estimates = probe.collect(topics.ESTIMATES, Float64MultiArray)
+        self.signals = probe.collect(topics.SIGNALS, Float64MultiArray)
+        self._diagnostics = probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
+        self._taken = 0
+        self.reference = probe.publisher(topics.REFERENCE, Float64)
+        self.applied: Publisher | None = None
+        if reports_applied:
+            self.applied = probe.publisher(topics.APPLIED_CONTROL, Float64)
+        self.output = probe.publisher(topics.PLANT_OUTPUT, Float64)
+
+    def meet(self, controller: NodeProcess) -> None:
+        """Wait until the controller listens."""
+        node = self.probe.node
+        self.probe.wait_until(
+            lambda: (
+                controller.events('ready') and self.output.get_subscription_count() > 0
+                and self.reference.get_subscription_count() > 0
+                and node.count_publishers(topics.ESTIMATES) > 0
+                and node.count_publishers(topics.CONTROL) > 0
+                and (self.applied is None or self.applied.get_subscription_count() > 0)
+            ),
+            'the controller',
+        )
+        self.rest()
+
+    def run(self, seconds: float) -> None:
+        """Let the plant go on for so long."""
+        for _ in range(round(seconds / self._period_s)):
+            self._tick()
+
+    def run_until(self, condition: Callable[[], object], what: str) -> None:
+        """Let the plant go on until condition holds."""
+        wait_until(condition, what, self._tick)
+
+    def rest(self) -> None:
+        """Let the plant stand still while nobody is served."""
+        self._start = time.monotonic() - self.k * self._period_s
+
+    def status(self) -> DiagnosticStatus | None:
+        """The newest diagnostics of the controller."""
+        statuses = [message.status[0] for message in self._diagnostics]
+        return next((s for s in reversed(statuses) if s.name == 'controller'), None)
+
+    def says(self, words: str) -> bool:
+        """Whether the newest diagnostics hold these words."""
+        status = self.status()
+        return status is not None and words in status.message
+
+    def value(self, key: str) -> float:
+        """A value in the newest diagnostics."""
+        status = self.status()
+        values: dict[str, Any] = {v.key: v.value for v in status.values} if status else {}
+        return float(values.get(key, 0.0))
+
+    def estimate(self) -> dict[str, float]:
+        """The newest m, c_r, c_l."""
+        return dict(zip(('m', 'c_r', 'c_l'), self.estimates[-1].data, strict=False))
+
+    def error(self) -> float:
+        """The largest relative error of the newest estimate."""
+        if not self.estimates:
+            return 1.0
+        estimate = self.estimate()
+        return max(abs(estimate[name] / true - 1.0) for name, true in TRUTH.items())
+
+    def check_sanity(self) -> None:
+        """Nothing was commanded that no plant can take, and y stayed where y_m is."""
+        commands = [message.data for message in self.controls]
+        assert max(map(abs, commands)) < LARGEST_V
+        assert max(map(abs, self.y)) < LARGEST_Y
+
+    def _tick(self) -> None:
+        while (left := self._start + (self.k + 1) * self._period_s - time.monotonic()) > 0.0:
+            self.probe.spin(left)
+        self.probe.spin(0.0)
+        for message in self.controls[self._taken:]:
+            if self.heard():
+                self.v = message.data
+        self._taken = len(self.controls)
+        # The plant does not wait for a test that was held up, which then has nothing to send.
+        passed = (time.monotonic() - self._start) / self._period_s
+        while self.k < int(passed):
+            self._advance()
+        if passed - self.k > LATEST:
+            return
+        y = self.plant.measure()
+        self.y.append(y)
+        for value in self.sent(self.k, y):
+            self.output.publish(Float64(data=value))
+        if self.referred:
+            self.reference.publish(Float64(data=self._signal((self.k + 1) * self._period_s)))
+
+    def _advance(self) -> None:
+        if self.applied is not None:
+            self.applied.publish(Float64(data=self.v))
+        self.plant.step(self.v)
+        self.k += 1
+
+
+def controller_and_driver(
+    world: RosWorld, reports_applied: bool = False, **parameters: object,
+) -> tuple[NodeProcess, PacedDriver]:
+    """A controller that knows the noise, and a driver that it hears."""
+    controller = world.start(
+        'controller', {'estimator.output_noise_std': NOISE, **parameters}
+    )
+    driver = PacedDriver(world.probe(), reports_applied=reports_applied)
+    driver.meet(controller)
+    return controller, driver
+
