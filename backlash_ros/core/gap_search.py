@@ -98,6 +98,11 @@ class GapSearch:
         return self._settled
 
     @property
+    def inherits(self) -> bool:
+        """Whether it still believes what was learned before."""
+        return self._inherited is not None
+
+    @property
     def exhausted(self) -> bool:
         """Whether the record is used up without a sign of engagement: begin afresh."""
         return self.samples >= LAST_REPLAY and self.fine is None and not self.excited

@@ -171,15 +171,21 @@ class KalmanEstimator:
         if challenger is None or challenger.inconsistent_for >= RESTART_AFTER:
             challenger = self._challenger = self._new_search()
         challenger.add(y, v, adapting=True)
-        found = self._usable(challenger) if challenger.consistent_for >= PROVEN else None
+        if self._adoptable(challenger) is not None:
+            self._search, self._challenger = challenger, None
+
+    def _adoptable(self, watched: _Watched) -> Crossings | None:
+        """The estimate of a search if it may replace another one.
+
+        A rough estimate is better than none at the start, but not than one that held for long.
+        """
+        found = self._usable(watched) if watched.consistent_for >= PROVEN else None
         if found is None:
-            return
-        # A rough estimate is better than none at the start, but not than one that held for long.
-        precise = found.std_m < ADOPTED_SLOPE * found.m and challenger.search.precise(
+            return None
+        precise = found.std_m < ADOPTED_SLOPE * found.m and watched.search.precise(
             found, ADOPTED_GAP
         )
-        if precise or challenger.consistent_for >= ADOPTED_AFTER:
-            self._search, self._challenger = challenger, None
+        return found if precise or watched.consistent_for >= ADOPTED_AFTER else None
 
     def _usable(self, watched: _Watched) -> Crossings | None:
         """The estimate of a search if it is precise and within the bounds by its deviations."""
@@ -202,7 +208,13 @@ class KalmanEstimator:
         status = self._status()
         # A first estimate may come out of an inconsistent start, a later one has to be consistent.
         frozen = status.frozen and (self._known or status != Status.INCONSISTENT)
-        found = None if frozen or not self._adapting else self._usable(self._search)
+        watched = self._search
+        if frozen or not self._adapting:
+            found = None
+        elif self._known and not self._confirmed and not watched.search.inherits:
+            found = self._adoptable(watched)  # it contradicts what was learned before
+        else:
+            found = self._usable(watched)
         if found is None:
             if self.estimate.status != status:
                 self.estimate = replace(self.estimate, status=status)

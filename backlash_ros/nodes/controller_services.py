@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future as ThreadFuture
+from concurrent.futures import Future
 from typing import Protocol
 
 from rclpy.node import Node
-from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.saved_estimates import worth_saving
@@ -21,7 +20,7 @@ class Served(Protocol):
 
     loop: ControlLoop | None
 
-    def save_estimates(self) -> ThreadFuture[str]:
+    def save_estimates(self) -> Future[str]:
         """Begin to save the estimates; the result says why it failed, empty if it did not."""
 
     @property
@@ -64,7 +63,7 @@ def offer_services(node: Node, served: Served) -> None:
         when_configured(response, renew)
         return response
 
-    async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         loop = served.loop
         if loop is None:
             response.message = UNCONFIGURED
@@ -73,9 +72,10 @@ def offer_services(node: Node, served: Served) -> None:
         elif not worth_saving(loop.estimate):
             response.message = 'nothing was learned yet'
         else:
-            why = await _of_the_executor(node, served.save_estimates())
+            # Samples that come meanwhile wait; rclpy has no way to answer later.
+            why = served.save_estimates().result()
             response.success = not why
-            response.message = str(why) or f'saved in {served.estimates_file}'
+            response.message = why or f'saved in {served.estimates_file}'
         return response
 
     node.create_service(SetBool, '~/freeze_adaptation', freeze)
@@ -83,9 +83,3 @@ def offer_services(node: Node, served: Served) -> None:
     node.create_service(Trigger, '~/reset_estimates', reset)
     node.create_service(Trigger, '~/save_estimates', save)
 
-
-def _of_the_executor(node: Node, work: ThreadFuture[str]) -> Future:
-    """A future that a callback can await without holding up the others."""
-    future = Future(executor=node.executor)
-    work.add_done_callback(lambda done: future.set_result(done.result()))
-    return future

@@ -1,0 +1,212 @@
+"""The controller as a managed node, and what it does when it is asked."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from paced_driver import PacedDriver, controller_and_driver
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
+from ros_processes import RosWorld, ros_world
+from std_srvs.srv import SetBool, Trigger
+
+RATE_MAX = 400.0
+STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
+
+
+class Asked:
+    """Calls services of the controller while the loop goes on."""
+
+    def __init__(self, driver: PacedDriver) -> None:
+        self._driver = driver
+
+    def __call__(self, service: str, kind: type[Any], request: Any) -> Any:
+        driver = self._driver
+        client = driver.probe.node.create_client(kind, f'controller/{service}')
+        driver.run_until(client.service_is_ready, service)
+        answer = client.call_async(request)
+        driver.run_until(answer.done, f'an answer of {service}')
+        return answer.result()
+
+    def change(self, transition: int) -> bool:
+        """Whether a transition succeeded."""
+        request = ChangeState.Request(transition=Transition(id=transition))
+        return bool(self('change_state', ChangeState, request).success)
+
+    def state(self) -> str:
+        """The present state."""
+        return str(self('get_state', GetState, GetState.Request()).current_state.label)
+
+    def set(self, service: str, value: bool) -> bool:
+        """Whether a SetBool service succeeded."""
+        return bool(self(service, SetBool, SetBool.Request(data=value)).success)
+
+    def trigger(self, service: str) -> Any:
+        """Response of a Trigger service."""
+        return self(service, Trigger, Trigger.Request())
+
+
+def learn(driver: PacedDriver) -> None:
+    driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
+    driver.run(1.0)
+
+
+def test_controller_goes_through_its_life_and_publishes_only_while_active(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {'autostart': False})
+        driver = PacedDriver(world.probe())
+        asked = Asked(driver)
+        assert asked.state() == 'unconfigured'
+        assert not asked.set('freeze_adaptation', True)
+        assert asked.change(Transition.TRANSITION_CONFIGURE)
+        driver.run(0.3)
+        assert asked.state() == 'inactive'
+        assert driver.controls == []
+        assert asked.change(Transition.TRANSITION_ACTIVATE)
+        driver.run_until(lambda: len(driver.controls) > 100, 'controls')
+        assert not asked.change(Transition.TRANSITION_CONFIGURE)  # does not fit, harms nobody
+        assert asked.change(Transition.TRANSITION_DEACTIVATE)
+        driver.run(0.2)
+        count = len(driver.controls)
+        driver.run(0.5)
+        assert len(driver.controls) == count
+        assert asked.change(Transition.TRANSITION_CLEANUP)
+        assert asked.state() == 'unconfigured'
+        assert asked.change(Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
+        assert asked.state() == 'finalized'
+        assert controller.stop() == 0
+
+
+@pytest.mark.parametrize('structure', ['proportional', 'tracking'])
+def test_reactivation_keeps_the_estimates_and_makes_no_jump(
+    tmp_path: Path, structure: str,
+) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(
+            world, structure=structure, **{'control.rate_max': RATE_MAX, 'on_stop': 'ramp'}
+        )
+        asked = Asked(driver)
+        learn(driver)
+        assert asked.change(Transition.TRANSITION_DEACTIVATE)
+        driver.run(0.3)
+        assert driver.controls[-1].data == 0.0
+        assert asked.change(Transition.TRANSITION_ACTIVATE)
+        rows = len(driver.estimates)
+        driver.run_until(lambda: len(driver.estimates) > rows + 100, 'the loop')
+        for row in driver.estimates[rows:]:
+            assert abs(row.data[0] / 1.3 - 1.0) < 0.05
+        commands = [message.data for message in driver.controls]
+        assert max(abs(b - a) for a, b in pairwise(commands)) <= STEP
+        assert controller.stop() == 0
+
+
+def test_frozen_estimates_stay_and_learning_goes_on_afterwards(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        asked = Asked(driver)
+        learn(driver)
+        assert asked.set('freeze_adaptation', True)
+        driver.run(0.1)
+        held = driver.estimate()
+        driver.run(0.5)
+        assert driver.estimate() == held
+        assert asked.set('freeze_adaptation', False)
+        driver.run(1.0)
+        assert driver.estimate() != held
+        assert driver.error() < 0.02
+        assert controller.stop() == 0
+
+
+def test_without_compensation_v_no_longer_jumps_over_the_gap(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        asked = Asked(driver)
+        learn(driver)
+        gap = 5.0
+        steps = [abs(b.data - a.data) for a, b in pairwise(driver.controls[-100:])]
+        assert max(steps) > gap
+        assert asked.set('enable_compensation', False)
+        driver.run(0.1)
+        count = len(driver.controls)
+        driver.run(1.0)
+        steps = [abs(b.data - a.data) for a, b in pairwise(driver.controls[count:])]
+        assert max(steps) < gap
+        assert asked.set('enable_compensation', True)
+        driver.run(1.0)
+        assert driver.error() < 0.02
+        assert controller.stop() == 0
+
+
+def test_reset_estimates_begins_with_the_first_guess(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        asked = Asked(driver)
+        learn(driver)
+        rows = len(driver.estimates)
+        assert asked.trigger('reset_estimates').success
+        driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 % once more')
+        assert any(row.data[0] == 0.696 for row in driver.estimates[rows:])
+        assert controller.stop() == 0
+
+
+def test_estimates_are_saved_on_request_or_the_reason_is_told(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(
+            world, **{'estimates.file': str(file), 'estimates.save_period': 0.0}
+        )
+        asked = Asked(driver)
+        learn(driver)
+        assert not file.exists()
+        answer = asked.trigger('save_estimates')
+        assert answer.success, answer.message
+        assert json.loads(file.read_text())['estimate']['m'] == pytest.approx(1.3, rel=0.02)
+        assert controller.stop() == 0
+        nowhere, driver = another(world, str(tmp_path / 'missing' / 'estimates.json'))
+        learn(driver)
+        answer = Asked(driver).trigger('save_estimates')
+        assert not answer.success
+        assert 'cannot be written: No such file or directory' in answer.message
+        assert nowhere.stop() == 0
+
+
+def another(world: RosWorld, file: str) -> tuple[Any, PacedDriver]:
+    return controller_and_driver(world, **{'estimates.file': file, 'estimates.save_period': 0.0})
+
+
+def test_live_parameters_change_together_or_not_at_all(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(
+            world, structure='tracking', **{'control.min': -200.0, 'control.max': 200.0}
+        )
+        asked = Asked(driver)
+        learn(driver)
+
+        def change(**values: object) -> Any:
+            request = SetParametersAtomically.Request(parameters=[
+                Parameter(name.replace('__', '.'), value=value).to_parameter_msg()
+                for name, value in values.items()
+            ])
+            kind = SetParametersAtomically
+            return asked('set_parameters_atomically', kind, request).result
+
+        assert change(
+            tracking__input_weight=0.02, estimator__output_noise_std=2e-3, on_stop='zero',
+            timeout__plant_output=0.8, inverse__caution=2.0,
+        ).successful
+        refused = change(control__max=5.0, on_timeout='ramp')
+        assert not refused.successful
+        assert 'needs a finite control.rate_max' in refused.reason
+        driver.run(0.5)
+        assert max(message.data for message in driver.controls[-50:]) > 5.0
+        refused = change(sample_period=0.02)
+        assert not refused.successful
+        driver.run(0.5)
+        assert driver.error() < 0.05
+        assert controller.stop() == 0

@@ -1,0 +1,180 @@
+"""Processes that die, begin anew, are reconfigured or stopped while the loop runs."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from builtin_interfaces.msg import Time
+from paced_driver import NOISE, PacedDriver, controller_and_driver
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from ros_processes import NodeProcess, ros_world, wait_until
+from rosgraph_msgs.msg import Clock
+
+from backlash_ros import topics
+
+PLANT = {'output_noise_std': NOISE}
+
+
+def learn(driver: PacedDriver) -> None:
+    driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
+    driver.run(1.0)
+
+
+def test_killed_driver_comes_back_and_the_estimates_are_kept(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {
+            'estimator.output_noise_std': NOISE, 'timeout.plant_output': 0.3,
+        })
+        world.start('reference')
+        first = world.start('plant', PLANT)
+        watch = PacedDriver(world.probe())  # only listens
+
+        def listen() -> None:
+            watch.probe.spin(0.02)
+
+        wait_until(lambda: watch.error() < 0.005, 'the estimates', listen)
+        first.kill()
+        wait_until(lambda: watch.says('no plant_output'), 'a word about the silence', listen)
+        rows = len(watch.estimates)
+        world.start('plant', {**PLANT, 'seed': 5, 'backlash.initial_u': 1.0})
+        # A new driver may send y some time before it hears v.
+        wait_until(lambda: len(watch.estimates) > rows + 200, 'the loop', listen)
+        wait_until(lambda: watch.error() < 0.005, 'the estimates once more', listen)
+        for row in watch.estimates[rows:]:
+            assert abs(row.data[0] / 1.3 - 1.0) < 0.02
+            assert abs(row.data[1] / 3.0 - 1.0) < 0.05
+        wait_until(lambda: watch.value('interruptions') >= 1, 'the count', listen)
+        assert controller.stop() == 0
+
+
+def test_killed_controller_goes_on_with_the_saved_estimates(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    keep = {'estimates.file': str(file), 'estimates.load': True, 'estimates.save_period': 0.2,
+            'estimator.output_noise_std': NOISE}
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', keep)
+        driver = PacedDriver(world.probe())
+        driver.meet(controller)
+        learn(driver)
+        driver.run_until(file.exists, 'saved estimates')
+        controller.kill()
+        rows = len(driver.estimates)
+        again = world.start('controller', keep)
+        driver.run_until(lambda: len(driver.estimates) > rows, 'the first new row')
+        saved = json.loads(file.read_text())['estimate']
+        m, c_r, c_l = driver.estimates[rows].data[:3]
+        assert (m, c_r, c_l) == pytest.approx((1.3, 3.0, -3.0), rel=0.05)
+        assert set(saved) >= {'m', 'c_r', 'c_l', 'std_m'}
+        driver.run(1.0)
+        for row in driver.estimates[rows:]:
+            assert abs(row.data[0] / 1.3 - 1.0) < 0.05
+        assert again.stop() == 0
+        assert 'going on with the estimates' in again.stderr
+
+
+def test_saved_estimates_of_another_plant_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world, **{'estimates.file': str(file)})
+        learn(driver)
+        assert controller.stop() == 0
+        other = world.start('controller', {
+            'estimates.file': str(file), 'estimates.load': True, 'sample_period': 0.02,
+        })
+        assert other.wait() == 2
+        assert 'was learned with sample_period=0.01, which is now 0.02' in other.stderr
+        assert other.stderr.count('\n') == 1
+
+
+@pytest.mark.parametrize('jump_s', [-3600, 3600])
+def test_clock_jump_on_simulated_time_is_an_interruption_not_the_end(
+    tmp_path: Path, jump_s: int,
+) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {
+            'estimator.output_noise_std': NOISE, 'use_sim_time': True,
+        })
+        probe = world.probe()
+        clock = probe.publisher(topics.CLOCK, Clock)
+        driver = PacedDriver(probe)
+        offset = 10_000
+
+        def with_clock(k: int, y: float) -> list[float]:
+            stamp = (k + 1) * 10_000_000 + offset * 10**9
+            clock.publish(Clock(clock=Time(sec=stamp // 10**9, nanosec=stamp % 10**9)))
+            return [y]
+
+        driver.sent = with_clock
+        driver.meet(controller)
+        learn(driver)
+        commands = len(driver.controls)
+        offset += jump_s
+        driver.run(2.0)
+        assert len(driver.controls) > commands + 150
+        assert driver.error() < 0.05
+        driver.check_sanity()
+        assert controller.stop() == 0
+
+
+def test_reconfiguration_under_load_keeps_the_loop_and_the_estimates(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        learn(driver)
+        client = driver.probe.node.create_client(SetParameters, 'controller/set_parameters')
+        driver.run_until(client.service_is_ready, 'the parameter service')
+        for k in range(20):
+            request = SetParameters.Request(parameters=[
+                Parameter('estimator.output_noise_std', value=NOISE * (1.0 + 0.01 * k))
+                .to_parameter_msg(),
+                Parameter('control.max', value=50.0 + k).to_parameter_msg(),
+                Parameter('inverse.direction_band', value=1e-9 * k).to_parameter_msg(),
+            ])
+            answer = client.call_async(request)
+            driver.run_until(answer.done, 'the answer')
+            assert all(result.successful for result in answer.result().results)
+            driver.run(0.05)
+        assert driver.error() < 0.02
+        driver.check_sanity()
+        assert controller.stop() == 0
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('action', ['hold', 'zero', 'ramp'])
+def test_a_signal_ends_the_loop_with_the_configured_command(
+    tmp_path: Path, number: signal.Signals, action: str,
+) -> None:
+    rate_max = 400.0
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(
+            world, **{'on_stop': action, 'control.rate_max': rate_max}
+        )
+        learn(driver)
+        driver.run_until(lambda: abs(driver.v) > 5.0, 'a v away from 0')
+        controller.send(number)
+        driver.run_until(lambda: controller.process.poll() is not None, 'the end')
+        driver.run(0.1)
+        assert controller.process.returncode == 0
+        last = [message.data for message in driver.controls[-3:]]
+        assert (last[-1] == 0.0) == (action != 'hold')
+        if action == 'ramp':
+            assert abs(last[-1] - last[-2]) <= rate_max * 0.01 * (1.0 + 1e-9)
+
+
+def test_a_signal_during_start_up_ends_the_process_with_code_0(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            nodes = [world.start('controller') for _ in range(4)]
+            for i, node in enumerate(nodes):
+                _let_start(node, 0.1 + 0.2 * i)
+                assert node.stop(number) == 0, node.stderr
+
+
+def _let_start(node: NodeProcess, seconds: float) -> None:
+    """Pass some of its start-up, which nothing tells from outside."""
+    with pytest.raises(subprocess.TimeoutExpired):
+        node.process.wait(seconds)
