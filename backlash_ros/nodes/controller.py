@@ -322,8 +322,9 @@ class ControllerNode(ManagedNode):
             ))
         if io.skipped:
             findings.append((
-                WARN, f'{io.skipped} messages of {io.output_topic} without joint '
-                f'{self.settings.word("io.joint")!r}: set io.joint and io.field',
+                WARN, f'{io.skipped} messages of {io.output_topic} without '
+                f'{self.settings.word("io.field")} of joint {self.settings.word("io.joint")!r}: '
+                f'set io.joint and io.field, the joints are {io.seen}',
             ))
         if loop.silent:
             findings.append((WARN, f'no {io.output_topic}: is the driver running?'))

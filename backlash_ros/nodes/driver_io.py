@@ -34,11 +34,11 @@ class Output(NamedTuple):
 class DriverIo:
     """What a node says to the driver and hears from it, in the messages that io.style names.
 
-    skipped: messages in which the joint was not found.
+    skipped: messages without the joint. seen: the joints of the newest one of them.
     """
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
-        self.skipped = 0
+        self.skipped, self.seen = 0, ''
         self._node = node
         self._ros2_control = p.word('io.style') == 'ros2_control'
         self._joint, self._field = p.word('io.joint'), p.word('io.field')
@@ -88,7 +88,7 @@ class DriverIo:
             values = getattr(message, self._field)
             row = self._row(message.name, len(values))
             if row < 0:
-                self.skipped += 1
+                self.skipped, self.seen = self.skipped + 1, ', '.join(message.name)
                 return
             stamp = message.header.stamp
             stamp_ns = stamp.sec * 10**9 + stamp.nanosec

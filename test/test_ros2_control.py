@@ -1,0 +1,96 @@
+"""io.style: ros2_control, against a stand-in for joint_state_broadcaster and forward controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from builtin_interfaces.msg import Time
+from paced_driver import NOISE, PacedDriver
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_processes import RosWorld, ros_world
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray, Header
+
+from backlash_ros import topics
+
+
+class StandIn:
+    """Speaks the topics of ros2_control in front of a PacedDriver.
+
+    Every state is stamped with the time of the sample and leaves some time later.
+    """
+
+    def __init__(self, world: RosWorld, field: str, names: list[str], best_effort: bool) -> None:
+        probe = world.probe()
+        self.driver = driver = PacedDriver(probe)
+        probe.node.create_subscription(
+            Float64MultiArray, topics.JOINT_COMMANDS, self._hear, 1000
+        )
+        qos = QoSProfile(depth=10, reliability=(
+            ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        ))
+        self._states = probe.node.create_publisher(JointState, topics.JOINT_STATES, qos)
+        self._field, self._names = field, names
+        driver.sent = self._send
+
+    def meet(self) -> None:
+        """Wait until the controller listens."""
+        self.driver.probe.wait_until(
+            lambda: self._states.get_subscription_count() > 0
+            and self.driver.reference.get_subscription_count() > 0
+            and self.driver.probe.node.count_publishers(topics.JOINT_COMMANDS) > 0,
+            'the controller',
+        )
+        self.driver.rest()
+
+    def _hear(self, command: Float64MultiArray) -> None:
+        (v,) = command.data
+        self.driver.controls.append(Float64(data=v))
+
+    def _send(self, k: int, y: float) -> list[float]:
+        now_ns = self.driver.probe.node.get_clock().now().nanoseconds
+        message = JointState(header=Header(stamp=Time(
+            sec=now_ns // 10**9, nanosec=now_ns % 10**9
+        )), name=self._names)
+        setattr(message, self._field, [0.1 * i for i in range(len(self._names) - 1)] + [y])
+        self._states.publish(message)
+        return []
+
+
+@pytest.mark.parametrize(
+    ('field', 'names', 'best_effort'),
+    [
+        ('position', ['axle'], False),
+        ('velocity', ['other', 'axle'], False),
+        ('effort', ['first', 'second', 'axle'], True),
+    ],
+)
+def test_backlash_is_learned_through_the_messages_of_ros2_control(
+    tmp_path: Path, field: str, names: list[str], best_effort: bool,
+) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {
+            'estimator.output_noise_std': NOISE, 'io.style': 'ros2_control', 'io.field': field,
+            'io.joint': names[-1], 'io.best_effort': best_effort,
+        })
+        stand_in = StandIn(world, field, names, best_effort)
+        stand_in.meet()
+        driver = stand_in.driver
+        driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
+        driver.check_sanity()
+        assert controller.stop() == 0
+
+
+def test_a_joint_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {'io.style': 'ros2_control', 'io.joint': 'axel'})
+        stand_in = StandIn(world, 'position', ['axle'], best_effort=False)
+        stand_in.meet()
+        driver = stand_in.driver
+        driver.run_until(
+            lambda: driver.says("without position of joint 'axel'"), 'a word about the joint'
+        )
+        assert driver.says('axle')
+        assert driver.controls == []
+        assert controller.stop() == 0
