@@ -35,8 +35,12 @@ def add_common_options(parser: argparse.ArgumentParser) -> None:
         help="ROS 2 parameter file, or the name of a shipped one (default: the paper's example)",
     )
     parser.add_argument(
-        '--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
-        help='change one parameter; may be given again',
+        '--set', action='append', default=[], metavar='[AXIS/]KEY=VALUE', dest='settings',
+        help='change one parameter, of all axes or of one; may be given again',
+    )
+    parser.add_argument(
+        '--axis', default='', metavar='NAME',
+        help='take this axis alone from a file with several axes',
     )
     parser.add_argument('--seed', type=int, metavar='N', help='seed of the simulated noise')
     parser.add_argument(

@@ -52,10 +52,11 @@ class Setting:
 class Configuration:
     """A file with what the command line changes in it: the parameters of every axis.
 
-    axes: empty for a run without axes.
+    own_file: whether the user has named it. axes: empty for a run without axes.
     """
 
     file: ParameterFile
+    own_file: bool
     settings: tuple[Setting, ...]
     seed: int | None
     axes: tuple[str, ...]
@@ -81,9 +82,11 @@ class Configuration:
         return Parameters(values)
 
     def given(self, axis: str = '') -> set[str]:
-        """Names of the parameters that do not keep their default for want of a value."""
-        settings = {s.name for s in self.settings if s.axis in ('', axis)}
-        return settings | set(self.file.values(axis)) | ({'seed'} if self.seed is not None else set())
+        """Names of the parameters that the user gives a value."""
+        names = {s.name for s in self.settings if s.axis in ('', axis)}
+        if self.own_file:
+            names |= set(self.file.values(axis))
+        return names if self.seed is None else names | {'seed'}
 
 
 def read_configuration(
@@ -104,7 +107,7 @@ def read_configuration(
             raise InputError(f'--set {setting.axis}/{setting.name}: '
                              + no_such_axis(setting.axis, axes))
     file.check_axes(axes)
-    return Configuration(file, parsed, seed, axes)
+    return Configuration(file, config is not None, parsed, seed, axes)
 
 
 def effective_parameters(
