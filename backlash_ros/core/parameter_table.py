@@ -195,7 +195,7 @@ PARAMETERS: tuple[Parameter, ...] = (
               'listen to plant_output only once all other nodes are heard', used_by=(RECORDER,)),
     Parameter('axes', (),
               'names of the axes, each a namespace with nodes of its own, empty for one loop '
-              "without a namespace; write 'y' and 'n' in quotes: ROS 2 reads them as true and false",
+              "without a namespace; 'y' and 'n' in quotes, as ROS 2 reads them as true and false",
               names=True, used_by=(BRINGUP,)),
     Parameter('driver', '',
               'command to start instead of plant, where {axis} stands for the name of the axis; '

@@ -176,10 +176,10 @@ def _announced_domain(plan: RunPlan, stack: ExitStack) -> int | None:
     if plan.awaits_driver:
         # Whoever started the driver did so in the domain that is set there, or in none.
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
-        names = [axis.process_name('controller') for axis in plan.axes if axis.driver_is_elsewhere]
+        names = ', '.join(axis.name for axis in plan.axes if axis.driver_is_elsewhere)
         print(
-            f'waiting for the driver of {", ".join(names)}, for as long as it takes, with '
-            f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}', flush=True,
+            f'waiting for the driver{f" of {names}" if names else ""} as long as it takes: start '
+            f'it with ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}', flush=True,
         )
         return None
     if os.environ.get('ROS_DOMAIN_ID'):

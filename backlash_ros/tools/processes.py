@@ -34,6 +34,8 @@ DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250
 PARTICIPANT_OFFSETS = range(10, 74, 2)  # as many as the discovery range LOCALHOST looks for
 RESERVATION_OFFSET = 5
 
+PROCESSES = Path('/proc')
+
 # Set by ROS 2 wheels when they have prepared LD_LIBRARY_PATH for the Python that runs.
 WHEELS_MARK, LIBRARY_PATH = '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'LD_LIBRARY_PATH'
 
@@ -247,14 +249,29 @@ def _pipe(stream: IO[bytes] | None) -> IO[bytes]:
 
 
 def group_exists(group: int) -> bool:
-    """Whether a process of this group is left, a zombie included."""
+    """Whether a process of this group is left; a zombie is none, for it may never be collected."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         return True
-    return True
+    if not PROCESSES.is_dir():
+        return True
+    # The leader first: only when it has gone all others must be looked through.
+    return _lives_in(str(group), group) or any(
+        _lives_in(entry.name, group) for entry in PROCESSES.iterdir() if entry.name.isdigit()
+    )
+
+
+def _lives_in(process: str, group: int) -> bool:
+    try:
+        stat = (PROCESSES / process / 'stat').read_text(encoding='utf-8', errors='replace')
+    except OSError:
+        return False
+    # The name of the program stands in parentheses and may hold anything.
+    state, _, its_group = stat.rpartition(')')[2].split()[:3]
+    return int(its_group) == group and state not in ('Z', 'X')
 
 
 def stop_groups(
@@ -358,7 +375,8 @@ def _bound(port: int) -> socket.socket:
 def guard(orders: Iterable[str]) -> None:
     """Read `+GROUP STAGE` and `-GROUP` until the end of the orders, then stop what stays.
 
-    One stage goes after the other. The end comes when the orchestrator closes the pipe or the kernel does it after its death.
+    One stage goes after the other. The end comes when the orchestrator closes the pipe or the
+    kernel does it after its death.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
