@@ -61,18 +61,25 @@ class Session:
     def wait(self) -> int:
         return self.process.wait(DEADLINE_S)
 
-    def wait_for_samples(self) -> None:
-        """Return once the progress tells of samples."""
-        wait_until(lambda: ' lost ' in self.stderr or self.process.poll() is not None, 'progress')
+    def wait_for_samples(self, axis: str = '') -> None:
+        """Return once the progress tells of samples, of the axis if its title is given."""
+        wait_until(
+            lambda: self.process.poll() is not None or any(
+                ' lost ' in line and line.startswith(axis) for line in self.stderr.splitlines()
+            ), 'progress',
+        )
         assert self.process.poll() is None, self.stderr
 
     def survivors(self) -> dict[int, str]:
         return marked_processes(self.mark)
 
-    def node(self, name: str) -> int:
+    def node(self, name: str, namespace: str = '') -> int:
         """Process id of a node."""
         module = f'backlash_ros.nodes.{name} '
-        (pid,) = (pid for pid, command in self.survivors().items() if module in command)
+        (pid,) = (
+            pid for pid, command in self.survivors().items()
+            if module in command and namespace in command.split(' -r ')[-1]
+        )
         return pid
 
 
