@@ -6,7 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from math import isinf
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
@@ -155,11 +155,14 @@ def perform(plan: RunPlan) -> int:
             for process in (process for stage in stages for process in stage):
                 process.log.parent.mkdir(exist_ok=True)
             displays = {
-                axis.name: stack.enter_context(closing(ProgressDisplay(
+                axis.name: ProgressDisplay(
                     axis.samples, axis.sample_period, sys.stderr, axis.name, line
-                )))
+                )
                 for line, axis in enumerate(plan.axes)
             }
+            # The last one entered is closed first, and the bars want it from top to bottom.
+            for display in reversed(displays.values()):
+                stack.callback(display.close)
             supervisor = stack.enter_context(ProcessSupervisor(stages, requests.insist))
             run = Run(plan, supervisor, requests, displays)
             run.execute()
