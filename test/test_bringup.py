@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import sys
 import uuid
 from collections.abc import Callable, Iterator
@@ -139,6 +140,15 @@ def test_bad_input_is_refused_in_one_line_before_anything_is_made(
     for word in words:
         assert word in said.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_is_heard_before_the_libraries_are_loaded() -> None:
+    code = (
+        'import sys, backlash_ros.tools.bringup as b; b.parse_options([]);'
+        'sys.exit(bool({"numpy", "scipy", "rosbags"} & set(sys.modules)))'
+    )
+    root = Path(bringup.__file__).resolve().parents[2]
+    assert subprocess.run([sys.executable, '-c', code], cwd=root).returncode == 0
 
 
 def test_folder_that_holds_a_bag_is_not_written_over(

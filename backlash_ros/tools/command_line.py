@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from backlash_ros.core.assembly import warnings_of
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.errors import BrokenOffError, InputError
@@ -95,6 +94,8 @@ def _interrupt(number: int, frame: object) -> None:
 
 def print_warnings(name: str, parameters: Parameters) -> None:
     """Say on stderr what is allowed but will make the estimate hard."""
+    # The options are read before numpy and scipy are loaded.
+    from backlash_ros.core.assembly import warnings_of
     for warning in warnings_of(parameters):
         print(f'{name}: warning: {warning}', file=sys.stderr)
 
