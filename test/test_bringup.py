@@ -121,6 +121,7 @@ def test_no_process_survives_a_killed_bringup(start: Callable[..., Session]) -> 
         (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
         (['--set', 'x/seed=3'], ['x/seed', "no axis 'x'"]),
         (['--set', 'axes=[a, b]', '--set', 'b/backlash.c_l=4'], ['b: backlash.c_l=4.0', '<']),
+        (['--set', 'axes=[a, b]', '--set', 'estimates.file=e'], ["'e'", 'of a and of b']),
         (['--set', 'axes=[a, b, c, d, e, f, g, h]'], ['8 axes', 'at most 7']),
         (['--config', 'nowhere.yaml'], ['nowhere.yaml']),
         (['--out', '/proc/nowhere'], ['/proc/nowhere']),

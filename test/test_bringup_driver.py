@@ -45,11 +45,14 @@ def tick():
     if state['count'] == {samples}:
         sys.exit('the fuse has blown')
 node.create_timer(0.01, tick)
-rclpy.spin(node)
+try:
+    rclpy.spin(node)
+except KeyboardInterrupt:
+    print('last command', state['v'], flush=True)
 """
 
 
-def driver_command(folder: Path, samples: int = -1, sigint: str = 'SIG_DFL') -> str:
+def driver_command(folder: Path, samples: int = -1, sigint: str = 'default_int_handler') -> str:
     """Command of a driver that dies after so many samples, and treats SIGINT like that."""
     script = folder / 'driver.py'
     script.write_text(DRIVER.format(samples=samples, sigint=sigint))
@@ -99,6 +102,20 @@ def test_driver_that_does_not_exist_is_named_and_nothing_stays(
     assert session.stderr == (
         'bringup: driver does not start: /no/such/driver: No such file or directory\n'
     )
+
+
+def test_last_command_of_the_controller_reaches_the_driver(
+    start: Callable[..., Session], tmp_path: Path,
+) -> None:
+    session = start(
+        '--driver', driver_command(tmp_path), '--duration', 'inf', '--no-record',
+        '--set', 'on_stop=zero', '--set', 'bias=20',
+    )
+    session.wait_for_samples()
+    session.process.send_signal(signal.SIGINT)
+    assert session.wait() == 0, session.stderr
+    assert session.survivors() == {}
+    assert (session.out / 'logs' / 'driver.log').read_text() == 'last command 0.0\n'
 
 
 def test_second_ctrl_c_ends_a_driver_that_ignores_the_first_one(
@@ -201,6 +218,8 @@ def test_plant_stops_first_but_a_driver_only_after_the_controller(tmp_path: Path
     assert names_of(stages) == [['controller'], ['driver'], ['reference'], ['recorder']]
     assert stages[1][0].command == ('run', 'it')
     assert stages[1][0].linger_s == pytest.approx(0.1)
+    slow = plan_processes(plan(tmp_path, 'run it', **{'timeout.ramp': 20.0}), None)
+    assert [stage[0].farewell_s for stage in slow] == [20.0, 0.0, 0.0, 0.0]
     assert names_of(plan_processes(plan(tmp_path, 'none'), None)) == [
         ['controller'], [], ['reference'], ['recorder'],
     ]
@@ -254,6 +273,19 @@ def test_next_stage_is_left_alone_until_the_one_before_has_gone(
     assert (tmp_path / '1.log').read_text() == 'True\n'
 
 
+def test_process_with_a_long_farewell_gets_the_time_for_it(
+    small: Callable[..., list[list[ProcessPlan]]], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(processes, 'ESCALATION', ((signal.SIGINT, 0.1), (signal.SIGKILL, 3.0)))
+    begun = tmp_path / 'begun'
+    ramp = ON_SIGINT.format(begun=str(begun)) + 'time.sleep(0.5); print("at zero")'
+    with ProcessSupervisor(small(ramp, farewell_s=DEADLINE_S), lambda: False) as supervisor:
+        started([begun])
+        supervisor.stop()
+    assert (tmp_path / '0.log').read_text() == 'at zero\n'
+
+
 def test_driver_that_ignores_sigint_gets_ever_firmer_signals(
     small: Callable[..., list[list[ProcessPlan]]], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -290,56 +322,80 @@ READY = 'print(\'{"event": "ready"}\', flush=True)'
 PROGRESS = 'print(\'{{"event": "progress", "sample": {}}}\', flush=True)'
 
 
+@pytest.fixture
 def watched(
-    folder: Path, recorder: str, capsys: pytest.CaptureFixture[str], driver: str = '',
-    **values: object,
-) -> tuple[str, str]:
-    """Failure and stderr of a run of a driver and a recorder, both small programs."""
-    run_plan = plan(folder, 'some command', **values)
-    environment = child_environment(folder, None)
-    idle = 'import signal; signal.sigwait([signal.SIGINT])'
-    block = 'import signal; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]);'
-    stages = [
-        [ProcessPlan(name, (sys.executable, '-c', block + program), folder / f'{name}.log',
-                     environment, foreign=name == 'driver')]
-        for name, program in (('driver', driver or idle), ('recorder', f'{recorder}; {idle}'))
-    ]
-    with ProcessSupervisor(stages, lambda: False) as supervisor:
-        displays = {'': ProgressDisplay(100, 0.01, sys.stderr)}
-        run = supervision.Run(run_plan, supervisor, supervision.StopRequests(), displays)
-        run.execute()
-    return run.failure, capsys.readouterr().err
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> Callable[..., tuple[str, str]]:
+    """Failure and stderr of a run of 100 samples whose processes are small programs."""
+    def watch(
+        text: str = 'some command', managed: bool = False, **programs: str,
+    ) -> tuple[str, str]:
+        run_plan = plan(tmp_path, text, samples=100, autostart=not managed)
+        environment = child_environment(tmp_path, None)
+        block = 'import signal, time; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]);'
+        stages = [
+            [ProcessPlan(
+                name, (sys.executable, '-c', f'{block}{program}\nsignal.sigwait([signal.SIGINT])'),
+                tmp_path / f'{name}.log', environment, foreign=name == 'driver',
+            )] for name, program in programs.items()
+        ]
+        with ProcessSupervisor(stages, lambda: False) as supervisor:
+            displays = {'': ProgressDisplay(100, 0.01, sys.stderr)}
+            run = supervision.Run(run_plan, supervisor, supervision.StopRequests(), displays)
+            run.execute()
+        return run.failure, capsys.readouterr().err
+    return watch
 
 
 def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    watched: Callable[..., tuple[str, str]],
 ) -> None:
     recorder = f'{READY}; {PROGRESS.format(5000)}; {PROGRESS.format(5099)}'
-    assert watched(tmp_path, recorder, capsys, samples=100)[0] == ''
+    assert watched(recorder=recorder)[0] == ''
 
 
 def test_too_few_samples_of_a_driver_are_an_error_when_the_time_is_over(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    watched: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervision, 'LATE_DEADLINE_S', 0.5)
     monkeypatch.setattr(supervision, 'STALL_DEADLINE_S', 0.1)
-    recorder = f'{READY}; {PROGRESS.format(7)}; {PROGRESS.format(48)}'
-    failure, said = watched(tmp_path, recorder, capsys, samples=100)
+    failure, said = watched(recorder=f'{READY}; {PROGRESS.format(7)}; {PROGRESS.format(48)}')
     assert failure.startswith('only 42 of 100 samples')
     # A silent driver may come back: that alone does not end the run.
     assert said.count('no new sample for 0.12 s after sample 48, waiting for the driver') == 1
 
 
 def test_driver_without_a_first_sample_is_an_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+    watched: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 1.0)
-    failure, _ = watched(tmp_path, READY, capsys, samples=100)
+    failure, _ = watched(recorder=READY)
     assert failure.startswith('no sample within 1 s: does the driver publish its output?')
 
 
+@pytest.mark.parametrize(('driver', 'managed', 'patient'), [
+    ('some command', False, False), ('none', False, True), ('some command', True, True),
+])
+def test_controller_may_take_its_time_only_if_somebody_else_has_to_come(
+    watched: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+    driver: str, managed: bool, patient: bool,
+) -> None:
+    monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 1.0)
+    on = str(tmp_path / 'on')
+    late = f'time.sleep(3.0); {READY}; open({on!r}, "w").close()'
+    samples = (
+        f'import os\n{READY}\nwhile not os.path.exists({on!r}): time.sleep(0.01)\n'
+        f'{PROGRESS.format(0)}; {PROGRESS.format(99)}'
+    )
+    failure, _ = watched(driver, managed, controller=late, recorder=samples)
+    if patient:
+        assert failure == ''
+    else:
+        assert failure.startswith('not ready within 1 s: controller (')
+
+
 def test_odd_exit_code_of_a_driver_that_was_told_to_end_is_said_and_no_error(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    watched: Callable[..., tuple[str, str]], tmp_path: Path,
 ) -> None:
     begun = str(tmp_path / 'begun')
     driver = (
@@ -347,11 +403,11 @@ def test_odd_exit_code_of_a_driver_that_was_told_to_end_is_said_and_no_error(
         'raise SystemExit("good-bye")'
     )
     recorder = (
-        'import os, time\n'
+        'import os\n'
         f'while not os.path.exists({begun!r}): time.sleep(0.01)\n'
         f'{READY}; {PROGRESS.format(0)}; {PROGRESS.format(99)}'
     )
-    failure, said = watched(tmp_path, recorder, capsys, driver, samples=100)
+    failure, said = watched(driver=driver, recorder=recorder)
     assert failure == ''
     assert 'driver was stopped and ended with exit code 1, the end of' in said
     assert 'good-bye' in said

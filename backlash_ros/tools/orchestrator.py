@@ -38,6 +38,7 @@ from backlash_ros.tools.supervision import Run, StopRequests, complain
 
 # Each node takes one of the places that discovery on one machine has; some stay for listeners.
 MOST_AXES = 7
+ESTIMATES = 'estimates.file'
 
 
 def prepare(options: argparse.Namespace) -> RunPlan:
@@ -47,6 +48,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     if len(names) > MOST_AXES:
         raise InputError(f'{len(names)} axes are too many for one machine: at most {MOST_AXES}')
     parameters = {name: _parameters(configuration, name, options) for name in names}
+    _check_files(parameters)
     for name, values in parameters.items():
         print_warnings(f'bringup: {name}' if name else 'bringup', values)
     _say_unused(configuration, parameters)
@@ -97,6 +99,18 @@ def _parameters(
     return parameters
 
 
+def _check_files(parameters: Mapping[str, Parameters]) -> None:
+    """Raise ParameterError where two axes would save their estimates in one file."""
+    users: dict[str, str] = {}
+    for axis, values in parameters.items():
+        file = values.word(ESTIMATES)
+        if file and users.setdefault(file, axis) != axis:
+            raise ParameterError(
+                ESTIMATES, file, f'is the file of {users[file]} and of {axis}',
+                f'give each axis one of its own, like --set {axis}/{ESTIMATES}=...',
+            )
+
+
 def _samples(parameters: Parameters, duration: float | None) -> int:
     """Samples of the run, 0 for a run without end."""
     samples = parameters.integer('samples')
@@ -132,6 +146,10 @@ def perform(plan: RunPlan) -> int:
         with ExitStack() as stack:
             requests = stack.enter_context(StopRequests())
             stages = plan_processes(plan, _announced_domain(plan, stack))
+            managed = [axis.process_name('controller') for axis in plan.axes if axis.is_managed]
+            if managed:
+                print(f'waiting until somebody activates {", ".join(managed)} (autostart: false)',
+                      flush=True)
             for process in (process for stage in stages for process in stage):
                 process.log.parent.mkdir(exist_ok=True)
             displays = {

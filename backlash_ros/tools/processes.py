@@ -53,7 +53,8 @@ class ProcessPlan:
 
     name: in messages. axis: that its events are about. foreign: no node of this package: all
     that it prints goes to its log. linger_s: the time that it is left alone when its turn to be
-    stopped has come, because what was stopped before still has an effect on it.
+    stopped has come, because what was stopped before still has an effect on it. farewell_s: the
+    time that it needs for its end beyond what any process gets.
     """
 
     name: str
@@ -63,6 +64,7 @@ class ProcessPlan:
     axis: str = ''
     foreign: bool = False
     linger_s: float = 0.0
+    farewell_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -189,7 +191,8 @@ class ProcessSupervisor:
         for stage in range(len(self._stages)):
             children = [child for child in self.children if child.stage == stage]
             _linger(children, listen, self._hurry)
-            stop_groups(partial(_groups, children), listen, self._hurry)
+            farewell = max((child.plan.farewell_s for child in children), default=0.0)
+            stop_groups(partial(_groups, children), listen, self._hurry, farewell)
             for child in children:
                 self._tell_guardian(f'-{child.process.pid}\n')
         while self._selector.select(0.0):
@@ -208,7 +211,7 @@ class ProcessSupervisor:
             raise RunError(
                 f'{plan.name} does not start: {plan.command[0]}: {error.strerror}'
             ) from error
-        self._tell_guardian(f'+{process.pid} {stage}\n')
+        self._tell_guardian(f'+{process.pid} {stage} {plan.farewell_s}\n')
         child = Child(plan, process, stage)
         self.children.append(child)
         if process.stdout is not None:
@@ -276,12 +279,15 @@ def _lives_in(process: str, group: int) -> bool:
 
 def stop_groups(
     alive: Callable[[], Collection[int]], wait: Callable[[], None], hurry: Callable[[], bool],
+    farewell_s: float = 0.0,
 ) -> None:
     """Signal process groups, ever more firmly, until none is alive or all means are used up.
 
     alive: the groups that are left. wait: passes a moment. hurry: yes skips to SIGKILL.
+    farewell_s: how much longer the first signal may take than usual.
     """
-    for number, patience in ESCALATION:
+    for number, usual in ESCALATION:
+        patience = usual + farewell_s * (number == ESCALATION[0][0])
         if hurry() and number != signal.SIGKILL:
             continue
         for group in alive():
@@ -373,7 +379,7 @@ def _bound(port: int) -> socket.socket:
 
 
 def guard(orders: Iterable[str]) -> None:
-    """Read `+GROUP STAGE` and `-GROUP` until the end of the orders, then stop what stays.
+    """Read `+GROUP STAGE FAREWELL` and `-GROUP` until the end, then stop what stays.
 
     One stage goes after the other. The end comes when the orchestrator closes the pipe or the
     kernel does it after its death.
@@ -381,16 +387,18 @@ def guard(orders: Iterable[str]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     stages: dict[int, int] = {}
+    farewells: dict[int, float] = {}
     for order in orders:
-        group, *stage = map(int, order[1:].split())
+        group, *more = order[1:].split()
         if order[0] == '+':
-            stages[group] = stage[0]
+            stages[int(group)], farewells[int(group)] = int(more[0]), float(more[1])
         else:
-            stages.pop(group, None)
+            stages.pop(int(group), None)
     for now in sorted(set(stages.values())):
+        groups = [group for group, stage in stages.items() if stage == now]
         stop_groups(
-            partial(_existing, [group for group, stage in stages.items() if stage == now]),
-            lambda: time.sleep(0.02), lambda: False,
+            partial(_existing, groups), lambda: time.sleep(0.02), lambda: False,
+            max(farewells[group] for group in groups),
         )
 
 

@@ -63,6 +63,11 @@ class AxisPlan:
         """Whether somebody else starts the driver."""
         return self.parameters.word(DRIVER) == ELSEWHERE
 
+    @property
+    def is_managed(self) -> bool:
+        """Whether somebody else activates the controller."""
+        return not self.parameters.flag('autostart')
+
     def titled(self, text: str) -> str:
         """The text, with the name of the axis where there are axes."""
         return f'{self.name}: {text}' if self.name else text
@@ -146,6 +151,8 @@ def _nodes(axis: AxisPlan, environment: Mapping[str, str]) -> dict[str, ProcessP
         name: ProcessPlan(
             axis.process_name(name), _node_command(axis, name, values),
             axis.logs / f'{name}.log', environment, axis.name,
+            # The controller may end with a ramp, and then saves what it has learned.
+            farewell_s=axis.parameters.real('timeout.ramp') if name == 'controller' else 0.0,
         )
         for name, values in own.items()
     }

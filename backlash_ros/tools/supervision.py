@@ -191,12 +191,15 @@ class Run:
         return ' (a controller waits until the driver subscribes to its command)'
 
     def _may_wait(self, child: Child) -> bool:
-        """Only the controller waits for the driver, and that one may come when it wants."""
-        axis = self._axes.get(child.plan.axis)
-        return (
-            axis is not None and axis.plan.driver_is_elsewhere
-            and child.plan.name == axis.plan.process_name('controller')
-        )
+        """Whether it waits for somebody who may come when he wants."""
+        axis = self._axes[child.plan.axis].plan
+        waiting = []
+        if axis.driver_is_elsewhere or axis.is_managed:
+            waiting.append(axis.process_name('controller'))
+        if axis.is_managed:
+            # The plant begins when the controller listens.
+            waiting.append(axis.process_name('plant'))
+        return child.plan.name in waiting
 
     def _check_pace(self, axis: AxisProgress) -> None:
         """Raise RunError for samples that do not come."""
