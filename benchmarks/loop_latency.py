@@ -165,21 +165,28 @@ class Driver:
 
 
 @contextmanager
-def processes(plans: Sequence[ProcessPlan]) -> Iterator[tuple[ProcessSupervisor, int]]:
+def processes(
+    commands: Mapping[str, Sequence[str]],
+) -> Iterator[tuple[ProcessSupervisor, int]]:
     """The processes of one measurement in a domain of their own; all are gone afterwards."""
-    with tempfile.TemporaryDirectory() as folder, free_domain() as domain:
-        environment = child_environment(Path(folder), domain)
-        with ProcessSupervisor(plans, Path(folder), environment, lambda: False) as supervisor:
+    with tempfile.TemporaryDirectory() as name, free_domain() as domain:
+        folder = Path(name)
+        environment = child_environment(folder, domain)
+        stages = [
+            [ProcessPlan(who, tuple(command), folder / f'{who}.log', environment)]
+            for who, command in commands.items()
+        ]
+        with ProcessSupervisor(stages, lambda: False) as supervisor:
             yield supervisor, domain
 
 
-def node_plan(name: str, values: Mapping[str, object]) -> ProcessPlan:
+def node_command(name: str, values: Mapping[str, object]) -> list[str]:
     """How to start a node with parameters."""
     arguments: list[str] = ['--ros-args'] if values else []
     for key, value in values.items():
         text = value if isinstance(value, str) else json.dumps(value)
         arguments += ['-p', f'{key}:={text}']
-    return ProcessPlan(name, (sys.executable, '-m', f'{NODES}.{name}', *arguments))
+    return [sys.executable, '-m', f'{NODES}.{name}', *arguments]
 
 
 def measure_latency(rate: float, law: str, duration_s: float) -> Latencies:
@@ -191,8 +198,11 @@ def measure_latency(rate: float, law: str, duration_s: float) -> Latencies:
     parameters = Parameters({
         **values, 'output_noise_std': 1e-3, 'frequency': 0.126 * rate,
     })
-    echo = ProcessPlan('echo', (sys.executable, str(Path(__file__).with_name('echo_node.py'))))
-    with processes([node_plan('controller', values), echo]) as (supervisor, domain):
+    commands = {
+        'controller': node_command('controller', values),
+        'echo': [sys.executable, str(Path(__file__).with_name('echo_node.py'))],
+    }
+    with processes(commands) as (supervisor, domain):
         driver = Driver(domain, parameters)
         try:
             driver.connect()
@@ -218,8 +228,10 @@ def latency_checks(latencies: Sequence[Latencies], law: str) -> list[Check]:
 def lockstep_speed(law: str, samples: int = LOCKSTEP_SAMPLES) -> float:
     """Samples per second of plant, controller and reference as processes in lockstep."""
     values = {'lockstep': True, 'samples': samples, 'estimator.law': law, 'seed': 1}
-    plans = [node_plan(name, values) for name in ('controller', 'reference', 'plant')]
-    with processes(plans) as (supervisor, _):
+    commands = {
+        name: node_command(name, values) for name in ('controller', 'reference', 'plant')
+    }
+    with processes(commands) as (supervisor, _):
         started = _wait_for(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
         done = _wait_for(supervisor, lambda kind, _: kind == 'done')
     return samples / (done - started)
@@ -229,7 +241,7 @@ def _wait_for(supervisor: ProcessSupervisor, wanted: Callable[[str, str], bool])
     deadline = time.monotonic() + 10.0 * DEADLINE_S
     while time.monotonic() < deadline:
         for event in supervisor.events(0.1):
-            if wanted(event.kind, event.process):
+            if wanted(event.kind, event.plan.name):
                 return time.perf_counter()
         _check_running(supervisor)
     raise RuntimeError('the nodes did not come to an end in time')

@@ -1,5 +1,10 @@
-"""Settings for all tests: property tests draw the same examples on every machine and run."""
+"""For all tests: property tests draw the same examples on every machine and run; a fixture."""
 
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from bringup_processes import Session, bringup_sessions
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -9,3 +14,10 @@ settings.register_profile(
 # For a hunt by hand: pytest --hypothesis-profile=search
 settings.register_profile('search', deadline=None, max_examples=1000)
 settings.load_profile('repeatable')
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Session]]:
+    """Start bringup with arguments; whatever is left of it at the end is killed."""
+    with bringup_sessions(tmp_path) as start_session:
+        yield start_session

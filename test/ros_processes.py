@@ -133,7 +133,7 @@ class RosWorld:
 
     def __init__(self, folder: Path, domain: int, stack: ExitStack) -> None:
         self.folder = folder
-        self._domain, self._stack = domain, stack
+        self.domain, self._stack = domain, stack
         self._environment = child_environment(folder, domain)
 
     def start(
@@ -152,7 +152,7 @@ class RosWorld:
 
     def probe(self) -> Probe:
         """A node of the test."""
-        probe = Probe(self._domain)
+        probe = Probe(self.domain)
         self._stack.callback(probe.close)
         return probe
 

@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,113 +15,16 @@ from pathlib import Path
 
 import pytest
 import yaml
-from rosbags.highlevel import AnyReader
+from bringup_processes import Session, bag_counts, marked_processes, wait_until
 
 from backlash_ros import topics
-from backlash_ros.tools import bringup, processes
+from backlash_ros.tools import bringup, processes, supervision
+from backlash_ros.tools.configuration import effective_parameters
 from backlash_ros.tools.processes import ProcessPlan, ProcessSupervisor, child_environment
 from backlash_ros.tools.progress import ProgressDisplay, describe
+from backlash_ros.tools.run_plan import AxisPlan, RunPlan
 
 NODES = ('controller', 'plant', 'recorder', 'reference')
-DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
-
-
-def wait_until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
-        time.sleep(0.02)
-
-
-def marked_processes(mark: str) -> dict[int, str]:
-    """Command lines of all processes whose environment holds the mark, by process id."""
-    found = {}
-    for folder in Path('/proc').glob('[0-9]*'):
-        try:
-            if mark.encode() in (folder / 'environ').read_bytes():
-                command = (folder / 'cmdline').read_bytes().replace(b'\0', b' ')
-                found[int(folder.name)] = command.decode().strip()
-        except OSError:
-            continue  # gone meanwhile, or of another user
-    return found
-
-
-@dataclass
-class Session:
-    """A bringup that was started; all its processes carry the mark in their environment."""
-
-    process: subprocess.Popen[bytes]
-    mark: str
-    out: Path
-    stdout_file: Path
-    stderr_file: Path
-
-    @property
-    def stdout(self) -> str:
-        return self.stdout_file.read_text()
-
-    @property
-    def stderr(self) -> str:
-        return self.stderr_file.read_text()
-
-    def wait(self) -> int:
-        return self.process.wait(DEADLINE_S)
-
-    def wait_for_samples(self) -> None:
-        """Return once the progress tells of samples."""
-        wait_until(lambda: ' lost ' in self.stderr or self.process.poll() is not None, 'progress')
-        assert self.process.poll() is None, self.stderr
-
-    def survivors(self) -> dict[int, str]:
-        return marked_processes(self.mark)
-
-    def node(self, name: str) -> int:
-        """Process id of a node."""
-        module = f'backlash_ros.nodes.{name} '
-        (pid,) = (pid for pid, command in self.survivors().items() if module in command)
-        return pid
-
-
-@pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., Session]]:
-    """Start bringup with arguments; whatever is left of it at the end is killed."""
-    sessions: list[Session] = []
-
-    def start_session(*arguments: str) -> Session:
-        folder = tmp_path / str(len(sessions))
-        folder.mkdir()
-        mark = f'BACKLASH_TEST_RUN={uuid.uuid4()}'
-        name, value = mark.split('=')
-        environment = {**os.environ, name: value}
-        for variable in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
-            environment.pop(variable, None)
-        stdout, stderr = folder / 'stdout.txt', folder / 'stderr.txt'
-        with stdout.open('wb') as out, stderr.open('wb') as err:
-            process = subprocess.Popen(
-                [sys.executable, '-m', 'backlash_ros.tools.bringup', '--out',
-                 str(folder / 'results'), *arguments],
-                stdout=out, stderr=err, env=environment,
-                cwd=Path(bringup.__file__).resolve().parents[2],
-            )
-        session = Session(process, mark, folder / 'results', stdout, stderr)
-        sessions.append(session)
-        return session
-
-    yield start_session
-    for session in sessions:
-        for pid in session.survivors():
-            os.kill(pid, signal.SIGKILL)
-        session.wait()
-
-
-def bag_counts(bag: Path) -> dict[str, int]:
-    """Messages per topic, without the leading slash."""
-    with AnyReader([bag]) as reader:
-        counts: dict[str, int] = {}
-        for connection, _, _ in reader.messages():
-            topic = connection.topic.lstrip('/')
-            counts[topic] = counts.get(topic, 0) + 1
-        return counts
 
 
 def test_lockstep_run_ends_with_all_files_and_no_process(start: Callable[..., Session]) -> None:
@@ -213,6 +115,14 @@ def test_no_process_survives_a_killed_bringup(start: Callable[..., Session]) -> 
         (['--duration', '0.015'], ['duration', '0.015', 'sample_period']),
         (['--duration', '-1'], ['duration', '-1']),
         (['--duration', 'long'], ['--duration', 'long']),
+        (['--driver', 'x', '--lockstep'], ["driver='x'", 'excludes lockstep', 'does not wait']),
+        (['--driver', 'x --axis {axis}'], ['driver', 'names an axis', 'axes']),
+        (['--driver', "x 'y"], ['driver', 'is not a command', 'quotation']),
+        (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
+        (['--set', 'x/seed=3'], ['x/seed', "no axis 'x'"]),
+        (['--set', 'axes=[a, b]', '--set', 'b/backlash.c_l=4'], ['b: backlash.c_l=4.0', '<']),
+        (['--set', 'axes=[a, b]', '--set', 'estimates.file=e'], ["'e'", 'of a and of b']),
+        (['--set', 'axes=[a, b, c, d, e, f, g, h]'], ['8 axes', 'at most 7']),
         (['--config', 'nowhere.yaml'], ['nowhere.yaml']),
         (['--out', '/proc/nowhere'], ['/proc/nowhere']),
         (['--speed', '3'], ['--speed']),
@@ -231,6 +141,15 @@ def test_bad_input_is_refused_in_one_line_before_anything_is_made(
     for word in words:
         assert word in said.err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_is_heard_before_the_libraries_are_loaded() -> None:
+    code = (
+        'import sys, backlash_ros.tools.bringup as b; b.parse_options([]);'
+        'sys.exit(bool({"numpy", "scipy", "rosbags"} & set(sys.modules)))'
+    )
+    root = Path(bringup.__file__).resolve().parents[2]
+    assert subprocess.run([sys.executable, '-c', code], cwd=root).returncode == 0
 
 
 def test_folder_that_holds_a_bag_is_not_written_over(
@@ -268,18 +187,22 @@ def watch(
     monkeypatch.setenv('BACKLASH_TEST_RUN', mark)
 
     def watch_programs(hurry: bool = False, **programs: str) -> Watched:
-        parameters = bringup.effective_parameters(None).replaced({'samples': 100})
-        plan = bringup.RunPlan(parameters, tmp_path, record=False)
-        plan.logs.mkdir()
-        plans = [
-            ProcessPlan(name, (sys.executable, '-c', program))
-            for name, program in programs.items()
+        parameters = effective_parameters(None).replaced({
+            'samples': 100, 'driver': 'some command' if 'driver' in programs else '',
+        })
+        axis = AxisPlan('', parameters, tmp_path, record=False)
+        axis.logs.mkdir()
+        environment = child_environment(axis.logs, None)
+        stages = [
+            [ProcessPlan(
+                name, (sys.executable, '-c', program), axis.logs / f'{name}.log', environment,
+                foreign=name == 'driver',
+            )] for name, program in programs.items()
         ]
-        with ProcessSupervisor(
-            plans, plan.logs, child_environment(plan.logs, None), lambda: hurry
-        ) as supervisor:
-            display = ProgressDisplay(100, 0.01, sys.stderr)
-            run = bringup.Run(plan, supervisor, bringup.StopRequests(), display)
+        with ProcessSupervisor(stages, lambda: hurry) as supervisor:
+            displays = {'': ProgressDisplay(100, 0.01, sys.stderr)}
+            plan = RunPlan((axis,), tmp_path)
+            run = supervision.Run(plan, supervisor, supervision.StopRequests(), displays)
             run.execute()
         return Watched(run.failure, capsys.readouterr().err, mark)
 
@@ -291,7 +214,7 @@ def watch(
 def test_process_that_is_never_ready_is_named_with_the_end_of_its_log(
     watch: Callable[..., Watched], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(bringup, 'READY_DEADLINE_S', 1.0)
+    monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 1.0)
     lines = 'import sys; print(*range(100, 130), sep="\\n", file=sys.stderr, flush=True)'
     run = watch(slow=f'{lines}; import time; time.sleep(600)', quick=f'{READY}; {WAIT}')
     assert run.failure.startswith('not ready within 1 s: slow\n')
@@ -302,7 +225,7 @@ def test_process_that_is_never_ready_is_named_with_the_end_of_its_log(
 def test_standstill_is_an_error_that_names_the_last_sample(
     watch: Callable[..., Watched], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(bringup, 'STALL_DEADLINE_S', 0.5)
+    monkeypatch.setattr(supervision, 'STALL_DEADLINE_S', 0.5)
     progress = 'print(\'{"event": "progress", "sample": 41}\', flush=True)'
     run = watch(recorder=f'{READY}; {progress}; {WAIT}')
     assert 'no new sample for' in run.failure

@@ -15,7 +15,7 @@ from backlash_ros.core.parameters import Parameters, check_value
 
 NUMBERS = [p for p in PARAMETERS if isinstance(p.default, (int, float))
            and not isinstance(p.default, bool)]
-LISTS = [p for p in PARAMETERS if isinstance(p.default, tuple)]
+LISTS = [p for p in PARAMETERS if isinstance(p.default, tuple) and not p.names]
 REALS = [p for p in NUMBERS if isinstance(p.default, float)]
 WHOLE = [p for p in NUMBERS if isinstance(p.default, int)]
 

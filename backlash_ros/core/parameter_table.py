@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import inf
 
-Value = bool | int | float | str | tuple[float, ...]
+Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
 CONTROLLER, PLANT, REFERENCE, RECORDER = 'controller', 'plant', 'reference', 'recorder'
+BRINGUP = 'bringup'
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Parameter:
     used_by: tuple[str, ...] = (CONTROLLER,)
     live: bool = False
     infinite: bool = False  # inf is allowed and means "no limit"
+    names: bool = False  # a list of names instead of numbers, possibly empty
 
 
 BOTH = (CONTROLLER, PLANT)
@@ -191,6 +193,14 @@ PARAMETERS: tuple[Parameter, ...] = (
               used_by=(RECORDER,)),
     Parameter('wait_for_publishers', False,
               'listen to plant_output only once all other nodes are heard', used_by=(RECORDER,)),
+    Parameter('axes', (),
+              'names of the axes, each a namespace with nodes of its own, empty for one loop '
+              "without a namespace; 'y' and 'n' in quotes, as ROS 2 reads them as true and false",
+              names=True, used_by=(BRINGUP,)),
+    Parameter('driver', '',
+              'command to start instead of plant, where {axis} stands for the name of the axis; '
+              'none waits for a driver that is started elsewhere, empty is the simulated plant',
+              used_by=(BRINGUP,)),
 )
 
 BY_NAME: dict[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from math import hypot, isfinite, isnan, sqrt
+from typing import cast
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter, Value
 
 NOISE = 'estimator.output_noise_std'
+NAME = re.compile(r'[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # a namespace of ROS
 
 
 class Parameters(Mapping[str, Value]):
@@ -67,7 +70,13 @@ class Parameters(Mapping[str, Value]):
         """Value of a list parameter."""
         value = self._values[name]
         assert isinstance(value, tuple)
-        return value
+        return cast(tuple[float, ...], value)
+
+    def names(self, name: str) -> tuple[str, ...]:
+        """Value of a parameter that is a list of names."""
+        value = self._values[name]
+        assert isinstance(value, tuple)
+        return cast(tuple[str, ...], value)
 
     def pair(self, name: str) -> tuple[float, float]:
         """Value of a list parameter of length 2."""
@@ -100,7 +109,7 @@ def check_value(parameter: Parameter, value: object) -> Value:
     if isinstance(default, str):
         return _word(parameter, value)
     if isinstance(default, tuple):
-        return _reals(parameter, value)
+        return _names(parameter, value) if parameter.names else _reals(parameter, value)
     number = _real(parameter, value)
     if not isinstance(default, int):
         return number
@@ -126,6 +135,21 @@ def _word(parameter: Parameter, value: object) -> str:
             parameter.name, value, 'must be one of ' + ', '.join(parameter.choices)
         )
     return value
+
+
+def _names(parameter: Parameter, value: object) -> tuple[str, ...]:
+    if isinstance(value, str):
+        value = [name.strip() for name in value.strip('[] ').split(',') if name.strip()]
+    if not isinstance(value, Iterable) or isinstance(value, Mapping):
+        raise ParameterError(parameter.name, value, 'must be a list of names')
+    names = list(value)
+    for name in names:
+        if not isinstance(name, str) or not NAME.fullmatch(name) or names.count(name) > 1:
+            raise ParameterError(
+                parameter.name, names, 'must be a list of names',
+                'each once, of letters, digits and single _, a letter first; quote true, on, ...',
+            )
+    return tuple(names)
 
 
 def _reals(parameter: Parameter, value: object) -> tuple[float, ...]:

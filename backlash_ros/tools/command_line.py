@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from backlash_ros.core.assembly import warnings_of
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.errors import BrokenOffError, InputError
@@ -35,8 +34,12 @@ def add_common_options(parser: argparse.ArgumentParser) -> None:
         help="ROS 2 parameter file, or the name of a shipped one (default: the paper's example)",
     )
     parser.add_argument(
-        '--set', action='append', default=[], metavar='KEY=VALUE', dest='settings',
-        help='change one parameter; may be given again',
+        '--set', action='append', default=[], metavar='[AXIS/]KEY=VALUE', dest='settings',
+        help='change one parameter, of all axes or of one; may be given again',
+    )
+    parser.add_argument(
+        '--axis', default='', metavar='NAME',
+        help='take this axis alone from a file with several axes',
     )
     parser.add_argument('--seed', type=int, metavar='N', help='seed of the simulated noise')
     parser.add_argument(
@@ -91,6 +94,8 @@ def _interrupt(number: int, frame: object) -> None:
 
 def print_warnings(name: str, parameters: Parameters) -> None:
     """Say on stderr what is allowed but will make the estimate hard."""
+    # The options are read before numpy and scipy are loaded.
+    from backlash_ros.core.assembly import warnings_of
     for warning in warnings_of(parameters):
         print(f'{name}: warning: {warning}', file=sys.stderr)
 

@@ -94,7 +94,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _compare(args: Sequence[str] | None) -> None:
     options = _parser().parse_args(args)
-    scenario = effective_parameters(options.config, options.settings, options.seed)
+    scenario = effective_parameters(
+        options.config, options.settings, options.seed, options.axis
+    )
     samples = number_of_samples(scenario, options.duration)
     results = compare(scenario, samples)
     # Drawing libraries take a second to load, which bad input should not cost.

@@ -4,40 +4,28 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Value
+from backlash_ros.core.parameter_table import BRINGUP, BY_NAME, PARAMETERS, Parameter, Value
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.files import write_atomically
 from backlash_ros.tools.errors import InputError
+from backlash_ros.tools.parameter_file import (
+    AXES,
+    EVERY_NODE,
+    ParameterFile,
+    no_such_axis,
+    read_parameter_file,
+)
 
 PACKAGE = 'backlash_ros'
 DEFAULT_CONFIG = 'paper_example.yaml'
-EVERY_NODE = '/**'
-NODES = ('controller', 'plant', 'reference', 'recorder')
-NODE_OF_SECTION = {
-    section: node for node in NODES for section in (f'/{node}', node, f'/**/{node}')
-}
-# A row of a reference file may miss its sample time by this share of the sample period.
-TIME_TOLERANCE = 1e-3
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """SafeLoader that refuses a key given twice, of which YAML would keep the last one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f'{key!r} is given twice', node.value[i][0].start_mark
-                )
-        return super().construct_mapping(node, deep=deep)
 
 
 class _Dumper(yaml.SafeDumper):
@@ -51,90 +39,104 @@ def _on_one_line(dumper: yaml.SafeDumper, values: list[Any]) -> yaml.Node:
 _Dumper.add_representer(list, _on_one_line)
 
 
-def load_config(path: Path) -> dict[str, Value]:
-    """Return the checked values of a ROS 2 parameter file by flat name.
+@dataclass(frozen=True)
+class Setting:
+    """One --set: axis is empty for all axes."""
 
-    Sections of single nodes go before `/**`. Raises InputError for a file that cannot be read,
-    ParameterError for a name or value that breaks a rule; both name the file.
+    axis: str
+    name: str
+    value: Value
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A file with what the command line changes in it: the parameters of every axis.
+
+    own_file: whether the user has named it. axes: empty for a run without axes.
     """
-    document = _read_yaml(path)
-    common: dict[str, Value] = {}
-    own: dict[str, Value] = {}
-    for section, content in document.items():
-        if section != EVERY_NODE and section not in NODE_OF_SECTION:
+
+    file: ParameterFile
+    own_file: bool
+    settings: tuple[Setting, ...]
+    seed: int | None
+    axes: tuple[str, ...]
+
+    def parameters(self, axis: str = '') -> Parameters:
+        """Return the complete set: defaults, then the file, then --set, then --seed.
+
+        axis: one of the axes, empty only if there are none; raises InputError.
+        """
+        if self.axes and not axis:
             raise InputError(
-                f'{path}: section {section!r} is none of {EVERY_NODE}, '
-                + ', '.join(f'/{node}' for node in NODES)
+                f'{self.file.path}: holds the axes {", ".join(self.axes)} and only one can be '
+                f'used here: choose it, like --axis {self.axes[0]}'
             )
-        try:
-            values = dict(_flatten(_parameters_of(content)))
-            check_names(values)
-            checked = {name: check_value(BY_NAME[name], value) for name, value in values.items()}
-            _check_node(section, values)
-        except (ParameterError, InputError) as error:
-            error.args = (f'{path}: {error}',)
-            raise
-        target = common if section == EVERY_NODE else own
-        for name, value in checked.items():
-            if target.setdefault(name, value) != value:
-                raise InputError(f'{path}: {name} has two values, {target[name]!r} and {value!r}')
-    return {**common, **own}
+        if axis and axis not in self.axes:
+            raise InputError(no_such_axis(axis, self.axes))
+        values: dict[str, object] = dict(self.file.values(axis))
+        for meant in ('', axis):
+            values.update({s.name: s.value for s in self.settings if s.axis == meant})
+        if self.seed is not None:
+            values['seed'] = self.seed
+        values.pop(AXES, None)
+        return Parameters(values)
+
+    def given(self, axis: str = '') -> set[str]:
+        """Names of the parameters that the user gives a value."""
+        names = {s.name for s in self.settings if s.axis in ('', axis)}
+        if self.own_file:
+            names |= set(self.file.values(axis))
+        return names if self.seed is None else names | {'seed'}
 
 
-def _read_yaml(path: Path) -> dict[object, object]:
-    try:
-        document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
-    except OSError as error:
-        raise InputError(f'{path}: cannot be read: {error.strerror}') from None
-    except UnicodeDecodeError:
-        raise InputError(f'{path}: is not a text file in UTF-8') from None
-    except yaml.MarkedYAMLError as error:
-        line = f' line {error.problem_mark.line + 1}:' if error.problem_mark else ''
-        raise InputError(f'{path}:{line} {error.problem}') from None
-    except yaml.YAMLError as error:
-        raise InputError(f'{path}: is not YAML: {" ".join(str(error).split())}') from None
-    if not isinstance(document, dict) or not document:
-        raise InputError(f'{path}: must hold "/**: {{ros__parameters: {{...}}}}"')
-    return document
+def read_configuration(
+    config: Path | None, settings: Sequence[str] = (), seed: int | None = None,
+) -> Configuration:
+    """Read and check everything; raises InputError and ParameterError.
+
+    config: a path, or the name of a shipped file; None for the paper's example.
+    """
+    file = read_parameter_file(find_config(config))
+    parsed = tuple(parse_setting(setting) for setting in settings)
+    axes = file.axes
+    for setting in parsed:
+        if setting.name == AXES:
+            axes = Parameters({AXES: setting.value}).names(AXES)
+    for setting in parsed:
+        if setting.axis and setting.axis not in axes:
+            raise InputError(f'--set {setting.axis}/{setting.name}: '
+                             + no_such_axis(setting.axis, axes))
+    file.check_axes(axes)
+    return Configuration(file, config is not None, parsed, seed, axes)
 
 
-def _parameters_of(content: object) -> dict[object, object]:
-    if not isinstance(content, dict) or set(content) != {'ros__parameters'}:
-        raise InputError('each section must hold ros__parameters and nothing else')
-    parameters = content['ros__parameters']
-    if not isinstance(parameters, dict):
-        raise InputError('ros__parameters must hold "name: value" lines')
-    return parameters
+def effective_parameters(
+    config: Path | None, settings: Sequence[str] = (), seed: int | None = None, axis: str = '',
+) -> Parameters:
+    """Return the complete set for one axis, as `Configuration.parameters` does."""
+    return read_configuration(config, settings, seed).parameters(axis)
 
 
-def _flatten(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    for key, value in tree.items():
-        name = f'{prefix}{key}'
-        if isinstance(value, dict):
-            yield from _flatten(value, f'{name}.')
-        else:
-            yield name, value
+def load_config(path: Path) -> dict[str, Value]:
+    """Return the values that a file without axes holds, by flat name.
+
+    Raises InputError and ParameterError.
+    """
+    file = read_parameter_file(path)
+    file.check_axes(())
+    return file.values('')
 
 
-def _check_node(section: object, values: Mapping[str, object]) -> None:
-    node = NODE_OF_SECTION.get(str(section))
-    for name in values:
-        users = BY_NAME[name].used_by
-        if node is not None and node not in users:
-            raise ParameterError(
-                name, values[name], f'is not a parameter of {node}',
-                f'put it under {EVERY_NODE} or /{users[0]}',
-            )
-
-
-def parse_setting(text: str) -> tuple[str, Value]:
-    """Return name and checked value of `KEY=VALUE`, the value written as in YAML."""
-    name, equals, value = text.partition('=')
-    name = name.strip()
-    if not equals:
-        raise InputError(f'--set {text!r} must be KEY=VALUE')
+def parse_setting(text: str) -> Setting:
+    """Return the checked content of `KEY=VALUE` or `AXIS/KEY=VALUE`, the value as in YAML."""
+    key, equals, value = text.partition('=')
+    axis, slash, name = key.strip().rpartition('/')
+    if not equals or (slash and not axis):
+        raise InputError(f'--set {text!r} must be KEY=VALUE or AXIS/KEY=VALUE')
     check_names([name])
-    return name, check_value(BY_NAME[name], parse_value(name, value))
+    if axis and name == AXES:
+        raise ParameterError(name, value, 'is for the whole run', f'write --set {AXES}=...')
+    return Setting(axis, name, check_value(BY_NAME[name], parse_value(name, value)))
 
 
 def parse_value(name: str, text: str) -> object:
@@ -145,20 +147,6 @@ def parse_value(name: str, text: str) -> object:
         return yaml.safe_load(text)
     except yaml.YAMLError:
         raise ParameterError(name, text, 'is not a value in YAML') from None
-
-
-def effective_parameters(
-    config: Path | None, settings: Sequence[str] = (), seed: int | None = None,
-) -> Parameters:
-    """Return the complete set: defaults, then the file, then --set, then --seed.
-
-    config: a path, or the name of a shipped file; None for the paper's example.
-    """
-    values: dict[str, object] = dict(load_config(find_config(config)))
-    values.update(parse_setting(setting) for setting in settings)
-    if seed is not None:
-        values['seed'] = seed
-    return Parameters(values)
 
 
 def find_config(config: Path | None) -> Path:
@@ -189,14 +177,26 @@ def shipped_configs() -> Path:
 
 
 def write_config(parameters: Parameters, path: Path) -> None:
-    """Write the complete set as a ROS 2 parameter file that every node accepts."""
+    """Write the complete set as a ROS 2 parameter file that every node accepts.
+
+    What is of bringup alone stands in a section of its own, and only if it is given: ROS 2 has
+    no empty lists.
+    """
+    common = [p for p in PARAMETERS if p.used_by != (BRINGUP,)]
+    own = [p for p in PARAMETERS if p not in common and parameters[p.name] != p.default]
+    document = {EVERY_NODE: {'ros__parameters': _tree(parameters, common)}}
+    if own:
+        document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
+    write_atomically(path, yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000))
+
+
+def _tree(parameters: Parameters, written: Sequence[Parameter]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
-    for parameter in PARAMETERS:
+    for parameter in written:
         *groups, leaf = parameter.name.split('.')
         branch = tree
         for group in groups:
             branch = branch.setdefault(group, {})
         value = parameters[parameter.name]
         branch[leaf] = list(value) if isinstance(value, tuple) else value
-    document = {EVERY_NODE: {'ros__parameters': tree}}
-    write_atomically(path, yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000))
+    return tree

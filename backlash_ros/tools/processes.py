@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import IO
@@ -33,6 +34,11 @@ DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250
 PARTICIPANT_OFFSETS = range(10, 74, 2)  # as many as the discovery range LOCALHOST looks for
 RESERVATION_OFFSET = 5
 
+PROCESSES = Path('/proc')
+
+# Set by ROS 2 wheels when they have prepared LD_LIBRARY_PATH for the Python that runs.
+WHEELS_MARK, LIBRARY_PATH = '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'LD_LIBRARY_PATH'
+
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
@@ -43,17 +49,29 @@ class RunError(RuntimeError):
 
 @dataclass(frozen=True)
 class ProcessPlan:
-    """What to start: its name in messages and of its log, and its command."""
+    """What to start.
+
+    name: in messages. axis: that its events are about. foreign: no node of this package: all
+    that it prints goes to its log. linger_s: the time that it is left alone when its turn to be
+    stopped has come, because what was stopped before still has an effect on it. farewell_s: the
+    time that it needs for its end beyond what any process gets.
+    """
 
     name: str
     command: tuple[str, ...]
+    log: Path
+    environment: Mapping[str, str]
+    axis: str = ''
+    foreign: bool = False
+    linger_s: float = 0.0
+    farewell_s: float = 0.0
 
 
 @dataclass(frozen=True)
 class Event:
     """A JSON object that a process printed as a line of its stdout."""
 
-    process: str
+    plan: ProcessPlan
     content: Mapping[str, object]
 
     @property
@@ -68,7 +86,7 @@ class Child:
 
     plan: ProcessPlan
     process: subprocess.Popen[bytes]
-    log: Path
+    stage: int
     unfinished_line: bytes = field(default=b'', repr=False)
 
     def group(self) -> list[int]:
@@ -83,17 +101,18 @@ class Child:
         for line in lines:
             content = _parse_event(line)
             if content is None:
-                with self.log.open('ab') as log:
+                with self.plan.log.open('ab') as log:
                     log.write(line + b'\n')
             else:
-                events.append(Event(self.plan.name, content))
+                events.append(Event(self.plan, content))
         return events
 
     def end_of_log(self) -> str:
         """The last lines of the log, indented."""
-        lines = self.log.read_text(encoding='utf-8', errors='replace').splitlines()
+        log = self.plan.log
+        lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
         quoted = ''.join(f'\n    {line}' for line in lines[-LOG_LINES:])
-        return f'{self.log}:{quoted}' if quoted else f'{self.log} is empty'
+        return f'{log}:{quoted}' if quoted else f'{log} is empty'
 
     def describe_exit(self) -> str:
         """How the process ended, in words."""
@@ -114,17 +133,14 @@ def _parse_event(line: bytes) -> dict[str, object] | None:
 class ProcessSupervisor:
     """Starts processes as a context manager and has stopped all of them when it is left.
 
-    plans: in the order in which they are to be stopped; they are started together.
-    log_folder: gets NAME.log of each process. hurry: asked while stopping; once it says yes,
-    nobody is given any more time.
+    stages: in the order in which they are to be stopped, those of one stage together; all are
+    started together. hurry: asked while stopping; once it says yes, nobody is given any more time.
     """
 
     def __init__(
-        self, plans: Sequence[ProcessPlan], log_folder: Path, environment: Mapping[str, str],
-        hurry: Callable[[], bool],
+        self, stages: Sequence[Sequence[ProcessPlan]], hurry: Callable[[], bool],
     ) -> None:
-        self._plans, self._log_folder = plans, log_folder
-        self._environment, self._hurry = environment, hurry
+        self._stages, self._hurry = stages, hurry
         self._selector = selectors.DefaultSelector()
         self._guardian: subprocess.Popen[bytes] | None = None
         self.children: list[Child] = []
@@ -133,11 +149,12 @@ class ProcessSupervisor:
         try:
             self._guardian = subprocess.Popen(
                 (sys.executable, '-m', 'backlash_ros.tools.processes'), bufsize=0,
-                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=self._environment,
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),
                 start_new_session=True,
             )
-            for plan in self._plans:
-                self._start(plan)
+            for stage, plans in enumerate(self._stages):
+                for plan in plans:
+                    self._start(plan, stage)
         except BaseException:
             self._close()
             raise
@@ -165,39 +182,47 @@ class ProcessSupervisor:
         return [child for child in self.children if child.process.poll() is not None]
 
     def stop(self) -> list[Event]:
-        """Stop one child after the other, each with all its group; returns their last words."""
+        """Stop one stage after the other, each child with all its group; returns last words."""
         last_words: list[Event] = []
 
         def listen() -> None:
             last_words.extend(self.events(0.02))
 
-        for child in self.children:
-            stop_groups(child.group, listen, self._hurry)
-            self._tell_guardian(f'-{child.process.pid}\n')
+        for stage in range(len(self._stages)):
+            children = [child for child in self.children if child.stage == stage]
+            _linger(children, listen, self._hurry)
+            farewell = max((child.plan.farewell_s for child in children), default=0.0)
+            stop_groups(partial(_groups, children), listen, self._hurry, farewell)
+            for child in children:
+                self._tell_guardian(f'-{child.process.pid}\n')
         while self._selector.select(0.0):
             last_words += self.events(0.0)
         return last_words
 
-    def _start(self, plan: ProcessPlan) -> None:
-        log = self._log_folder / f'{plan.name}.log'
+    def _start(self, plan: ProcessPlan, stage: int) -> None:
         try:
-            with log.open('ab') as stderr:
+            with plan.log.open('ab') as log:
                 process = subprocess.Popen(
-                    plan.command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                    stderr=stderr, env=self._environment, start_new_session=True,
+                    plan.command, stdin=subprocess.DEVNULL,
+                    stdout=log if plan.foreign else subprocess.PIPE, stderr=log,
+                    env=plan.environment, start_new_session=True,
                 )
         except OSError as error:
-            raise RunError(f'{plan.name} does not start: {error}') from error
-        self._tell_guardian(f'+{process.pid}\n')
-        child = Child(plan, process, log)
+            raise RunError(
+                f'{plan.name} does not start: {plan.command[0]}: {error.strerror}'
+            ) from error
+        self._tell_guardian(f'+{process.pid} {stage} {plan.farewell_s}\n')
+        child = Child(plan, process, stage)
         self.children.append(child)
-        self._selector.register(_pipe(process.stdout), selectors.EVENT_READ, child)
+        if process.stdout is not None:
+            self._selector.register(process.stdout, selectors.EVENT_READ, child)
 
     def _close(self) -> None:
         self.stop()
         self._selector.close()
         for child in self.children:
-            _pipe(child.process.stdout).close()
+            if child.process.stdout is not None:
+                child.process.stdout.close()
         if self._guardian is not None:
             _pipe(self._guardian.stdin).close()
             self._guardian.wait()
@@ -208,30 +233,61 @@ class ProcessSupervisor:
                 _pipe(self._guardian.stdin).write(line.encode())
 
 
+def _groups(children: Sequence[Child]) -> list[int]:
+    return [group for child in children for group in child.group()]
+
+
+def _linger(
+    children: Sequence[Child], wait: Callable[[], None], hurry: Callable[[], bool],
+) -> None:
+    times = [child.plan.linger_s for child in children if child.process.poll() is None]
+    deadline = time.monotonic() + max(times, default=0.0)
+    while time.monotonic() < deadline and not hurry():
+        wait()
+
+
 def _pipe(stream: IO[bytes] | None) -> IO[bytes]:
     assert stream is not None
     return stream
 
 
 def group_exists(group: int) -> bool:
-    """Whether a process of this group is left, a zombie included."""
+    """Whether a process of this group is left; a zombie is none, for it may never be collected."""
     try:
         os.killpg(group, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         return True
-    return True
+    if not PROCESSES.is_dir():
+        return True
+    # The leader first: only when it has gone all others must be looked through.
+    return _lives_in(str(group), group) or any(
+        _lives_in(entry.name, group) for entry in PROCESSES.iterdir() if entry.name.isdigit()
+    )
+
+
+def _lives_in(process: str, group: int) -> bool:
+    try:
+        stat = (PROCESSES / process / 'stat').read_text(encoding='utf-8', errors='replace')
+    except OSError:
+        return False
+    # The name of the program stands in parentheses and may hold anything.
+    state, _, its_group = stat.rpartition(')')[2].split()[:3]
+    return int(its_group) == group and state not in ('Z', 'X')
 
 
 def stop_groups(
     alive: Callable[[], Collection[int]], wait: Callable[[], None], hurry: Callable[[], bool],
+    farewell_s: float = 0.0,
 ) -> None:
     """Signal process groups, ever more firmly, until none is alive or all means are used up.
 
     alive: the groups that are left. wait: passes a moment. hurry: yes skips to SIGKILL.
+    farewell_s: how much longer the first signal may take than usual.
     """
-    for number, patience in ESCALATION:
+    for number, usual in ESCALATION:
+        patience = usual + farewell_s * (number == ESCALATION[0][0])
         if hurry() and number != signal.SIGKILL:
             continue
         for group in alive():
@@ -249,13 +305,9 @@ def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
 
     What the user has set stays. domain: ROS_DOMAIN_ID to set, None to leave it alone.
     """
-    environment = dict(os.environ)
+    environment = with_source(os.environ)
     environment['BACKLASH_ROS_EVENTS'] = '1'
     environment['PYTHONUNBUFFERED'] = '1'
-    # A source tree need not be installed; behind the user's own entries it shadows nothing.
-    source = str(Path(__file__).resolve().parents[2])
-    paths = [entry for entry in environment.get('PYTHONPATH', '').split(os.pathsep) if entry]
-    environment['PYTHONPATH'] = os.pathsep.join([*paths, source])
     if domain is not None:
         environment['ROS_DOMAIN_ID'] = str(domain)
     environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -264,6 +316,32 @@ def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         environment.setdefault(name, '1')
     return environment
+
+
+def with_source(environment: Mapping[str, str]) -> dict[str, str]:
+    """A copy in which Python finds this package, which need not be installed."""
+    source = str(Path(__file__).resolve().parents[2])
+    # Behind the user's own entries it shadows nothing.
+    paths = [entry for entry in environment.get('PYTHONPATH', '').split(os.pathsep) if entry]
+    return {**environment, 'PYTHONPATH': os.pathsep.join([*paths, source])}
+
+
+def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """The same for a program that is no node of this package and may be of another Python.
+
+    ROS 2 wheels have set variables for this Python alone, with which those of another one fail.
+    """
+    foreign = {
+        name: value for name, value in environment.items()
+        if name not in ('BACKLASH_ROS_EVENTS', WHEELS_MARK)
+    }
+    if WHEELS_MARK in environment and LIBRARY_PATH in environment:
+        folders = environment[LIBRARY_PATH].split(os.pathsep)
+        kept = [folder for folder in folders if not Path(folder).is_relative_to(sys.prefix)]
+        foreign[LIBRARY_PATH] = os.pathsep.join(kept)
+        if not kept:
+            del foreign[LIBRARY_PATH]
+    return foreign
 
 
 @contextlib.contextmanager
@@ -301,20 +379,31 @@ def _bound(port: int) -> socket.socket:
 
 
 def guard(orders: Iterable[str]) -> None:
-    """Read `+GROUP` and `-GROUP` until the end of the orders, then stop the groups that stay.
+    """Read `+GROUP STAGE FAREWELL` and `-GROUP` until the end, then stop what stays.
 
-    The end comes when the orchestrator closes the pipe or the kernel does it after its death.
+    One stage goes after the other. The end comes when the orchestrator closes the pipe or the
+    kernel does it after its death.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    groups: set[int] = set()
+    stages: dict[int, int] = {}
+    farewells: dict[int, float] = {}
     for order in orders:
-        sign, group = order[0], int(order[1:])
-        (groups.add if sign == '+' else groups.discard)(group)
-    stop_groups(
-        lambda: [group for group in groups if group_exists(group)],
-        lambda: time.sleep(0.02), lambda: False,
-    )
+        group, *more = order[1:].split()
+        if order[0] == '+':
+            stages[int(group)], farewells[int(group)] = int(more[0]), float(more[1])
+        else:
+            stages.pop(int(group), None)
+    for now in sorted(set(stages.values())):
+        groups = [group for group, stage in stages.items() if stage == now]
+        stop_groups(
+            partial(_existing, groups), lambda: time.sleep(0.02), lambda: False,
+            max(farewells[group] for group in groups),
+        )
+
+
+def _existing(groups: Sequence[int]) -> list[int]:
+    return [group for group in groups if group_exists(group)]
 
 
 if __name__ == '__main__':

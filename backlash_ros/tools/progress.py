@@ -15,29 +15,33 @@ PLAIN_LINE_PERIOD_S = 2.0
 
 
 class ProgressDisplay:
-    """Shows the progress events of the recorder.
+    """Shows the progress events of one recorder.
 
-    samples: how many make a whole run. sample_period [s]. stream: a terminal gets a bar that
-    moves, a file or pipe a line every two seconds.
+    samples: how many make a whole run, 0 for one without end. sample_period [s]. stream: a
+    terminal gets a bar that moves, a file or pipe a line every two seconds. axis: its name, if
+    there are several, and line: the one of its bar among theirs.
     """
 
-    def __init__(self, samples: int, sample_period: float, stream: TextIO) -> None:
+    def __init__(
+        self, samples: int, sample_period: float, stream: TextIO, axis: str = '', line: int = 0,
+    ) -> None:
         self._samples, self._sample_period, self._stream = samples, sample_period, stream
+        self._title = f'{axis}: ' if axis else ''
         self._last_line = -PLAIN_LINE_PERIOD_S
         self._closed = False
         self._bar: tqdm[None] | None = None
         if _has_room(stream):
             tqdm.monitor_interval = 0  # no thread beside the loop that starts processes
+            done = '{percentage:3.0f} % |{bar:16}| {n_fmt}/{total_fmt}' if samples else '{n_fmt}'
             self._bar = tqdm(
-                total=samples, file=stream, dynamic_ncols=True, leave=True,
-                bar_format='{percentage:3.0f} % |{bar:16}| {n_fmt}/{total_fmt}{postfix}',
+                total=samples or None, file=stream, dynamic_ncols=True, leave=True, position=line,
+                bar_format=f'{self._title}{done}{{postfix}}',
             )
 
-    def show(self, progress: Mapping[str, object]) -> None:
-        """Show one progress event; after `close` nothing is shown."""
+    def show(self, progress: Mapping[str, object], made: int) -> None:
+        """Show one progress event; made: samples so far. After `close` nothing is shown."""
         if self._closed:
             return
-        made = int(number(progress, 'sample')) + 1
         text = describe(progress)
         if self._bar is not None:
             self._bar.n = made
@@ -45,7 +49,15 @@ class ProgressDisplay:
         elif time.monotonic() >= self._last_line + PLAIN_LINE_PERIOD_S:
             self._last_line = time.monotonic()
             t = made * self._sample_period
-            print(f'{t:7.2f} s  {made}/{self._samples}  {text}', file=self._stream, flush=True)
+            of_all = f'/{self._samples}' if self._samples else ''
+            self.say(f'{self._title}{t:7.2f} s  {made}{of_all}  {text}')
+
+    def say(self, line: str) -> None:
+        """Print a line above the bar."""
+        if self._bar is not None and not self._closed:
+            self._bar.write(line, file=self._stream)
+        else:
+            print(line, file=self._stream, flush=True)
 
     def close(self) -> None:
         """Leave the bar as it is and free the line below it."""

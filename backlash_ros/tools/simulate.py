@@ -57,7 +57,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _simulate(args: Sequence[str] | None) -> None:
     options = _parser().parse_args(args)
-    parameters = effective_parameters(options.config, options.settings, options.seed)
+    parameters = effective_parameters(
+        options.config, options.settings, options.seed, options.axis
+    )
     if options.seeds is not None and options.seeds < 1:
         raise InputError(f'--seeds={options.seeds} must be >= 1')
     if options.seeds is None and not options.sweep:
@@ -88,8 +90,8 @@ def _refuse_bad(out: Path | None) -> None:
         result_directory(out)
 
 
-def run_table(summary: Mapping[str, Any]) -> str:
-    """Table of the estimates of one run, as text."""
+def run_table(summary: Mapping[str, Any], title: str = '') -> str:
+    """Table of the estimates of one run, as text; title: of its first column."""
     rows = []
     for name in BACKLASH:
         final, truth = summary['final'][name], summary['truth'][name]
@@ -99,7 +101,7 @@ def run_table(summary: Mapping[str, Any]) -> str:
             '-' if truth is None else f'{truth:.6g}', relative_error(final, truth),
             '-' if truth is None else 'never' if settled is None else f'{settled:.4g} s',
         ))
-    return format_table(('', 'estimate', 'std', 'truth', 'error', 'within 1 % from'), rows)
+    return format_table((title, 'estimate', 'std', 'truth', 'error', 'within 1 % from'), rows)
 
 
 def _many(parameters: Parameters, options: argparse.Namespace) -> None:

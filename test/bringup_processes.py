@@ -1,0 +1,128 @@
+"""Helpers for tests of bringup as a process: start it, and find all that it has started."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rosbags.highlevel import AnyReader
+
+from backlash_ros.tools import bringup
+
+DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
+
+
+def wait_until(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
+        time.sleep(0.02)
+
+
+def marked_processes(mark: str) -> dict[int, str]:
+    """Command lines of all processes whose environment holds the mark, by process id."""
+    found = {}
+    for folder in Path('/proc').glob('[0-9]*'):
+        try:
+            if mark.encode() in (folder / 'environ').read_bytes():
+                command = (folder / 'cmdline').read_bytes().replace(b'\0', b' ')
+                found[int(folder.name)] = command.decode().strip()
+        except OSError:
+            continue  # gone meanwhile, or of another user
+    return found
+
+
+@dataclass
+class Session:
+    """A bringup that was started; all its processes carry the mark in their environment."""
+
+    process: subprocess.Popen[bytes]
+    mark: str
+    out: Path
+    stdout_file: Path
+    stderr_file: Path
+
+    @property
+    def stdout(self) -> str:
+        return self.stdout_file.read_text()
+
+    @property
+    def stderr(self) -> str:
+        return self.stderr_file.read_text()
+
+    def wait(self) -> int:
+        return self.process.wait(DEADLINE_S)
+
+    def wait_for_samples(self, axis: str = '') -> None:
+        """Return once the progress tells of samples, of the axis if its title is given."""
+        wait_until(
+            lambda: self.process.poll() is not None or any(
+                ' lost ' in line and line.startswith(axis) for line in self.stderr.splitlines()
+            ), 'progress',
+        )
+        assert self.process.poll() is None, self.stderr
+
+    def survivors(self) -> dict[int, str]:
+        return marked_processes(self.mark)
+
+    def node(self, name: str, namespace: str = '') -> int:
+        """Process id of a node."""
+        module = f'backlash_ros.nodes.{name} '
+        (pid,) = (
+            pid for pid, command in self.survivors().items()
+            if module in command and namespace in command.split(' -r ')[-1]
+        )
+        return pid
+
+
+@contextmanager
+def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
+    """Start bringup with arguments; whatever is left of it at the end is killed."""
+    sessions: list[Session] = []
+
+    def start_session(*arguments: str, variables: Mapping[str, str] | None = None) -> Session:
+        own = folder / str(len(sessions))
+        own.mkdir()
+        mark = f'BACKLASH_TEST_RUN={uuid.uuid4()}'
+        name, value = mark.split('=')
+        environment = {**os.environ, name: value}
+        for variable in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
+            environment.pop(variable, None)
+        environment.update(variables or {})
+        stdout, stderr = own / 'stdout.txt', own / 'stderr.txt'
+        with stdout.open('wb') as out, stderr.open('wb') as err:
+            process = subprocess.Popen(
+                [sys.executable, '-m', 'backlash_ros.tools.bringup', '--out',
+                 str(own / 'results'), *arguments],
+                stdout=out, stderr=err, env=environment,
+                cwd=Path(bringup.__file__).resolve().parents[2],
+            )
+        session = Session(process, mark, own / 'results', stdout, stderr)
+        sessions.append(session)
+        return session
+
+    try:
+        yield start_session
+    finally:
+        for session in sessions:
+            for pid in session.survivors():
+                os.kill(pid, signal.SIGKILL)
+            session.wait()
+
+
+def bag_counts(bag: Path) -> dict[str, int]:
+    """Messages per topic, without the leading slash."""
+    with AnyReader([bag]) as reader:
+        counts: dict[str, int] = {}
+        for connection, _, _ in reader.messages():
+            topic = connection.topic.lstrip('/')
+            counts[topic] = counts.get(topic, 0) + 1
+        return counts
