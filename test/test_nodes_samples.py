@@ -126,3 +126,75 @@ def test_reports_over_lost_outputs_are_used_one_by_one() -> None:
     for k in (1, 2, 3):
         commands.report(10.0 * k, START_NS + k * PERIOD_NS - 1000)
     assert commands.reported_over(3, START_NS + 3 * PERIOD_NS) == [10.0, 20.0, 30.0]
+
+
+def paced_counter(samples: int = 40) -> tuple[SampleCounter, int]:
+    """A counter that has seen a sender keep time, and the stamp of its next sample."""
+    counter = SampleCounter(PERIOD_S)
+    for k in range(samples):
+        assert counter.count(START_NS + k * PERIOD_NS, 1 + k).is_sample
+    return counter, START_NS + samples * PERIOD_NS
+
+
+@given(st.lists(st.floats(0.01, 0.6), min_size=1, max_size=30))
+def test_repetitions_and_floods_are_no_samples(shares: list[float]) -> None:
+    counter, due = paced_counter()
+    number = 40
+    for k in range(20):
+        number += 1
+        assert counter.count(due + k * PERIOD_NS, number) == Arrival(is_sample=True)
+        for share in sorted(shares):
+            number += 1
+            assert not counter.count(due + int((k + share) * PERIOD_NS), number).is_sample
+    assert counter.index == 59
+
+
+def test_flood_of_which_the_middleware_drops_a_part_leaves_some_samples() -> None:
+    counter, due = paced_counter()
+    used = [
+        counter.count(due + k * PERIOD_NS + i * 1000, 41 + 20 * k + i).is_sample
+        for k in range(60) for i in range(10, 20)
+    ]
+    assert 20 <= sum(used) <= 60
+
+
+@given(st.integers(1, 10**6), st.floats(0.0, 1.0))
+def test_second_sender_is_refused_while_the_first_one_sends(first: int, phase: float) -> None:
+    counter, due = paced_counter()
+    accepted = 0
+    for k in range(100):
+        arrivals = [
+            (due + k * PERIOD_NS, 41 + k, True),
+            (due + int((k + phase) * PERIOD_NS), 10**7 + first + k, False),
+        ]
+        for stamp, number, own in sorted(arrivals):
+            accepted += counter.count(stamp, number).is_sample and not own
+    assert accepted == 0
+    assert counter.index == 139
+
+
+@given(st.integers(10, 10**7))
+def test_sender_that_begins_anew_after_a_silence_is_taken_up(silence: int) -> None:
+    counter, due = paced_counter(100)
+    start = due + silence * PERIOD_NS
+    arrivals = [counter.count(start + k * PERIOD_NS, 1 + k) for k in range(20)]
+    assert sum(arrival.anew for arrival in arrivals) == 1
+    assert all(arrival.is_sample for arrival in arrivals[5:])
+
+
+@given(st.integers(-10**9, -6))
+def test_clock_that_is_set_back_is_believed_after_some_samples(jump: int) -> None:
+    counter = SampleCounter(PERIOD_S)
+    for k in range(40):
+        counter.count(START_NS * 10 + k * PERIOD_NS)
+    start = START_NS * 10 + (40 + jump) * PERIOD_NS
+    arrivals = [counter.count(start + k * PERIOD_NS) for k in range(20)]
+    assert all(arrival.is_sample for arrival in arrivals[5:])
+    assert sum(arrival.anew for arrival in arrivals) == 1
+
+
+def test_sender_that_answers_at_once_is_counted_by_number() -> None:
+    counter = SampleCounter(PERIOD_S)
+    stamps = [START_NS + k * PERIOD_NS // 20 for k in range(1000)]
+    arrivals = [counter.count(stamp, 1 + k) for k, stamp in enumerate(stamps)]
+    assert all(arrival == Arrival(is_sample=True) for arrival in arrivals)

@@ -1,0 +1,50 @@
+"""The commands that end a loop: within the limits, and where they are meant to end."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import inf
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.controller import Limits
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.last_command import last_commands
+from backlash_ros.core.parameters import Parameters
+
+values = st.floats(-1e3, 1e3)
+
+
+@given(values, st.floats(0.5, 1e3), st.floats(-1e3, 999.0), st.floats(1e-3, 2e3))
+def test_ramp_goes_to_the_v_nearest_to_zero_as_fast_as_the_limits_allow(
+    v: float, move: float, low: float, width: float,
+) -> None:
+    limits = Limits(low, low + width, move)
+    v = limits.apply(v, v)
+    commands = [v, *last_commands('ramp', v, limits)]
+    assert abs(commands[-1]) == min(abs(min(max(0.0, low), low + width)), abs(v))
+    for before, after in pairwise(commands):
+        assert abs(after - before) <= move * (1.0 + 1e-9)
+        assert low <= after <= low + width
+
+
+@given(values)
+def test_hold_sends_nothing_and_zero_one_command(v: float) -> None:
+    assert list(last_commands('hold', v, Limits())) == []
+    assert list(last_commands('zero', v, Limits())) == [0.0]
+    assert list(last_commands('zero', v, Limits(low=2.0))) == [2.0]
+
+
+def test_ramp_from_an_absurd_v_ends() -> None:
+    assert len(list(last_commands('ramp', 1e300, Limits(move=1.0)))) < 3
+
+
+@pytest.mark.parametrize('name', ['on_stop', 'on_timeout'])
+def test_ramp_without_a_rate_is_refused(name: str) -> None:
+    with pytest.raises(ParameterError, match=r'needs a finite control\.rate_max'):
+        build_controller(Parameters({name: 'ramp'}))
+    assert Parameters({})['control.rate_max'] == inf
+    build_controller(Parameters({name: 'ramp', 'control.rate_max': 10.0}))

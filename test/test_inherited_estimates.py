@@ -1,0 +1,84 @@
+"""A controller that goes on with what was learned before, and one that is told not to learn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
+from backlash_ros.core.controller import AdaptiveController
+from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.parameters import Parameters
+
+TRUE = np.array([1.3, 3.0, -3.0])
+
+
+class Loop:
+    """Plant and reference that outlive their controllers."""
+
+    def __init__(self, p: Parameters) -> None:
+        self.plant, self._reference = build_plant(p), build_reference(p)
+        self._period = p.real('sample_period')
+
+    def run(self, controller: AdaptiveController, samples: int) -> list[Estimate]:
+        estimates = []
+        for _ in range(samples):
+            y_m = self._reference(self.plant.sample * self._period)
+            step = controller.step(self.plant.measure(), y_m)
+            controller.refine()
+            self.plant.step(step.v)
+            estimates.append(step.estimate)
+        return estimates
+
+
+def errors(estimates: list[Estimate]) -> np.ndarray:
+    values = np.array([(e.m, e.c_r, e.c_l) for e in estimates])
+    return np.asarray(np.abs(values / TRUE - 1.0).max(axis=1))
+
+
+@pytest.mark.parametrize('structure', ['proportional', 'tracking'])
+@pytest.mark.parametrize('noise', [0.0, 1e-3])
+def test_inherited_estimate_holds_from_the_first_sample_on(structure: str, noise: float) -> None:
+    p = Parameters({'structure': structure, 'output_noise_std': noise})
+    loop = Loop(p)
+    first = build_controller(p)
+    learned = loop.run(first, 400)[-1]
+    second = build_controller(p, learned)
+    second.start_from(first.inverse.v)
+    after = loop.run(second, 400)
+    assert after[0].status == Status.ACQUIRING
+    assert after[-1].status == Status.TRACKING
+    assert errors(after).max() < 0.05
+    assert errors(after[-1:])[0] < 0.005
+
+
+def test_backlash_that_changed_meanwhile_is_learned_anew() -> None:
+    p = Parameters({'output_noise_std': 1e-3})
+    wrong = Estimate(2.0, 5.0, -1.0, 0.22, 1e-4, 1e-4, 1e-4, Status.TRACKING)
+    after = Loop(p).run(build_controller(p, wrong), 1500)
+    assert errors(after[-1:])[0] < 0.01
+
+
+@pytest.mark.parametrize('law', ['kalman', 'lms', 'printed', 'gradient'])
+def test_held_estimates_do_not_move_and_learning_can_go_on(law: str) -> None:
+    structure = 'pole_placement' if law == 'gradient' else 'proportional'
+    p = Parameters({'estimator.law': law, 'structure': structure})
+    loop, controller = Loop(p), build_controller(p)
+    loop.run(controller, 300)
+    controller.estimator.adapting = False
+    held = {(e.m, e.c_r, e.c_l) for e in loop.run(controller, 200)[2:]}
+    assert len(held) == 1
+    controller.estimator.adapting = True
+    moving = {(e.m, e.c_r, e.c_l) for e in loop.run(controller, 300)}
+    assert len(moving) > 1
+    if law in ('kalman', 'lms'):
+        assert errors([controller.estimator.estimate])[0] < 0.05
+
+
+def test_estimator_that_is_held_before_it_knows_anything_learns_afterwards() -> None:
+    p = Parameters({'output_noise_std': 1e-3})
+    loop, controller = Loop(p), build_controller(p)
+    controller.estimator.adapting = False
+    assert {e.m for e in loop.run(controller, 100)} == {0.696}
+    controller.estimator.adapting = True
+    assert errors(loop.run(controller, 400)[-1:])[0] < 0.02

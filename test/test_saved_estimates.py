@@ -1,0 +1,110 @@
+"""Estimates in a file: what is saved comes back, what does not fit is refused with the reason."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import isnan, nan
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.saved_estimates import load_estimate, save_estimate, worth_saving
+
+LEARNED = Estimate(1.25, 2.5, -3.5, 0.2, 0.01, 0.02, 0.03, Status.TRACKING)
+
+
+def parameters(file: Path, **values: object) -> Parameters:
+    return Parameters({'estimates.file': str(file), 'estimates.load': True, **values})
+
+
+@given(
+    st.floats(0.01, 100.0), st.floats(0.0, 100.0), st.floats(-100.0, 0.0), st.floats(-0.5, 0.5),
+    st.one_of(st.just(nan), st.floats(0.0, 10.0)),
+)
+def test_saved_estimate_comes_back_to_the_last_bit(
+    tmp_path_factory: pytest.TempPathFactory, m: float, c_r: float, c_l: float, f: float,
+    std: float,
+) -> None:
+    p = parameters(tmp_path_factory.mktemp('saved') / 'estimates.json')
+    estimate = Estimate(m, c_r, c_l, f, std, std, std)
+    save_estimate(Path(p.word('estimates.file')), estimate, p)
+    loaded = load_estimate(p)
+    assert loaded is not None
+    assert (loaded.m, loaded.c_r, loaded.c_l, loaded.f) == (m, c_r, c_l, f)
+    assert loaded.std_m == std or (isnan(std) and not loaded.learned)
+
+
+def test_nothing_is_loaded_unless_asked_or_before_it_was_saved(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    assert load_estimate(parameters(file)) is None
+    save_estimate(file, LEARNED, parameters(file))
+    assert load_estimate(Parameters({'estimates.file': str(file)})) is None
+    with pytest.raises(ParameterError, match='must name a file'):
+        load_estimate(Parameters({'estimates.load': True}))
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('sample_period', 0.02),
+        ('plant.numerator', [1e-5, 4e-5, 2e-5]),
+        ('control.delay_samples', 1),
+        ('estimator.bounds.c_r', [0.0, 50.0]),
+    ],
+)
+def test_estimates_of_another_plant_are_refused(tmp_path: Path, name: str, value: object) -> None:
+    file = tmp_path / 'estimates.json'
+    save_estimate(file, LEARNED, parameters(file))
+    with pytest.raises(ParameterError, match=f'was learned with {name}='):
+        load_estimate(parameters(file, **{name: value}))
+
+
+@pytest.mark.parametrize(
+    'content',
+    ['', '{', '[]', '3', '{"version": 1}', 'null', '{"version": 1, "key": {}, "estimate": 2}',
+     '{"version": 1, "key": {}, "estimate": {"m": "1"}}', '\x00', '"estimate"'],
+)
+def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, content: str) -> None:
+    file = tmp_path / 'estimates.json'
+    file.write_text(content)
+    with pytest.raises(ParameterError, match=r'estimates\.file='):
+        load_estimate(parameters(file))
+
+
+@pytest.mark.parametrize(
+    ('part', 'value', 'reason'),
+    [('m', 1000.0, 'outside of estimator.bounds.m'), ('c_r', -1.0, 'outside'),
+     ('c_l', None, 'no finite c_l')],
+)
+def test_values_that_cannot_be_are_refused(
+    tmp_path: Path, part: str, value: float | None, reason: str,
+) -> None:
+    file = tmp_path / 'estimates.json'
+    save_estimate(file, LEARNED, parameters(file))
+    content = json.loads(file.read_text())
+    content['estimate'][part] = value
+    file.write_text(json.dumps(content))
+    with pytest.raises(ParameterError, match=reason):
+        load_estimate(parameters(file))
+
+
+def test_file_of_another_format_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    save_estimate(file, LEARNED, parameters(file))
+    file.write_text(file.read_text().replace('"version": 1', '"version": 2'))
+    with pytest.raises(ParameterError, match='has format 2'):
+        load_estimate(parameters(file))
+
+
+def test_a_first_guess_is_not_worth_saving() -> None:
+    assert worth_saving(LEARNED)
+    assert not worth_saving(Estimate(1.0, 1.0, -1.0, 0.2))
+    # Laws without deviations.
+    assert worth_saving(Estimate(1.0, 1.0, -1.0, 0.2, status=Status.TRACKING))
+    assert worth_saving(replace(LEARNED, status=Status.INCONSISTENT))
