@@ -21,6 +21,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.guard_condition import GuardCondition
 from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
@@ -40,8 +41,8 @@ LONGEST_BLINDNESS_NS = 20_000_000  # without a look at callbacks, be the period 
 class ProcessNode(Node):
     """A node that is the purpose of its process: parameters checked, then work until stopped."""
 
-    def __init__(self, executable: str) -> None:
-        """Raises ParameterError."""
+    def __init__(self, executable: str, parameters_of: str = '') -> None:
+        """parameters_of: the executable whose parameters it reads. Raises ParameterError."""
         try:
             super().__init__(executable, automatically_declare_parameters_from_overrides=True)
         except ValueError:
@@ -49,14 +50,15 @@ class ProcessNode(Node):
                 executable, None, 'has a parameter without a value', 'give it one or leave it out'
             ) from None
         self.log = Node.get_logger(self)
-        self.settings = declare_parameters(self, executable)
+        self.settings = declare_parameters(self, parameters_of or executable)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.stopping = False
         self.stop_request = self.create_guard_condition(self._stop)
 
     def listen(
         self, message_type: type[Any], topic: str,
-        callback: Callable[[Any, dict[str, Any]], None], depth: int, raw: bool = False,
+        callback: Callable[[Any, dict[str, Any]], None], depth: int | QoSProfile,
+        raw: bool = False,
     ) -> Subscription:
         """Subscribe with a callback that also gets time stamp and number of the message."""
         # rclpy takes such callbacks but does not say so in its types.
