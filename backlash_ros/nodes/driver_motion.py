@@ -40,6 +40,7 @@ MOTION_SUBJECTS = (DELAY, SIGN, MODEL, NOISE, BACKLASH)
 DECISIVE = 10.0  # log-likelihood by which one delay beats another
 SHOWS = 15.0  # log-likelihood by which y shows v at all
 PREDICTED = 0.9  # share of the motion of y that G has to predict
+BOUND_SLACK = 0.01  # of a value that lies outside its bounds without harm
 NOISIER = 3.0  # times the given deviation of the noise
 COLOURED = 0.5  # correlation of successive residuals that noise of a sensor does not have
 OTHER_PERIODS = (0.05, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0)
@@ -169,10 +170,11 @@ def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
         )
     if fit.predicted < PREDICTED:
         return _only(MODEL, *_mismatch(fit, model, record, p))
+    found = _crossings(fit, record, p)
     return [
-        _delay(fit, record.lag, p), _sign(fit, p),
+        _delay(fit, record.lag, p), _sign(fit, found, p),
         Finding(MODEL, FITS, f'predicts {fit.predicted:.1%} of the motion of y'),
-        _noise(fit, p), _backlash(fit, record, p, swing),
+        _noise(fit, p), _backlash(found, swing),
     ]
 
 
@@ -227,15 +229,18 @@ def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
     )
 
 
-def _sign(fit: RecordFit, p: Parameters) -> Finding:
+def _sign(fit: RecordFit, found: Crossings | None, p: Parameters) -> Finding:
     if fit.m < 0.0:
         return Finding(
             SIGN, WRONG, f'y moves against v: m would be {fit.m:.4g}',
             'change the sign of y or v in the driver, or of plant.numerator',
         )
-    for name, value in (('m', fit.m), ('c_r', fit.c_r), ('c_l', fit.c_l)):
+    values = [('m', fit.m, fit.std_m)]
+    if found is not None:
+        values += [('c_r', found.c_r, found.std_c_r), ('c_l', found.c_l, found.std_c_l)]
+    for name, value, std in values:
         low, high = p.pair(f'estimator.bounds.{name}')
-        slack = max(3.0 * fit.std_m / fit.m, 0.01) * abs(value)
+        slack = 3.0 * std + BOUND_SLACK * abs(value)
         if not low - slack <= value <= high + slack:
             return Finding(
                 SIGN, WRONG, f'{name} would be {value:.4g}, outside [{low:g}, {high:g}]',
@@ -256,13 +261,8 @@ def _noise(fit: RecordFit, p: Parameters) -> Finding:
     return Finding(NOISE, WRONG, found, cure)
 
 
-def _backlash(fit: RecordFit, record: Record, p: Parameters, swing: float) -> Finding:
-    """Read the record with the filters of the loop: how precise are m, c_r, c_l?"""
-    found = _crossings(fit, record, p)
-    known = found is not None and found.std_m <= PRECISE_SLOPE * found.m and (
-        found.std_gap <= max(PRECISE_GAP * found.gap, NO_GAP * swing)
-    )
-    if not known or found is None:
+def _backlash(found: Crossings | None, swing: float) -> Finding:
+    if found is None:
         return Finding(
             BACKLASH, WRONG, f'not identifiable from this motion: v swung by {swing:.4g}',
             'swing v past the gap in both directions, several times; raise --duration',
@@ -276,7 +276,10 @@ def _backlash(fit: RecordFit, record: Record, p: Parameters, swing: float) -> Fi
 
 
 def _crossings(fit: RecordFit, record: Record, p: Parameters) -> Crossings | None:
-    """Estimate of a bank around the gap of the fit, with the sign and delay of the fit."""
+    """Read the record with the filters of the loop around the gap of the fit.
+
+    None unless m, c_r, c_l come out as precise as the loop would publish them.
+    """
     sign = 1.0 if fit.m > 0.0 else -1.0
     model = StateModel(TransferFunction(
         tuple(sign * value for value in p.reals('plant.numerator')),
@@ -297,4 +300,8 @@ def _crossings(fit: RecordFit, record: Record, p: Parameters) -> Crossings | Non
     if not bank.active:
         return None
     bank.elect()
-    return bank.found()
+    found = bank.found()
+    if found is None or found.std_m > PRECISE_SLOPE * found.m:
+        return None
+    precise = found.std_gap <= max(PRECISE_GAP * found.gap, NO_GAP * swing)
+    return found if precise else None

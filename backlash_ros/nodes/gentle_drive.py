@@ -11,8 +11,8 @@ from backlash_ros.core.parameters import Parameters
 PERIODS = 3.0  # of the slower sine, where the speed allows them
 SHARE, FASTER = 0.3, 2.7  # of the second sine; together they tell a delay from a wider gap
 STEEPEST = 1.0 - SHARE + SHARE * FASTER
-STEPS = 5.0  # waves on the way up
-DEPTH = 0.9  # of the waves; below 1 v never turns back
+STEPS = 24  # on the way up; each shows the response of G at all frequencies
+UNEVEN = 0.618  # share of a step by which their times differ, lest they excite one frequency only
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
 class GentleDrive:
     """v(k) from one sample to the next.
 
-    rising: once from the lower to the upper limit without turning back, instead of to and fro.
+    rising: once from the lower to the upper limit, step by step, instead of to and fro.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class GentleDrive:
         self._t = 0.0
         half = 0.5 * (limits.high - limits.low)
         if rising:
-            self._speed = min(1.0 / duration, limits.rate / (2.0 * half * (1.0 + DEPTH)))
+            self._speed = 1.0 / max(duration - 2.0 * half / limits.rate, sample_period)
         else:
             self._speed = min(2.0 * pi * PERIODS / duration, limits.rate / (half * STEEPEST))
 
@@ -95,8 +95,9 @@ class GentleDrive:
         low, high = self.limits.low, self.limits.high
         x = self._speed * self._t
         if self._rising:
-            waves = 2.0 * pi * STEPS
-            x = min(x, 1.0)
-            return low + (high - low) * (x - DEPTH * sin(waves * x) / waves)
+            steps = STEPS * min(x, 1.0)
+            number = int(steps)
+            up = number + (steps - number > UNEVEN * (number * UNEVEN % 1.0))
+            return low + (high - low) * min(up / STEPS, 1.0)
         swing = (1.0 - SHARE) * sin(x) + SHARE * sin(FASTER * x)
         return 0.5 * (low + high) + 0.5 * (high - low) * swing
