@@ -32,6 +32,7 @@ MORE_DELAY = 8  # samples that are tried beyond the expected delay
 FEWEST_ROWS = 10  # per unknown
 # Share of the motion of y that is not worth telling delays apart by.
 FLOOR = 1e-4
+WILD = 6.0  # standard deviations
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
 
 
@@ -122,7 +123,7 @@ class _Problem:
         self, gap: float, delay: int, margins: tuple[float, ...], floor: float,
     ) -> RecordFit:
         """All there is to say about one gap and delay."""
-        solution, residual, variance_of_m = self._solve(gap, delay)
+        solution, residual, variance_of_m = self._solve(gap, delay, trimmed=True)
         null = _least_squares(self._known[self._rows], self._y[self._rows])[1]
         squares, null_squares = float(residual @ residual), float(null @ null)
         m, product = float(solution[-1]), float(solution[-2])
@@ -136,12 +137,24 @@ class _Problem:
             correlation=float(residual[1:] @ residual[:-1]) / max(squares, floor * 1e-12),
         )
 
-    def _solve(self, gap: float, delay: int) -> tuple[Array, Array, float]:
-        """Solution (..., m c_r negated, m), residual, and the variance of m at unit noise."""
+    def _solve(
+        self, gap: float, delay: int, trimmed: bool = False,
+    ) -> tuple[Array, Array, float]:
+        """Solution (..., m c_r negated, m), residual, and the variance of m at unit noise.
+
+        trimmed: solve again without the wildest samples, so that a v that came late now and then
+        does not disturb the rest.
+        """
         moved = self._response(reach_of(self._v, gap))
         rows = self._rows
-        columns = np.column_stack([self._known[rows], moved[rows - delay]])
-        return _least_squares(columns, self._y[rows])
+        columns, y = np.column_stack([self._known[rows], moved[rows - delay]]), self._y[rows]
+        solution, residual, variance = _least_squares(columns, y)
+        if trimmed:
+            distance = np.abs(residual)
+            kept = distance <= WILD * NORMAL_MAD * float(np.median(distance))
+            solution, _, variance = _least_squares(columns[kept], y[kept])
+            residual = y - columns @ solution
+        return solution, residual, variance
 
     def _response(self, u: Array) -> Array:
         """Response of G at rest to u, shape (N + 1,)."""

@@ -44,6 +44,7 @@ from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
 EXECUTABLE = 'check_driver'
 UNFIT = 1
 LOOK_S = 0.1  # between two looks at the graph
+SETTLE_S = 0.5  # after which everybody should have found everybody
 REMIND_S = 3.0  # between two lines that say what is missing
 NOT_OURS = {'/rosout', '/parameter_events'}
 
@@ -67,6 +68,7 @@ class CheckDriverNode(ProcessNode):
         self._driving = False
         self._heard, self._graph = Heard(), Graph()
         self._range_left: float | None = None
+        self._rivals = ''  # who else publishes control
         self._heard_at = inf  # on the steady clock [s]
         self._names = {
             topic: self.resolve_topic_name(topic)
@@ -77,14 +79,19 @@ class CheckDriverNode(ProcessNode):
     def work(self, executor: SingleThreadedExecutor) -> None:
         """Wait for the driver, listen, come to rest, tell."""
         if self._await_driver(executor):
-            if self._drive_is_taken():
-                return
             self._listen()
             try:
                 self._follow(executor)
             finally:
                 self._come_to_rest(executor)
-        self._tell()
+        if self._rivals:
+            print(
+                f'{EXECUTABLE}: {self._names[topics.CONTROL]} is published by {self._rivals}: '
+                'stop that first, or leave --drive out', file=sys.stderr,
+            )
+            self.exit_code = BAD_INPUT
+        else:
+            self._tell()
 
     def _await_driver(self, executor: SingleThreadedExecutor) -> bool:
         deadline = time.monotonic() + self._options.wait
@@ -117,18 +124,6 @@ class CheckDriverNode(ProcessNode):
         print(f'  sees {"besides " if near else ""}{", ".join(others) or "no other topic"}',
               flush=True)
 
-    def _drive_is_taken(self) -> bool:
-        if self._limits is None:
-            return False
-        others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
-        if others:
-            print(
-                f'{EXECUTABLE}: {self._names[topics.CONTROL]} is published by '
-                f'{_names_of(others)}: stop that first, or leave --drive out', file=sys.stderr,
-            )
-            self.exit_code = BAD_INPUT
-        return bool(others)
-
     def _listen(self) -> None:
         """Subscribe the way that hears the driver, whatever its QoS."""
         heard = self._heard
@@ -159,12 +154,12 @@ class CheckDriverNode(ProcessNode):
     def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
         self._heard_at = time.monotonic()
         self._heard.outputs.append(_message(message, info))
-        if not self._driving or self._limits is None:
+        if not self._driving or self._limits is None or self._range_left is not None:
             return
         y = message.data
         low, high = self._options.output_range
         if plausible(y) and not low <= y <= high:
-            self._range_left, self._driving = y, False
+            self._range_left = y
             return
         if self._drive is None:
             start = self._heard.applied[-1].value if self._heard.applied else 0.0
@@ -182,7 +177,7 @@ class CheckDriverNode(ProcessNode):
     def _follow(self, executor: SingleThreadedExecutor) -> None:
         """Listen for the duration, and drive."""
         begin = looked = time.monotonic()
-        self._driving = self._limits is not None
+        end = begin + self._options.duration + (0.0 if self._limits is None else SETTLE_S)
         patience = max(self.settings.real('timeout.plant_output'), 10.0 * self._period)
         while not self.stopping:
             executor.spin_once(timeout_sec=LOOK_S)
@@ -190,13 +185,20 @@ class CheckDriverNode(ProcessNode):
             if now > looked + LOOK_S:
                 looked = now
                 self._look_at_graph()
-            if now > begin + self._options.duration or self._range_left is not None:
-                break
-            if self._driving and now > self._heard_at + patience:
+                self._driving = self._may_drive(now - begin)
+            silent = self._driving and now > self._heard_at + patience
+            if now > end or silent or self._rivals or self._range_left is not None:
                 break
         self._look_at_graph()
         self._driving = False
         self._heard.end_ns = time.time_ns()
+
+    def _may_drive(self, listened_s: float) -> bool:
+        """Whether to drive: told to, the graph known by now, heard by a driver, alone."""
+        return (
+            self._limits is not None and listened_s > SETTLE_S and not self._rivals
+            and self._control.get_subscription_count() > 0
+        )
 
     def _come_to_rest(self, executor: SingleThreadedExecutor) -> None:
         drive = self._drive
@@ -216,6 +218,11 @@ class CheckDriverNode(ProcessNode):
         listeners = self.get_subscriptions_info_by_topic(self._names[topics.CONTROL])
         bystanders = (self.get_name(), RECORDER)
         listeners = [info for info in listeners if info.node_name not in bystanders]
+        if self._limits is not None:
+            others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
+            self._rivals = _names_of(
+                [info for info in others if info.node_name != self.get_name()]
+            )
         graph.publishers = max(graph.publishers, len(outputs))
         graph.listeners = max(graph.listeners, len(listeners))
         if outputs:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.controller import plausible
-from backlash_ros.nodes.sample_counter import SampleCounter
+from backlash_ros.nodes.sample_counter import UNNUMBERED, SampleCounter
 
 FLOAT64 = 'std_msgs/msg/Float64'
 
@@ -159,10 +159,16 @@ def _without_doubles(
     outputs: Sequence[Message], sample_period_s: float,
 ) -> tuple[list[Message], int]:
     kept = list(outputs[:1])
+    numbered_doubles = 0  # they must not look like gaps in the numbers
     for message in outputs[1:]:
-        again = message.value == kept[-1].value or message.number == kept[-1].number
-        if not again or message.stamp_ns - kept[-1].stamp_ns > DOUBLE * sample_period_s * 1e9:
+        if message.number != UNNUMBERED:
+            message = message._replace(number=message.number - numbered_doubles)
+        before = kept[-1]
+        again = message.value == before.value or message.number == before.number != UNNUMBERED
+        if not again or message.stamp_ns - before.stamp_ns > DOUBLE * sample_period_s * 1e9:
             kept.append(message)
+        elif message.number != before.number:
+            numbered_doubles += 1
     repeated = len(outputs) - len(kept)
     if repeated > MOSTLY * len(outputs):
         return list(outputs), 0

@@ -168,7 +168,7 @@ def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
             BACKLASH, f'y shows nothing of v, which swung by {swing:.4g}',
             'let v swing wider than the gap; see that the driver applies v',
         )
-    if fit.predicted < PREDICTED:
+    if fit.predicted < PREDICTED or _odd(fit, record.lag, p):
         return _only(MODEL, *_mismatch(fit, model, record, p))
     found = _crossings(fit, record, p)
     return [
@@ -188,6 +188,12 @@ def _only(subject: str, found: str, cure: str) -> list[Finding]:
 def not_judged(subject: str, when: str) -> Finding:
     """A line for what something else hides."""
     return Finding(subject, UNKNOWN, f'can be told {when}')
+
+
+def _odd(fit: RecordFit, lag: int, p: Parameters) -> bool:
+    """Whether a delay that nobody announced came out together with what is not noise."""
+    noisy = fit.noise_std > NOISIER * p.real('estimator.output_noise_std')
+    return noisy and fit.correlation > COLOURED and _delay(fit, lag, p).mark == WRONG
 
 
 def _mismatch(

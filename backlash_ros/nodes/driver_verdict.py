@@ -28,7 +28,7 @@ from backlash_ros.nodes.driver_motion import (
 MESSAGE_SUBJECTS = ('rate', 'jitter', 'lost samples', 'repeated samples', 'clock', 'values')
 # Without these nothing that follows from time or motion means anything.
 BASIC = {'publisher', 'type'}
-NEEDED_FOR_MOTION = {'rate', 'clock'}
+NEEDED_FOR_MOTION = {'listener', 'rate', 'clock'}
 SIMILAR = 0.6
 
 
