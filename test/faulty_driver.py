@@ -1,15 +1,21 @@
-"""A driver in a process of its own, with the fault named as its argument, or `none`."""
+"""A driver in a process of its own, with the fault named as its argument, or `none`.
+
+At the end it prints by which share of a period the machine held it up at most.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import signal
 import sys
 import time
 from math import nan
 
 import rclpy
 from made_up_driver import PERIOD_S, plant_parameters
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 
 from backlash_ros.core.assembly import build_plant
@@ -24,6 +30,7 @@ class FaultyDriver:
         self.fault, self.sample = fault, 0
         self.period = PERIOD_S * (1.25 if fault == 'rate' else 1.0)
         self.plant = build_plant(plant_parameters())
+        self.held_up = 0.0  # share of a period
         self.commands = [0.0, 0.0, 0.0]  # the newest one last, one per sample
         self.node = rclpy.create_node('faulty_driver')
         profile = QoSProfile(
@@ -60,14 +67,15 @@ class FaultyDriver:
             while (remaining := due - time.monotonic()) > 0.0:
                 executor.spin_once(timeout_sec=remaining)
             executor.spin_once(timeout_sec=0.0)
+            self.held_up = max(self.held_up, (time.monotonic() - due) / self.period)
             self.advance()
 
 
 if __name__ == '__main__':
-    rclpy.init(args=[])
-    try:
-        FaultyDriver(sys.argv[1]).run()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        rclpy.try_shutdown()
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    driver = FaultyDriver(sys.argv[1])
+    with contextlib.suppress(KeyboardInterrupt):
+        driver.run()
+    print(driver.held_up)
+    rclpy.try_shutdown()

@@ -130,7 +130,7 @@ class RosWorld:
     def __init__(self, folder: Path, domain: int, stack: ExitStack) -> None:
         self.folder = folder
         self._domain, self._stack = domain, stack
-        self._environment = child_environment(folder, domain)
+        self.environment = child_environment(folder, domain)
 
     def start(
         self, executable: str, parameters: Mapping[str, object] | None = None, *arguments: str,
@@ -141,7 +141,7 @@ class RosWorld:
             text = value if isinstance(value, str) else json.dumps(value)
             ros_arguments += ['-p', f'{name}:={text}']
         process = NodeProcess(
-            executable, [*ros_arguments, *arguments], self.folder, self._environment
+            executable, [*ros_arguments, *arguments], self.folder, self.environment
         )
         self._stack.callback(process.kill)
         return process

@@ -22,6 +22,9 @@ from backlash_ros.tools.processes import child_environment, free_domain
 HERE = Path(__file__).resolve().parent
 DURATION_S = 6.0
 DEADLINE_S = 60.0
+# A machine under load may hold the driver up: then the check is right to find fault with it, and
+# the run says nothing.
+HELD_UP, ATTEMPTS = 0.3, 5
 
 
 class Bench:
@@ -30,6 +33,7 @@ class Bench:
     def __init__(self, folder: Path, domain: int) -> None:
         self.folder, self.domain = folder, domain
         self.environment = child_environment(folder, domain)
+        self.driver: subprocess.Popen[str] | None = None
         self.config = folder / 'driver.yaml'
         # JSON is YAML.
         self.config.write_text(json.dumps({'/**': {'ros__parameters': parameters()}}))
@@ -54,24 +58,39 @@ class Bench:
             process.kill()
         return process.returncode, out + err
 
+    def held_up(self) -> float:
+        """End the driver; return by which share of a period it was held up at most."""
+        assert self.driver is not None
+        self.driver.terminate()
+        return float(self.driver.communicate(timeout=DEADLINE_S)[0])
+
 
 @contextmanager
 def bench(folder: Path, fault: str = '') -> Iterator[Bench]:
     """A bench with a driver of this fault, or with none."""
     with free_domain() as domain:
         beside = Bench(folder, domain)
-        driver = None
         if fault:
-            driver = subprocess.Popen(
-                [sys.executable, str(HERE / 'faulty_driver.py'), fault],
-                env=beside.environment, stdin=subprocess.DEVNULL,
+            beside.driver = subprocess.Popen(
+                [sys.executable, str(HERE / 'faulty_driver.py'), fault], text=True,
+                env=beside.environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             )
         try:
             yield beside
         finally:
-            if driver is not None:
-                driver.kill()
-                driver.wait()
+            if beside.driver is not None:
+                beside.driver.kill()
+                beside.driver.communicate()
+
+
+def check_undisturbed(folder: Path, fault: str, *options: str) -> tuple[int, str]:
+    """Run check_driver beside a driver that the machine did not hold up."""
+    for _ in range(ATTEMPTS):
+        with bench(folder, fault) as beside:
+            checked = beside.check(*options)
+            if beside.held_up() < HELD_UP:
+                break
+    return checked
 
 
 def subjects(told: str, mark: str) -> list[str]:
@@ -82,8 +101,9 @@ def subjects(told: str, mark: str) -> list[str]:
 
 
 def test_a_good_driver_passes_and_its_record_is_saved(tmp_path: Path) -> None:
-    with bench(tmp_path, 'none') as beside:
-        code, told = beside.check('--drive', '--save', str(tmp_path / 'record.csv'))
+    code, told = check_undisturbed(
+        tmp_path, 'none', '--drive', '--save', str(tmp_path / 'record.csv')
+    )
     assert (code, subjects(told, '✗')) == (0, []), told
     with (tmp_path / 'record.csv').open(newline='') as file:
         rows = list(csv.DictReader(file))
@@ -96,15 +116,13 @@ def test_a_good_driver_passes_and_its_record_is_saved(tmp_path: Path) -> None:
     ('second', 'publisher'), ('delay', 'reaction delay'), ('sign', 'sign and units'),
 ])
 def test_a_fault_is_told_and_only_that(tmp_path: Path, fault: str, subject: str) -> None:
-    with bench(tmp_path, fault) as beside:
-        code, told = beside.check('--drive')
+    code, told = check_undisturbed(tmp_path, fault, '--drive')
     assert (code, subjects(told, '✗')) == (1, [subject]), told
     assert '→' in told
 
 
 def test_listening_alone_does_not_move_v(tmp_path: Path) -> None:
-    with bench(tmp_path, 'none') as beside:
-        code, told = beside.check('--duration', '2')
+    code, told = check_undisturbed(tmp_path, 'none', '--duration', '2')
     assert (code, subjects(told, '✗')) == (1, ['backlash']), told
     assert 'check_driver --drive' in told
 
@@ -113,10 +131,9 @@ def test_a_topic_of_another_name_is_pointed_out(tmp_path: Path) -> None:
     with bench(tmp_path, 'name') as beside:
         code, told = beside.check('--wait', '3')
         assert code == 1
-        assert '--ros-args -r plant_output:=/motor/plant_output' in told
-        code, told = beside.check(
-            '--drive', '--ros-args', '-r', 'plant_output:=/motor/plant_output'
-        )
+    remap = ['--ros-args', '-r', 'plant_output:=/motor/plant_output']
+    assert ' '.join(remap) in told
+    code, told = check_undisturbed(tmp_path, 'name', '--drive', *remap)
     assert (code, subjects(told, '✗')) == (0, []), told
 
 
