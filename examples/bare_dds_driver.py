@@ -40,7 +40,7 @@ SAMPLE_PERIOD_S = 0.01
 EARLY = 0.1  # of a period
 RELIABLE = Qos(
     Policy.Reliability.Reliable(max_blocking_time=100_000_000), Policy.Durability.Volatile,
-    Policy.History.KeepLast(10),
+    Policy.History.KeepLast(100),
 )
 
 

@@ -29,6 +29,8 @@ BLOCKS = re.findall(
 FOREVER = ('motor_driver.py', 'bare_dds_driver.py', '/controller', '/reference')
 SHORT = {'--duration': '3'}  # s; the pages give a user more time
 DEADLINE_S = 90.0
+# Of a driver that a machine under load holds up, a run says nothing.
+HELD_UP, ATTEMPTS = ('✗ jitter', '✗ lost samples'), 5
 
 sys.path.insert(0, str(EXAMPLES))
 from find_model import find_model, rising_part  # noqa: E402
@@ -55,7 +57,7 @@ def final_estimates(world: RosWorld, driver: str) -> tuple[float, float, float]:
     probe = world.probe()
     heard = probe.collect(topics.ESTIMATES, Float64MultiArray)
     world.start('reference')
-    world.start('controller')
+    world.start('controller', {'estimator.use_applied_control': True})
     with running([sys.executable, str(EXAMPLES / driver)], world.environment):
         probe.wait_until(lambda: heard and within_one_percent(heard[-1]), 'estimates within 1 %')
     m, c_r, c_l = heard[-1].data[:3]
@@ -175,12 +177,14 @@ def run_or_start(
             process.kill()
             process.wait()
         started.clear()
-    done = subprocess.run(
-        runnable(words), cwd=folder, env=environment, capture_output=True, text=True,
-        timeout=DEADLINE_S,
-    )
+    for _ in range(ATTEMPTS):
+        done = subprocess.run(
+            runnable(words), cwd=folder, env=environment, capture_output=True, text=True,
+            timeout=DEADLINE_S,
+        )
+        if not any(word in done.stdout for word in HELD_UP):
+            break
     if 'check_driver' in text:
-        # A busy machine disturbs the timing of a driver with 5 ms; its motion it does not.
         assert done.returncode in (0, 1), done.stderr
         assert '✓ sign and units' in done.stdout, done.stdout + done.stderr
         assert '✓ G(z)' in done.stdout, done.stdout

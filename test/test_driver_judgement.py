@@ -124,11 +124,12 @@ def test_values_that_are_no_numbers_are_told_and_left_out(bad: float) -> None:
 def test_jitter_is_told_where_samples_come_a_period_late_now_and_then() -> None:
     heard = heard_from_driver()
     late = int(0.7 * PERIOD_S * 1e9)
-    heard.outputs[5::10] = [
-        m._replace(stamp_ns=m.stamp_ns + late, received_ns=m.received_ns + late)
-        for m in heard.outputs[5::10]
-    ]
-    assert 'jitter' in subjects(faults(heard))
+    for sent in (heard.outputs, heard.controls):
+        sent[5::10] = [
+            m._replace(stamp_ns=m.stamp_ns + late, received_ns=m.received_ns + late)
+            for m in sent[5::10]
+        ]
+    assert subjects(faults(heard)) == ['jitter']
 
 
 def test_clocks_that_disagree_hide_what_follows_from_them() -> None:

@@ -21,6 +21,7 @@ FITS, WRONG, UNKNOWN = '✓', '✗', '–'
 
 FEWEST_SAMPLES = 20
 PERIOD_TOLERANCE = 0.01  # what the controller's count of samples follows
+UNSTEADY_TOLERANCE = 0.1  # where samples come in bursts
 LATENESS = 0.5  # of a period: beyond 0.85 the controller takes it for a loss
 LOSS = 0.01  # share of lost samples that a driver may have
 DOUBLE = 0.25  # of a period: the same value again within it is the same sample
@@ -149,9 +150,13 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
     lateness = float(np.quantile(late, 0.99) - np.quantile(late, 0.01)) / float(slope)
     # A driver that fell silent for good loses samples as well.
     missing += max(int((heard.end_ns - outputs[-1].stamp_ns) / rough) - 1, 0)
+    # Amid bursts the samples cannot be counted for certain; most intervals tell the period still.
+    steady = lateness <= LATENESS
+    period = float(slope) if steady else rough * 1e-9
+    tolerance = PERIOD_TOLERANCE if steady else UNSTEADY_TOLERANCE
     return Timing(
-        outputs, numbers, float(slope), missing, repeated, lateness,
-        abs(float(slope) / sample_period_s - 1.0) <= PERIOD_TOLERANCE,
+        outputs, numbers, period, missing, repeated, lateness,
+        abs(period / sample_period_s - 1.0) <= tolerance,
     )
 
 
