@@ -208,6 +208,16 @@ def test_bad_input_is_one_line_and_code_2(
     assert len(told.splitlines()) == 1
 
 
+def test_what_a_file_holds_for_the_controller_alone_counts(tmp_path: Path) -> None:
+    with bench(tmp_path) as beside:
+        own = {'/controller': {'ros__parameters': {'control': {'min': 'nothing'}}}}
+        document = json.loads(beside.config.read_text())
+        beside.config.write_text(json.dumps({**document, **own}))
+        code, told = beside.check('--drive')
+    assert code == 2
+    assert "control.min='nothing'" in told
+
+
 def test_help_names_the_exit_codes(tmp_path: Path) -> None:
     with bench(tmp_path) as beside:
         code, told = beside.check('--help')

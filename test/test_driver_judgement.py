@@ -24,7 +24,14 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.record_fit import fit_record, reach_of
 from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.nodes.driver_findings import FLOAT64, UNKNOWN, WRONG, Heard
+from backlash_ros.nodes.driver_findings import (
+    FITS,
+    FLOAT64,
+    UNKNOWN,
+    WRONG,
+    Heard,
+    graph_findings,
+)
 from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
 from backlash_ros.nodes.gentle_drive import GentleDrive, Range, drive_range
 
@@ -42,6 +49,7 @@ def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
     (replace(GOOD_GRAPH, publishers=0), 'publisher', 'start the driver'),
     (replace(GOOD_GRAPH, types=('std_msgs/msg/Float32',)), 'type', FLOAT64),
     (replace(GOOD_GRAPH, listeners=0), 'listener', 'subscribe control'),
+    (replace(GOOD_GRAPH, listeners=0, near_control=('/m/control',)), 'listener', 'remap'),
     (replace(GOOD_GRAPH, best_effort=True), 'QoS', 'reliable'),
     (replace(GOOD_GRAPH, misfits=('control: durability',)), 'QoS', 'volatile'),
 ])
@@ -49,6 +57,12 @@ def test_a_fault_in_the_graph_is_the_only_one_told(graph, subject, word) -> None
     found = faults(heard_from_driver(), graph)
     assert subjects(found) == [subject]
     assert word in found[0].cure
+
+
+def test_best_effort_is_fine_where_the_controller_accepts_it() -> None:
+    graph = replace(GOOD_GRAPH, best_effort=True)
+    assert [f.mark for f in graph_findings(graph, True)] == [FITS] * 3
+    assert WRONG in [f.mark for f in graph_findings(graph, False)]
 
 
 def test_nothing_is_judged_from_the_mixture_of_two_publishers() -> None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any, NoReturn
 
+import yaml
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import (
     QoSCompatibility,
@@ -46,6 +48,7 @@ UNFIT = 1
 LOOK_S = 0.1  # between two looks at the graph
 SETTLE_S = 0.5  # after which everybody should have found everybody
 REMIND_S = 3.0  # between two lines that say what is missing
+CONTROLLER_SECTIONS = ('/**/controller', 'controller', '/controller')
 NOT_OURS = {'/rosout', '/parameter_events'}
 
 
@@ -111,10 +114,7 @@ class CheckDriverNode(ProcessNode):
 
     def _say_what_is_missing(self) -> None:
         wanted = self._names[topics.PLANT_OUTPUT]
-        seen = {
-            topic: types for topic, types in self.get_topic_names_and_types()
-            if topic not in NOT_OURS and self.get_publishers_info_by_topic(topic)
-        }
+        seen = self._topics_with(self.get_publishers_info_by_topic)
         print(f'waiting for {wanted} ({FLOAT64})')
         near = similar_topics(wanted, FLOAT64, seen)
         for topic in near:
@@ -123,6 +123,15 @@ class CheckDriverNode(ProcessNode):
         others = sorted(set(seen) - set(near))
         print(f'  sees {"besides " if near else ""}{", ".join(others) or "no other topic"}',
               flush=True)
+
+    def _topics_with(
+        self, endpoints: Callable[[str], list[TopicEndpointInfo]],
+    ) -> dict[str, list[str]]:
+        """Topics that have such endpoints, and their types."""
+        return {
+            topic: types for topic, types in self.get_topic_names_and_types()
+            if topic not in NOT_OURS and endpoints(topic)
+        }
 
     def _listen(self) -> None:
         """Subscribe the way that hears the driver, whatever its QoS."""
@@ -237,6 +246,10 @@ class CheckDriverNode(ProcessNode):
         graph.misfits = tuple(sorted({*graph.misfits, *misfits}))
 
     def _tell(self) -> None:
+        seen = self._topics_with(self.get_subscriptions_info_by_topic)
+        self._graph.near_control = tuple(
+            similar_topics(self._names[topics.CONTROL], FLOAT64, seen)
+        )
         findings = judge(self._graph, self._heard, self.settings)
         if self._range_left is not None:
             findings.append(Finding(
@@ -344,20 +357,37 @@ def ros_arguments(arguments: Sequence[str]) -> list[str]:
     return found
 
 
+def parameter_files(config: str, folder: Path) -> list[str]:
+    """The file, and in folder one more with what it holds for the controller alone, if anything."""
+    try:
+        document = yaml.safe_load(Path(config).read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return [config]  # rcl says what is wrong with it
+    files = [config]
+    for section in CONTROLLER_SECTIONS:
+        if isinstance(document, dict) and section in document:
+            path = folder / f'{len(files)}.yaml'
+            path.write_text(yaml.safe_dump({'/**': document[section]}), encoding='utf-8')
+            files.append(str(path))
+    return files
+
+
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     options = parse_options(remove_ros_args(['', *arguments])[1:])
-    given = ros_arguments(arguments)
-    if options.config:
-        given = ['--ros-args', '--params-file', options.config, *given]
     nodes: list[CheckDriverNode] = []
 
     def make_node() -> CheckDriverNode:
         nodes.append(CheckDriverNode(options))
         return nodes[-1]
 
-    code = run(EXECUTABLE, make_node, given)
+    with tempfile.TemporaryDirectory() as folder:
+        files = [] if options.config is None else parameter_files(options.config, Path(folder))
+        given = ['--ros-args'] if files else []
+        for file in files:
+            given += ['--params-file', file]
+        code = run(EXECUTABLE, make_node, [*given, *ros_arguments(arguments)])
     return nodes[-1].exit_code if nodes else code
 
 

@@ -55,7 +55,8 @@ class Graph:
 
     publishers: of plant_output. types: of plant_output. listeners: of control, without the
     tools of this package. misfits: reasons why messages cannot pass, from QoS.
-    best_effort: whether plant_output is published without guarantee.
+    best_effort: whether plant_output is published without guarantee. near_control: subscribed
+    topics of a name like control.
     """
 
     publishers: int = 0
@@ -63,6 +64,7 @@ class Graph:
     listeners: int = 0
     misfits: tuple[str, ...] = ()
     best_effort: bool = False
+    near_control: tuple[str, ...] = ()
 
 
 @dataclass
@@ -102,8 +104,10 @@ def graph_findings(graph: Graph, accepts_best_effort: bool) -> list[Finding]:
         ))
     findings.append(_qos(graph, accepts_best_effort))
     if graph.listeners == 0:
+        near = ', '.join(graph.near_control)
         findings.append(Finding(
-            'listener', WRONG, 'nobody listens to control',
+            'listener', WRONG,
+            'nobody listens to control' + (f', but somebody to {near}' if near else ''),
             f'let the driver subscribe control as {FLOAT64}, or remap it',
         ))
     else:
