@@ -24,7 +24,7 @@ DURATION_S = 6.0
 DEADLINE_S = 60.0
 # A machine under load may hold the driver up: then the check is right to find fault with it, and
 # the run says nothing.
-HELD_UP, ATTEMPTS = 0.3, 5
+HELD_UP, ATTEMPTS = 0.3, 4
 
 
 class Bench:
@@ -89,8 +89,8 @@ def check_undisturbed(folder: Path, fault: str, *options: str) -> tuple[int, str
         with bench(folder, fault) as beside:
             checked = beside.check(*options)
             if beside.held_up() < HELD_UP:
-                break
-    return checked
+                return checked
+    pytest.skip(f'the machine held up the driver in each of {ATTEMPTS} runs')
 
 
 def subjects(told: str, mark: str) -> list[str]:

@@ -146,6 +146,17 @@ def test_jitter_is_told_where_samples_come_a_period_late_now_and_then() -> None:
     assert subjects(faults(heard)) == ['jitter']
 
 
+def test_what_jitter_may_have_blurred_is_not_called_wrong() -> None:
+    heard = heard_from_driver()
+    late = int(0.7 * PERIOD_S * 1e9)
+    # The answers stay where they are: some seem to belong to the sample before.
+    heard.outputs[5::10] = [
+        m._replace(stamp_ns=m.stamp_ns + late, received_ns=m.received_ns + late)
+        for m in heard.outputs[5::10]
+    ]
+    assert subjects(faults(heard)) == ['jitter']
+
+
 def test_clocks_that_disagree_hide_what_follows_from_them() -> None:
     heard = heard_from_driver()
     heard.outputs = [m._replace(received_ns=m.stamp_ns - 10**9) for m in heard.outputs]
@@ -165,7 +176,9 @@ def test_a_delay_is_told_in_samples_and_accepted_when_announced(delay: int) -> N
 
 def test_a_delay_before_applied_control_counts_as_one() -> None:
     heard = heard_from_driver(delay=2, report=True)
-    assert subjects(faults(heard)) == ['reaction delay']
+    found = faults(heard)
+    assert subjects(found) == ['reaction delay']
+    assert 'set control.delay_samples: 2' in found[0].cure
     assert faults(heard, estimator__use_applied_control=True) == []
 
 

@@ -18,7 +18,10 @@ from backlash_ros.nodes.driver_findings import (
     timing_of,
 )
 from backlash_ros.nodes.driver_motion import (
+    DELAY,
+    MODEL,
     MOTION_SUBJECTS,
+    NOISE,
     applied_findings,
     motion_findings,
     not_judged,
@@ -28,6 +31,7 @@ from backlash_ros.nodes.driver_motion import (
 MESSAGE_SUBJECTS = ('rate', 'jitter', 'lost samples', 'repeated samples', 'clock', 'values')
 # Without these nothing that follows from time or motion means anything.
 BASIC = {'publisher', 'type'}
+BLURRED_BY_JITTER = {DELAY, MODEL, NOISE}
 NEEDED_FOR_MOTION = {'listener', 'rate', 'clock'}
 SIMILAR = 0.6
 
@@ -52,7 +56,15 @@ def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Finding]:
     if wrong:
         return found + _hidden(MOTION_SUBJECTS, wrong[0])
     found += applied_findings(heard, timing, p)
-    return found + motion_findings(record_of(heard, timing), p)
+    motion = motion_findings(record_of(heard, timing), p)
+    if any(f.subject == 'jitter' and f.mark == WRONG for f in found):
+        # Amid jitter it is uncertain which v led to which y: what fits does, what does not may.
+        motion = [
+            not_judged(f.subject, 'once jitter fits')
+            if f.mark == WRONG and f.subject in BLURRED_BY_JITTER else f
+            for f in motion
+        ]
+    return found + motion
 
 
 def _hidden(subjects: Sequence[str], behind: str) -> list[Finding]:
