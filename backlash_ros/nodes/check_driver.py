@@ -46,7 +46,7 @@ from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
 EXECUTABLE = 'check_driver'
 UNFIT = 1
 LOOK_S = 0.1  # between two looks at the graph
-SETTLE_S = 0.5  # after which everybody should have found everybody
+SETTLE_S = 1.0  # after which everybody should have found everybody
 REMIND_S = 3.0  # between two lines that say what is missing
 CONTROLLER_SECTIONS = ('/**/controller', 'controller', '/controller')
 NOT_OURS = {'/rosout', '/parameter_events'}
@@ -229,7 +229,8 @@ class CheckDriverNode(ProcessNode):
         listeners = [info for info in listeners if info.node_name not in bystanders]
         if self._limits is not None:
             others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
-            self._rivals = _names_of(
+            # Once heard, a rival counts, even if it leaves.
+            self._rivals = self._rivals or _names_of(
                 [info for info in others if info.node_name != self.get_name()]
             )
         graph.publishers = max(graph.publishers, len(outputs))
