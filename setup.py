@@ -35,6 +35,7 @@ setup(
             f'simulate = {PACKAGE}.tools.simulate:main',
             f'report = {PACKAGE}.tools.report:main',
             f'compare = {PACKAGE}.tools.compare:main',
+            f'check_driver = {PACKAGE}.nodes.check_driver:main',
         ],
     },
 )

@@ -134,7 +134,7 @@ class RosWorld:
     def __init__(self, folder: Path, domain: int, stack: ExitStack) -> None:
         self.folder = folder
         self.domain, self._stack = domain, stack
-        self._environment = child_environment(folder, domain)
+        self.environment = child_environment(folder, domain)
 
     def start(
         self, executable: str, parameters: Mapping[str, object] | None = None, *arguments: str,
@@ -145,7 +145,7 @@ class RosWorld:
             text = value if isinstance(value, str) else json.dumps(value)
             ros_arguments += ['-p', f'{name}:={text}']
         process = NodeProcess(
-            executable, [*ros_arguments, *arguments], self.folder, self._environment
+            executable, [*ros_arguments, *arguments], self.folder, self.environment
         )
         self._stack.callback(process.kill)
         return process

@@ -15,6 +15,7 @@ import pytest
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.parameter_table import BY_NAME
+from backlash_ros.nodes import check_driver
 from backlash_ros.tools import batch, bringup, simulate
 from backlash_ros.tools.configuration import effective_parameters
 
@@ -104,7 +105,7 @@ def test_page_of_parameters_is_current() -> None:
 
 def test_python_files_that_pages_name_exist() -> None:
     named = {code for _, code in of_every_page(CODE) if re.fullmatch(r'\w+\.py', code)}
-    folders = ('backlash_ros', 'docs', 'benchmarks', 'test', 'scripts')
+    folders = ('backlash_ros', 'docs', 'benchmarks', 'examples', 'test', 'scripts')
     present = {path.name for folder in folders for path in (ROOT / folder).rglob('*.py')}
     assert named
     assert named <= present
@@ -141,8 +142,11 @@ def test_command_exists_and_takes_its_arguments(words: list[str]) -> None:
     elif program == 'ros2':
         assert arguments[:2] == ['run', 'backlash_ros']
         assert arguments[2] in console_scripts()
-    elif program in ('rosdep', 'colcon', '.'):
+    elif program in ('rosdep', 'colcon', '.', 'export'):
         assert program != 'colcon' or arguments[-1] == 'backlash_ros'
+    elif program == '.venv/bin/python':
+        # test_driver_examples.py runs them.
+        assert arguments[0] == '-c' or (ROOT / arguments[0]).is_file()
     else:
         assert program.removeprefix('.venv/bin/') in console_scripts()
         check_tool(program.removeprefix('.venv/bin/'), arguments)
@@ -152,6 +156,14 @@ def check_tool(program: str, arguments: list[str]) -> None:
     """Let the tool itself parse its options, and the core build what they describe."""
     if program == 'report':
         assert len(arguments) == 1
+        return
+    if program in ('controller', 'plant', 'reference', 'recorder'):
+        assert arguments[:2] == ['--ros-args', '--params-file']
+        assert (ROOT / arguments[2]).is_file()
+        return
+    if program == 'check_driver':
+        config = check_driver.parse_options(arguments).config
+        assert config is None or (ROOT / config).is_file()
         return
     options = (
         simulate._parser().parse_args(arguments) if program == 'simulate'

@@ -41,8 +41,8 @@ LONGEST_BLINDNESS_NS = 20_000_000  # without a look at callbacks, be the period 
 class ProcessNode(Node):
     """A node that is the purpose of its process: parameters checked, then work until stopped."""
 
-    def __init__(self, executable: str) -> None:
-        """Raises ParameterError."""
+    def __init__(self, executable: str, parameters_of: str = '') -> None:
+        """parameters_of: the executable whose parameters it reads. Raises ParameterError."""
         try:
             super().__init__(executable, automatically_declare_parameters_from_overrides=True)
         except ValueError:
@@ -50,7 +50,7 @@ class ProcessNode(Node):
                 executable, None, 'has a parameter without a value', 'give it one or leave it out'
             ) from None
         self.log = Node.get_logger(self)
-        self.settings = declare_parameters(self, executable)
+        self.settings = declare_parameters(self, parameters_of or executable)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.stopping = False
         self.stop_request = self.create_guard_condition(self._stop)

@@ -1,0 +1,396 @@
+"""Node that judges a driver: it listens, moves it gently if told to, and says what does not fit."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from math import inf
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import (
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.utilities import remove_ros_args
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.controller import plausible
+from backlash_ros.core.parameter_table import CONTROLLER, RECORDER
+from backlash_ros.nodes.driver_findings import (
+    FLOAT64,
+    WRONG,
+    Finding,
+    Graph,
+    Heard,
+    Message,
+    timing_of,
+)
+from backlash_ros.nodes.driver_motion import record_of
+from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
+from backlash_ros.nodes.gentle_drive import GentleDrive, drive_range
+from backlash_ros.nodes.messages import DEPTH
+from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
+
+EXECUTABLE = 'check_driver'
+UNFIT = 1
+LOOK_S = 0.1  # between two looks at the graph
+SETTLE_S = 1.0  # after which everybody should have found everybody
+REMIND_S = 3.0  # between two lines that say what is missing
+CONTROLLER_SECTIONS = ('/**/controller', 'controller', '/controller')
+NOT_OURS = {'/rosout', '/parameter_events'}
+
+
+class CheckDriverNode(ProcessNode):
+    """Stands in for the controller, with its parameters, and judges what it hears.
+
+    Driving, it answers every plant_output with a control, as the controller does, and brings v
+    to rest at the end, whatever ends it.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        super().__init__(EXECUTABLE, parameters_of=CONTROLLER)
+        build_controller(self.settings)
+        self._options = options
+        self._period = self.settings.real('sample_period')
+        self._limits = (
+            drive_range(self.settings, options.amplitude, options.rate) if options.drive else None
+        )
+        self._drive: GentleDrive | None = None
+        self._driving = False
+        self._heard, self._graph = Heard(), Graph()
+        self._range_left: float | None = None
+        self._rivals = ''  # who else publishes control
+        self._heard_at = inf  # on the steady clock [s]
+        self._names = {
+            topic: self.resolve_topic_name(topic)
+            for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL)
+        }
+        self.exit_code = UNFIT
+
+    def work(self, executor: SingleThreadedExecutor) -> None:
+        """Wait for the driver, listen, come to rest, tell."""
+        if self._await_driver(executor):
+            self._listen()
+            try:
+                self._follow(executor)
+            finally:
+                self._come_to_rest(executor)
+        if self._rivals:
+            print(
+                f'{EXECUTABLE}: {self._names[topics.CONTROL]} is published by {self._rivals}: '
+                'stop that first, or leave --drive out', file=sys.stderr,
+            )
+            self.exit_code = BAD_INPUT
+        else:
+            self._tell()
+
+    def _await_driver(self, executor: SingleThreadedExecutor) -> bool:
+        deadline = time.monotonic() + self._options.wait
+        remind = time.monotonic() + REMIND_S
+        while not self.stopping:
+            if self.get_publishers_info_by_topic(self._names[topics.PLANT_OUTPUT]):
+                return True
+            now = time.monotonic()
+            if now > deadline:
+                self._say_what_is_missing()
+                return False
+            if now > remind:
+                remind += REMIND_S
+                self._say_what_is_missing()
+            executor.spin_once(timeout_sec=LOOK_S)
+        return False
+
+    def _say_what_is_missing(self) -> None:
+        wanted = self._names[topics.PLANT_OUTPUT]
+        seen = self._topics_with(self.get_publishers_info_by_topic)
+        print(f'waiting for {wanted} ({FLOAT64})')
+        near = similar_topics(wanted, FLOAT64, seen)
+        for topic in near:
+            print(f'  sees {topic} ({", ".join(seen[topic])}); if that is it: '
+                  f'--ros-args -r {topics.PLANT_OUTPUT}:={topic}')
+        others = sorted(set(seen) - set(near))
+        print(f'  sees {"besides " if near else ""}{", ".join(others) or "no other topic"}',
+              flush=True)
+
+    def _topics_with(
+        self, endpoints: Callable[[str], list[TopicEndpointInfo]],
+    ) -> dict[str, list[str]]:
+        """Topics that have such endpoints, and their types."""
+        return {
+            topic: types for topic, types in self.get_topic_names_and_types()
+            if topic not in NOT_OURS and endpoints(topic)
+        }
+
+    def _listen(self) -> None:
+        """Subscribe the way that hears the driver, whatever its QoS."""
+        heard = self._heard
+        self._hear(topics.APPLIED_CONTROL, heard.applied)
+        if self._limits is None:
+            self._hear(topics.CONTROL, heard.controls)
+        else:
+            self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+        self.listen(
+            Float64, topics.PLANT_OUTPUT, self._on_output, self._profile(topics.PLANT_OUTPUT)
+        )
+
+    def _hear(self, topic: str, messages: list[Message]) -> None:
+        def on_message(message: Float64, info: dict[str, Any]) -> None:
+            messages.append(_message(message, info))
+
+        self.listen(Float64, topic, on_message, self._profile(topic))
+
+    def _profile(self, topic: str) -> QoSProfile:
+        offered = self.get_publishers_info_by_topic(self._names[topic])
+        reliable = all(
+            info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered
+        )
+        return QoSProfile(depth=DEPTH, reliability=(
+            ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        ))
+
+    def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
+        self._heard_at = time.monotonic()
+        self._heard.outputs.append(_message(message, info))
+        if not self._driving or self._limits is None or self._range_left is not None:
+            return
+        y = message.data
+        low, high = self._options.output_range
+        if plausible(y) and not low <= y <= high:
+            self._range_left = y
+            return
+        if self._drive is None:
+            start = self._heard.applied[-1].value if self._heard.applied else 0.0
+            self._drive = GentleDrive(
+                self._limits, self._period, self._options.duration, self._options.rising,
+                start if plausible(start) else 0.0,
+            )
+        self._command(self._drive.step())
+
+    def _command(self, v: float) -> None:
+        now = time.time_ns()
+        self._control.publish(Float64(data=v))
+        self._heard.controls.append(Message(v, now, now, 0))
+
+    def _follow(self, executor: SingleThreadedExecutor) -> None:
+        """Listen for the duration, and drive."""
+        begin = looked = time.monotonic()
+        end = begin + self._options.duration + (0.0 if self._limits is None else SETTLE_S)
+        patience = max(self.settings.real('timeout.plant_output'), 10.0 * self._period)
+        while not self.stopping:
+            executor.spin_once(timeout_sec=LOOK_S)
+            now = time.monotonic()
+            if now > looked + LOOK_S:
+                looked = now
+                self._look_at_graph()
+                self._driving = self._may_drive(now - begin)
+            silent = self._driving and now > self._heard_at + patience
+            if now > end or silent or self._rivals or self._range_left is not None:
+                break
+        self._look_at_graph()
+        self._driving = False
+        self._heard.end_ns = time.time_ns()
+
+    def _may_drive(self, listened_s: float) -> bool:
+        """Whether to drive: told to, the graph known by now, heard by a driver, alone."""
+        return (
+            self._limits is not None and listened_s > SETTLE_S and not self._rivals
+            and self._control.get_subscription_count() > 0
+        )
+
+    def _come_to_rest(self, executor: SingleThreadedExecutor) -> None:
+        drive = self._drive
+        if drive is None:
+            return
+        self._driving, done = False, False
+        while not done:
+            done = drive.step_to_rest()
+            self._control.publish(Float64(data=drive.v))
+            time.sleep(self._period)
+        # The last command must leave before the node does.
+        executor.spin_once(timeout_sec=LOOK_S)
+
+    def _look_at_graph(self) -> None:
+        graph = self._graph
+        outputs = self.get_publishers_info_by_topic(self._names[topics.PLANT_OUTPUT])
+        listeners = self.get_subscriptions_info_by_topic(self._names[topics.CONTROL])
+        bystanders = (self.get_name(), RECORDER)
+        listeners = [info for info in listeners if info.node_name not in bystanders]
+        if self._limits is not None:
+            others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
+            # Once heard, a rival counts, even if it leaves.
+            self._rivals = self._rivals or _names_of(
+                [info for info in others if info.node_name != self.get_name()]
+            )
+        graph.publishers = max(graph.publishers, len(outputs))
+        graph.listeners = max(graph.listeners, len(listeners))
+        if outputs:
+            graph.types = tuple(sorted({info.topic_type for info in outputs}))
+        graph.best_effort = graph.best_effort or any(
+            info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in outputs
+        )
+        misfits = {
+            reason for info in listeners
+            if (reason := _misfit(QoSProfile(depth=DEPTH), info.qos_profile))
+        }
+        graph.misfits = tuple(sorted({*graph.misfits, *misfits}))
+
+    def _tell(self) -> None:
+        seen = self._topics_with(self.get_subscriptions_info_by_topic)
+        self._graph.near_control = tuple(
+            similar_topics(self._names[topics.CONTROL], FLOAT64, seen)
+        )
+        findings = judge(self._graph, self._heard, self.settings)
+        if self._range_left is not None:
+            findings.append(Finding(
+                'range', WRONG, f'y = {self._range_left:.4g} left --output-range: drive ended',
+                'widen --output-range, or drive less: --amplitude, --rate, --duration',
+            ))
+        print(table(findings), flush=True)
+        if self._options.save is not None:
+            self._save(self._options.save)
+        self.exit_code = DONE if all_fit(findings) else UNFIT
+
+    def _save(self, path: Path) -> None:
+        timing = timing_of(self._heard, self._period)
+        record = None if timing is None else record_of(self._heard, timing)
+        if record is None:
+            print(f'{EXECUTABLE}: nothing to save in {path}: v and y were not both heard',
+                  file=sys.stderr)
+            return
+        try:
+            with path.open('w', newline='', encoding='utf-8') as file:
+                writer = csv.writer(file)
+                writer.writerow(('t', 'v', 'y'))
+                for k, (v, y) in enumerate(zip(record.v, record.y, strict=True)):
+                    writer.writerow((repr(k * self._period), repr(float(v)), repr(float(y))))
+        except OSError as error:
+            print(f'{EXECUTABLE}: {path}: cannot be written: {error.strerror}', file=sys.stderr)
+            return
+        print(f'saved {len(record.v)} samples of v and y in {path}')
+
+
+def _message(message: Float64, info: dict[str, Any]) -> Message:
+    return Message(
+        message.data, info['source_timestamp'], info['received_timestamp'],
+        info['publication_sequence_number'],
+    )
+
+
+def _misfit(offered: QoSProfile, asked: QoSProfile) -> str:
+    """Why messages cannot pass from control to a subscriber, empty if they can."""
+    # What discovery does not tell (depth) or tells as "infinite" would count as a misfit.
+    bare = QoSProfile(depth=DEPTH, reliability=asked.reliability, durability=asked.durability)
+    compatibility, reason = qos_check_compatible(offered, bare)
+    return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
+
+
+def _names_of(endpoints: Sequence[TopicEndpointInfo]) -> str:
+    return ', '.join(sorted({
+        f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in endpoints
+    }))
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports errors in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f'{self.prog}: {message} (--help lists the options)\n')
+
+
+def _positive(text: str) -> float:
+    number = float(text)
+    if not 0.0 < number < inf:
+        raise argparse.ArgumentTypeError(f'{text} must be finite and > 0')
+    return number
+
+
+def parse_options(plain: Sequence[str]) -> argparse.Namespace:
+    """Options besides those of ROS."""
+    parser = _Parser(
+        prog=EXECUTABLE, description=__doc__,
+        epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.',
+    )
+    parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller')
+    parser.add_argument('--duration', type=_positive, default=10.0, metavar='SECONDS',
+                        help='how long to listen (default: 10)')
+    parser.add_argument('--wait', type=_positive, default=10.0, metavar='SECONDS',
+                        help='how long to wait for a driver (default: 10)')
+    parser.add_argument('--drive', action='store_true',
+                        help='move v, to and fro within control.min, control.max and '
+                             'control.rate_max, to rest at the end')
+    parser.add_argument('--amplitude', type=_positive, metavar='V',
+                        help='drive: keep v within ±V as well')
+    parser.add_argument('--rate', type=_positive, metavar='V_PER_S',
+                        help='drive: keep v slower than this as well')
+    parser.add_argument('--rising', action='store_true',
+                        help='drive: once upwards without turning back, to find G(z)')
+    parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),
+                        metavar=('LOW', 'HIGH'), help='drive: stop when y leaves this range')
+    parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
+    options = parser.parse_args(plain)
+    for name in ('amplitude', 'rate'):
+        if getattr(options, name) is not None and not options.drive:
+            parser.error(f'--{name} says how to drive: give --drive as well')
+    if options.rising and not options.drive:
+        parser.error('--rising says how to drive: give --drive as well')
+    return options
+
+
+def ros_arguments(arguments: Sequence[str]) -> list[str]:
+    """The part between --ros-args and --, all of them."""
+    found, inside = [], False
+    for argument in arguments:
+        inside = (inside or argument == '--ros-args') and argument != '--'
+        if inside:
+            found.append(argument)
+    return found
+
+
+def parameter_files(config: str, folder: Path) -> list[str]:
+    """The file, and in folder one more with what it holds for the controller alone, if anything."""
+    try:
+        document = yaml.safe_load(Path(config).read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return [config]  # rcl says what is wrong with it
+    files = [config]
+    for section in CONTROLLER_SECTIONS:
+        if isinstance(document, dict) and section in document:
+            path = folder / f'{len(files)}.yaml'
+            path.write_text(yaml.safe_dump({'/**': document[section]}), encoding='utf-8')
+            files.append(str(path))
+    return files
+
+
+def main(args: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    arguments = sys.argv[1:] if args is None else args
+    options = parse_options(remove_ros_args(['', *arguments])[1:])
+    nodes: list[CheckDriverNode] = []
+
+    def make_node() -> CheckDriverNode:
+        nodes.append(CheckDriverNode(options))
+        return nodes[-1]
+
+    with tempfile.TemporaryDirectory() as folder:
+        files = [] if options.config is None else parameter_files(options.config, Path(folder))
+        given = ['--ros-args'] if files else []
+        for file in files:
+            given += ['--params-file', file]
+        code = run(EXECUTABLE, make_node, [*given, *ros_arguments(arguments)])
+    return nodes[-1].exit_code if nodes else code
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,313 @@
+"""What the motion of a driver says: delay, sign, G(z), noise, and whether the backlash shows.
+
+Pure: no ROS in here. The whole record is fitted at once, then read by the filters of the loop.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.controller import plausible
+from backlash_ros.core.crossings import Crossings
+from backlash_ros.core.gap_bank import GapBank, Noise, Prior
+from backlash_ros.core.gap_search import COARSE_TOLERANCE, NO_GAP, NOISE_FLOOR, SLOPE_REACH
+from backlash_ros.core.kalman import PRECISE_GAP, PRECISE_SLOPE
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.record_fit import MORE_DELAY, RecordFit, fit_record
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.nodes.driver_findings import (
+    FITS,
+    UNKNOWN,
+    WRONG,
+    Finding,
+    Heard,
+    Message,
+    Timing,
+)
+
+Array = NDArray[np.float64]
+
+DELAY, SIGN, MODEL, NOISE, BACKLASH = (
+    'reaction delay', 'sign and units', 'G(z)', 'noise on y', 'backlash',
+)
+MOTION_SUBJECTS = (DELAY, SIGN, MODEL, NOISE, BACKLASH)
+
+DECISIVE = 10.0  # log-likelihood by which one delay beats another
+SHOWS = 15.0  # log-likelihood by which y shows v at all
+PREDICTED = 0.9  # share of the motion of y that G has to predict
+BOUND_SLACK = 0.01  # of a value that lies outside its bounds without harm
+NOISIER = 3.0  # times the given deviation of the noise
+COLOURED = 0.5  # correlation of successive residuals that noise of a sensor does not have
+OTHER_PERIODS = (0.05, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0)
+ALTERED = 0.02  # of the swing of v: applied_control that differs by more was limited
+ALTERED_SHARE = 0.05  # of the samples
+GAP_RATIOS = np.geomspace(0.25, 4.0, 25)  # of the bank, around the gap of the fit
+REPORTED = 0.9  # share of the samples that applied_control has to report
+
+
+@dataclass
+class Record:
+    """v (N,) from sample k to k+1, y (N,) with nan where lost, and what v was taken from.
+
+    lag: samples from control to applied_control; 0 where v is that of control.
+    """
+
+    v: Array
+    y: Array
+    lag: int
+
+
+def applied_findings(heard: Heard, timing: Timing, p: Parameters) -> list[Finding]:
+    """Whether applied_control, where it is published or asked for, is of use."""
+    wanted = p.flag('estimator.use_applied_control')
+    subject = 'applied_control'
+    if not heard.applied:
+        return [Finding(
+            subject, WRONG, 'is not published',
+            'report v just before each y, or set estimator.use_applied_control: false',
+        )] if wanted else []
+    share = len(heard.applied) / len(timing.outputs)
+    if wanted and share < REPORTED:
+        return [Finding(
+            subject, WRONG, f'comes with {share:.0%} of the samples',
+            'report v just before each y',
+        )]
+    applied = _on_grid(heard.applied, timing)
+    control = _on_grid(heard.controls, timing)
+    if wanted or control is None or applied is None:
+        return [Finding(subject, FITS, 'is published')]
+    moved = _shifted_difference(applied, control, _lag(applied, control))
+    swing = float(np.ptp(control))
+    if np.mean(moved > ALTERED * swing) > ALTERED_SHARE:
+        return [Finding(
+            subject, WRONG, f'differs from control by up to {moved.max():.3g}',
+            'set estimator.use_applied_control: true, or narrow control.min, max, rate_max',
+        )]
+    return [Finding(subject, FITS, 'agrees with control')]
+
+
+def record_of(heard: Heard, timing: Timing) -> Record | None:
+    """v and y sample by sample, from the first known v on; None where no v was heard."""
+    commands = heard.applied or heard.controls
+    v = _on_grid(commands, timing)
+    if v is None:
+        return None
+    if heard.applied:
+        _put_reports(v, heard.applied, timing)
+    y = np.full(len(v), nan)
+    values = np.array([m.value if plausible(m.value) else nan for m in timing.outputs])
+    y[timing.index] = values
+    lag = 0
+    if heard.applied:
+        control = _on_grid(heard.controls, timing)
+        lag = 0 if control is None else _lag(v, control)
+    known = int(np.argmax(np.isfinite(v)))
+    return Record(v[known:], y[known:], lag)
+
+
+def _on_grid(commands: list[Message], timing: Timing) -> Array | None:
+    """v over each sample interval, shape (N,): the newest one when it ends; nan before any."""
+    usable = [message for message in commands if plausible(message.value)]
+    if not usable:
+        return None
+    count = int(timing.index[-1]) + 1
+    stamps = np.array([message.stamp_ns for message in timing.outputs], dtype=np.int64)
+    begin = stamps[0]
+    ends = np.interp(np.arange(1, count + 1), timing.index, (stamps - begin).astype(float))
+    left = np.array([message.stamp_ns - begin for message in usable], dtype=float)
+    newest = np.searchsorted(left, ends, side='right') - 1
+    values = np.append([message.value for message in usable], nan)
+    v = values[newest]
+    return v if np.isfinite(v).any() else None
+
+
+def _put_reports(v: Array, reports: list[Message], timing: Timing) -> None:
+    """Where there is one report per interval, take them in order: a late one may come in a heap."""
+    stamps = [message.stamp_ns for message in timing.outputs]
+    left = np.array([message.stamp_ns for message in reports], dtype=np.int64)
+    until = np.searchsorted(left, np.array(stamps, dtype=np.int64), side='right')
+    for i in range(1, len(stamps)):
+        first, last = int(timing.index[i - 1]), int(timing.index[i])
+        between = reports[until[i - 1]:until[i]]
+        if len(between) == last - first and all(plausible(m.value) for m in between):
+            v[first:last] = [message.value for message in between]
+
+
+def _lag(applied: Array, control: Array) -> int:
+    """Samples by which applied follows control."""
+    return int(np.argmin([
+        _shifted_difference(applied, control, lag).mean() for lag in range(MORE_DELAY + 1)
+    ]))
+
+
+def _shifted_difference(applied: Array, control: Array, lag: int) -> Array:
+    difference = np.abs(applied[lag:] - control[: len(control) - lag])
+    known = difference[np.isfinite(difference)]
+    return known if len(known) else np.full(1, np.inf)
+
+
+def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
+    """What v and y say together."""
+    swing = 0.0 if record is None else float(np.ptp(record.v))
+    if record is None or swing == 0.0:
+        return _only(BACKLASH, 'v stood still', 'run the controller, or check_driver --drive')
+    expected = p.integer('control.delay_samples')
+    model = TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator'))
+    fit = fit_record(model, record.v, record.y, expected)
+    if fit is None:
+        return _only(
+            BACKLASH, f'too few samples after v had swung by {swing:.4g}', 'raise --duration'
+        )
+    if fit.evidence < SHOWS:
+        return _only(
+            BACKLASH, f'y shows nothing of v, which swung by {swing:.4g}',
+            'let v swing wider than the gap; see that the driver applies v',
+        )
+    if fit.predicted < PREDICTED or _odd(fit, record.lag, p):
+        return _only(MODEL, *_mismatch(fit, model, record, p))
+    found = _crossings(fit, record, p)
+    return [
+        _delay(fit, record.lag, p), _sign(fit, found, p),
+        Finding(MODEL, FITS, f'predicts {fit.predicted:.1%} of the motion of y'),
+        _noise(fit, p), _backlash(found, swing),
+    ]
+
+
+def _only(subject: str, found: str, cure: str) -> list[Finding]:
+    """One reason why nothing else can be told."""
+    return [Finding(subject, WRONG, found, cure)] + [
+        not_judged(other, f'once {subject} fits') for other in MOTION_SUBJECTS if other != subject
+    ]
+
+
+def not_judged(subject: str, when: str) -> Finding:
+    """A line for what something else hides."""
+    return Finding(subject, UNKNOWN, f'can be told {when}')
+
+
+def _odd(fit: RecordFit, lag: int, p: Parameters) -> bool:
+    """Whether a delay that nobody announced came out together with what is not noise."""
+    noisy = fit.noise_std > NOISIER * p.real('estimator.output_noise_std')
+    return noisy and fit.correlation > COLOURED and _delay(fit, lag, p).mark == WRONG
+
+
+def _mismatch(
+    fit: RecordFit, model: TransferFunction, record: Record, p: Parameters,
+) -> tuple[str, str]:
+    """Say how badly G predicts y, and whether the same poles at another period would."""
+    found = f'predicts {max(fit.predicted, 0.0):.0%} of the motion of y'
+    period = p.real('sample_period')
+    others: list[tuple[float, float]] = []
+    for ratio in OTHER_PERIODS:
+        denominator = np.real(np.poly(model.poles.astype(complex) ** ratio)).tolist()
+        other = TransferFunction(model.numerator.tolist(), denominator)
+        refit = fit_record(other, record.v, record.y, p.integer('control.delay_samples'))
+        if refit is not None:
+            others.append((refit.predicted, ratio))
+    best, ratio = max(others, default=(0.0, 1.0))
+    if best >= PREDICTED:
+        return found, (
+            f'G(z) looks made for a sample period of about {period / ratio:.3g} s: discretise it '
+            f'with sample_period, {period:g} s'
+        )
+    return found, (
+        'enter the G(z) of this plant, discretised with sample_period; see that y is measured '
+        'behind the gap and that the driver holds v over the period'
+    )
+
+
+def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
+    expected = p.integer('control.delay_samples')
+    if p.flag('estimator.use_applied_control'):
+        lag = 0
+    found = fit.delay + lag
+    inside = expected - lag
+    if 0 <= inside < len(fit.margins) and fit.margins[inside] <= DECISIVE:
+        return Finding(DELAY, FITS, f'{expected} samples, as control.delay_samples says')
+    return Finding(
+        DELAY, WRONG, f'{found} samples; control.delay_samples says {expected}',
+        f'apply v as soon as it comes, or set control.delay_samples: {found}',
+    )
+
+
+def _sign(fit: RecordFit, found: Crossings | None, p: Parameters) -> Finding:
+    if fit.m < 0.0:
+        return Finding(
+            SIGN, WRONG, f'y moves against v: m would be {fit.m:.4g}',
+            'change the sign of y or v in the driver, or of plant.numerator',
+        )
+    values = [('m', fit.m, fit.std_m)]
+    if found is not None:
+        values += [('c_r', found.c_r, found.std_c_r), ('c_l', found.c_l, found.std_c_l)]
+    for name, value, std in values:
+        low, high = p.pair(f'estimator.bounds.{name}')
+        slack = 3.0 * std + BOUND_SLACK * abs(value)
+        if not low - slack <= value <= high + slack:
+            return Finding(
+                SIGN, WRONG, f'{name} would be {value:.4g}, outside [{low:g}, {high:g}]',
+                f'see the units of v, y and G(z) and the zero of v, or widen '
+                f'estimator.bounds.{name}',
+            )
+    return Finding(SIGN, FITS, f'm is about {fit.m:.4g}, within its bounds')
+
+
+def _noise(fit: RecordFit, p: Parameters) -> Finding:
+    given = p.real('estimator.output_noise_std')
+    found = f'deviation {fit.noise_std:.2g}; estimator.output_noise_std says {given:.2g}'
+    if fit.noise_std <= NOISIER * given:
+        return Finding(NOISE, FITS, found)
+    cure = f'set estimator.output_noise_std: {fit.noise_std:.1e}'
+    if fit.correlation > COLOURED:
+        cure += ', or give a more exact G(z): the residual is coloured'
+    return Finding(NOISE, WRONG, found, cure)
+
+
+def _backlash(found: Crossings | None, swing: float) -> Finding:
+    if found is None:
+        return Finding(
+            BACKLASH, WRONG, f'not identifiable from this motion: v swung by {swing:.4g}',
+            'swing v past the gap in both directions, several times; raise --duration',
+        )
+    return Finding(BACKLASH, FITS, ', '.join(
+        f'{name} = {value:.4g} ± {std:.1g}' for name, value, std in (
+            ('m', found.m, found.std_m), ('c_r', found.c_r, found.std_c_r),
+            ('c_l', found.c_l, found.std_c_l),
+        )
+    ))
+
+
+def _crossings(fit: RecordFit, record: Record, p: Parameters) -> Crossings | None:
+    """Read the record with the filters of the loop around the gap of the fit.
+
+    None unless m, c_r, c_l come out as precise as the loop would publish them.
+    """
+    sign = 1.0 if fit.m > 0.0 else -1.0
+    model = StateModel(TransferFunction(
+        tuple(sign * value for value in p.reals('plant.numerator')),
+        p.reals('plant.denominator') + (0.0,) * fit.delay,
+    ))
+    swing, m, gap = float(np.ptp(record.v)), abs(fit.m), fit.c_r - fit.c_l
+    gaps = np.union1d(
+        np.clip(gap * GAP_RATIOS, NO_GAP * swing * GAP_RATIOS, swing), max(gap, 1e-6 * swing)
+    )
+    floor = NOISE_FLOOR * float(np.linalg.norm(model.b)) * m * swing
+    noise_std = max(p.real('estimator.output_noise_std'), fit.rms, floor)
+    prior = Prior(np.array([m, 0.0, 0.0]), SLOPE_REACH * m)
+    bank = GapBank(gaps, model, prior, Noise(noise_std), COARSE_TOLERANCE)
+    for k in range(1, len(record.v)):
+        bank.predict(float(record.v[k - 1]))
+        if np.isfinite(record.y[k]):
+            bank.correct(float(record.y[k]))
+    if not bank.active:
+        return None
+    bank.elect()
+    found = bank.found()
+    if found is None or found.std_m > PRECISE_SLOPE * found.m:
+        return None
+    precise = found.std_gap <= max(PRECISE_GAP * found.gap, NO_GAP * swing)
+    return found if precise else None

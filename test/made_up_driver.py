@@ -1,0 +1,95 @@
+"""What a driver would send, made up without ROS; and the plant that all tests of it share."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+from scipy.signal import cont2discrete
+
+from backlash_ros.core.assembly import build_plant
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.driver_findings import FLOAT64, WRONG, Finding, Graph, Heard, Message
+from backlash_ros.nodes.driver_verdict import judge
+from backlash_ros.nodes.gentle_drive import GentleDrive, Range
+
+PERIOD_S = 0.04  # long enough that a busy machine does not disturb it
+NATURAL = 2.0 * pi * 2.0  # rad/s
+START_NS = 1_800_000_000_000_000_000
+LIMITS = Range(-5.0, 5.0, 30.0)
+GOOD_GRAPH = Graph(publishers=1, types=(FLOAT64,), listeners=1)
+
+
+def model(period_s: float = PERIOD_S) -> tuple[list[float], list[float]]:
+    """G(z) of a load with 2 Hz and a damping of 0.5."""
+    continuous = ([NATURAL**2], [1.0, NATURAL, NATURAL**2])
+    numerator, denominator, _ = cont2discrete(continuous, period_s, 'zoh')
+    return numerator[0, 1:].tolist(), denominator.tolist()
+
+
+def parameters(**changes: object) -> dict[str, object]:
+    """What the driver's user would write into a file; `__` in a name stands for a point."""
+    numerator, denominator = model()
+    return {
+        'sample_period': PERIOD_S, 'plant.numerator': numerator,
+        'plant.denominator': denominator, 'estimator.output_noise_std': 1e-3,
+        'control.min': LIMITS.low, 'control.max': LIMITS.high, 'control.rate_max': LIMITS.rate,
+        **{name.replace('__', '.'): value for name, value in changes.items()},
+    }
+
+
+def plant_parameters() -> Parameters:
+    """The plant behind the driver."""
+    return Parameters(parameters(
+        backlash__m=1.3, backlash__c_r=1.0, backlash__c_l=-0.8, output_noise_std=5e-4,
+    ))
+
+
+def messages(values: list[float], offset: float, age_s: float = 1e-4) -> list[Message]:
+    """One message per sample, at a share `offset` of the period."""
+    stamps = [START_NS + int((k + offset) * PERIOD_S * 1e9) for k in range(len(values))]
+    return [
+        Message(value, stamp, stamp + int(age_s * 1e9), k + 1)
+        for k, (value, stamp) in enumerate(zip(values, stamps, strict=True))
+    ]
+
+
+def heard_from_driver(
+    samples: int = 200, delay: int = 0, sign: float = 1.0, reach: float = 1.0,
+    rising: bool = False, report: bool = False, limit: float = np.inf,
+) -> Heard:
+    """What is heard of a driver while v moves.
+
+    delay: samples by which it applies v later. reach: share of LIMITS that v uses. report: whether
+    it publishes applied_control. limit: of v inside the driver. rising: v only rises, from
+    0, so that the left side is never engaged.
+    """
+    low = 0.0 if rising else reach * LIMITS.low
+    limits = Range(low, reach * LIMITS.high, LIMITS.rate)
+    drive = GentleDrive(limits, PERIOD_S, samples * PERIOD_S, rising)
+    plant = build_plant(plant_parameters())
+    v: list[float] = []
+    y: list[float] = []
+    applied: list[float] = []
+    for k in range(samples):
+        y.append(sign * plant.measure())
+        v.append(drive.step())
+        late = v[k - delay] if k >= delay else 0.0
+        applied.append(min(max(late, -limit), limit))
+        plant.step(applied[-1])
+    heard = Heard(messages(y, 0.0), messages(v, 0.1))
+    if report:
+        heard.applied = messages(applied, 0.99)
+    heard.end_ns = heard.outputs[-1].stamp_ns
+    return heard
+
+
+def faults(heard: Heard, graph: Graph = GOOD_GRAPH, **changes: object) -> list[Finding]:
+    """The findings that are wrong."""
+    findings = judge(graph, heard, Parameters(parameters(**changes)))
+    return [finding for finding in findings if finding.mark == WRONG]
+
+
+def subjects(findings: list[Finding]) -> list[str]:
+    """What the findings are about."""
+    return [finding.subject for finding in findings]

@@ -1,0 +1,227 @@
+"""check_driver beside a driver in another process: each fault is told, and only that one."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from made_up_driver import LIMITS, parameters
+from ros_processes import Probe
+from std_msgs.msg import Float64
+
+from backlash_ros.tools.processes import child_environment, free_domain
+
+HERE = Path(__file__).resolve().parent
+DURATION_S = 6.0
+DEADLINE_S = 60.0
+# A machine under load may hold the driver up: then the check is right to find fault with it, and
+# the run says nothing.
+HELD_UP, ATTEMPTS = 0.3, 4
+
+
+class Bench:
+    """A domain with a driver in it, and check_driver to be run beside it."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.folder, self.domain = folder, domain
+        self.environment = child_environment(folder, domain)
+        self.driver: subprocess.Popen[str] | None = None
+        self.config = folder / 'driver.yaml'
+        # JSON is YAML.
+        self.config.write_text(json.dumps({'/**': {'ros__parameters': parameters()}}))
+
+    def start(self, *options: str) -> subprocess.Popen[str]:
+        """Start check_driver with the parameters of the plant."""
+        command = [
+            sys.executable, '-m', 'backlash_ros.nodes.check_driver',
+            '--config', str(self.config), '--duration', str(DURATION_S), *options,
+        ]
+        return subprocess.Popen(
+            command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def check(self, *options: str) -> tuple[int, str]:
+        """Run check_driver; return its exit code and what it printed."""
+        process = self.start(*options)
+        try:
+            out, err = process.communicate(timeout=DEADLINE_S)
+        finally:
+            process.kill()
+        return process.returncode, out + err
+
+    def held_up(self) -> float:
+        """End the driver; return by which share of a period it was held up at most."""
+        assert self.driver is not None
+        self.driver.terminate()
+        return float(self.driver.communicate(timeout=DEADLINE_S)[0])
+
+
+@contextmanager
+def bench(folder: Path, fault: str = '') -> Iterator[Bench]:
+    """A bench with a driver of this fault, or with none."""
+    with free_domain() as domain:
+        beside = Bench(folder, domain)
+        if fault:
+            beside.driver = subprocess.Popen(
+                [sys.executable, str(HERE / 'faulty_driver.py'), fault], text=True,
+                env=beside.environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            )
+        try:
+            yield beside
+        finally:
+            if beside.driver is not None:
+                beside.driver.kill()
+                beside.driver.communicate()
+
+
+def check_undisturbed(folder: Path, fault: str, *options: str) -> tuple[int, str]:
+    """Run check_driver beside a driver that the machine did not hold up."""
+    for _ in range(ATTEMPTS):
+        with bench(folder, fault) as beside:
+            checked = beside.check(*options)
+            if beside.held_up() < HELD_UP:
+                return checked
+    pytest.skip(f'the machine held up the driver in each of {ATTEMPTS} runs')
+
+
+def subjects(told: str, mark: str) -> list[str]:
+    """What the lines with this mark are about."""
+    return [
+        line[2:].split('  ')[0].strip() for line in told.splitlines() if line.startswith(mark)
+    ]
+
+
+def test_a_good_driver_passes_and_its_record_is_saved(tmp_path: Path) -> None:
+    code, told = check_undisturbed(
+        tmp_path, 'none', '--drive', '--save', str(tmp_path / 'record.csv')
+    )
+    assert (code, subjects(told, '✗')) == (0, []), told
+    with (tmp_path / 'record.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) > 50
+    assert max(abs(float(row['v'])) for row in rows) <= LIMITS.high
+
+
+@pytest.mark.parametrize(('fault', 'subject'), [
+    ('rate', 'rate'), ('loss', 'lost samples'), ('nan', 'values'), ('best_effort', 'QoS'),
+    ('second', 'publisher'), ('delay', 'reaction delay'), ('sign', 'sign and units'),
+])
+def test_a_fault_is_told_and_only_that(tmp_path: Path, fault: str, subject: str) -> None:
+    code, told = check_undisturbed(tmp_path, fault, '--drive')
+    assert (code, subjects(told, '✗')) == (1, [subject]), told
+    assert '→' in told
+
+
+def test_listening_alone_does_not_move_v(tmp_path: Path) -> None:
+    code, told = check_undisturbed(tmp_path, 'none', '--duration', '2')
+    assert (code, subjects(told, '✗')) == (1, ['backlash']), told
+    assert 'check_driver --drive' in told
+
+
+def test_a_topic_of_another_name_is_pointed_out(tmp_path: Path) -> None:
+    with bench(tmp_path, 'name') as beside:
+        code, told = beside.check('--wait', '3')
+        assert code == 1
+    remap = ['--ros-args', '-r', 'plant_output:=/motor/plant_output']
+    assert ' '.join(remap) in told
+    code, told = check_undisturbed(tmp_path, 'name', '--drive', *remap)
+    assert (code, subjects(told, '✗')) == (0, []), told
+
+
+def test_nobody_there_is_said(tmp_path: Path) -> None:
+    with bench(tmp_path) as beside:
+        code, told = beside.check('--wait', '1')
+    assert code == 1
+    assert 'waiting for /plant_output (std_msgs/msg/Float64)' in told
+    assert 'sees no other topic' in told
+
+
+def test_sigint_brings_v_to_rest(tmp_path: Path) -> None:
+    with bench(tmp_path, 'none') as beside:
+        probe = Probe(beside.domain)
+        try:
+            controls = probe.collect('control', Float64)
+            process = beside.start('--drive', '--duration', '60')
+            try:
+                probe.wait_until(
+                    lambda: any(abs(c.data) > 2.0 for c in controls), 'a motion of v'
+                )
+                process.send_signal(signal.SIGINT)
+                probe.wait_until(lambda: process.poll() is not None, 'the end')
+                out, err = process.communicate()
+            finally:
+                process.kill()
+            probe.wait_until(lambda: controls[-1].data == 0.0, 'v at rest')
+        finally:
+            probe.close()
+    assert 'Traceback' not in err
+    assert 'rate' in out
+    v = [c.data for c in controls]
+    step = LIMITS.rate * parameters()['sample_period']
+    assert max(abs(b - a) for a, b in pairwise(v)) <= step * (1.0 + 1e-9)
+
+
+def test_y_outside_the_given_range_ends_the_drive(tmp_path: Path) -> None:
+    with bench(tmp_path, 'none') as beside:
+        code, told = beside.check('--drive', '--output-range', '-0.5', '0.5', '--duration', '30')
+    assert code == 1
+    assert 'left --output-range' in told
+
+
+def test_a_controller_that_drives_already_is_not_disturbed(tmp_path: Path) -> None:
+    with bench(tmp_path, 'none') as beside:
+        probe = Probe(beside.domain)
+        try:
+            probe.publisher('control', Float64)
+            process = beside.start('--drive')
+            probe.wait_until(lambda: process.poll() is not None, 'the refusal')
+            err = process.communicate()[1]
+        finally:
+            probe.close()
+    assert process.returncode == 2
+    assert '/control is published by /probe' in err
+
+
+@pytest.mark.parametrize(('options', 'word'), [
+    (['--drive', '--ros-args', '-p', 'control.rate_max:=.inf'], 'give --rate'),
+    (['--amplitude', '3'], 'give --drive'),
+    (['--duration', '-1'], 'must be finite and > 0'),
+    (['--ros-args', '-p', 'sample_priod:=0.1'], 'did you mean sample_period?'),
+    (['--config', 'nowhere.yaml'], 'nowhere.yaml'),
+])
+def test_bad_input_is_one_line_and_code_2(
+    tmp_path: Path, options: list[str], word: str
+) -> None:
+    with bench(tmp_path) as beside:
+        code, told = beside.check(*options)
+    assert code == 2
+    assert word in told
+    assert len(told.splitlines()) == 1
+
+
+def test_what_a_file_holds_for_the_controller_alone_counts(tmp_path: Path) -> None:
+    with bench(tmp_path) as beside:
+        own = {'/controller': {'ros__parameters': {'control': {'min': 'nothing'}}}}
+        document = json.loads(beside.config.read_text())
+        beside.config.write_text(json.dumps({**document, **own}))
+        code, told = beside.check('--drive')
+    assert code == 2
+    assert "control.min='nothing'" in told
+
+
+def test_help_names_the_exit_codes(tmp_path: Path) -> None:
+    with bench(tmp_path) as beside:
+        code, told = beside.check('--help')
+    assert code == 0
+    assert 'Exit codes' in told
+
+

@@ -1,0 +1,192 @@
+"""The example drivers beside real nodes, and the commands that docs/driver.md prints."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_processes import RosWorld, ros_world
+from std_msgs.msg import Float64MultiArray
+
+from backlash_ros import topics
+from backlash_ros.nodes.gentle_drive import GentleDrive, Range
+from backlash_ros.tools.processes import child_environment, free_domain
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / 'examples'
+BLOCKS = re.findall(
+    r'^```bash\n(.*?)^```', (ROOT / 'docs' / 'driver.md').read_text(), re.MULTILINE | re.DOTALL
+)
+# Beside these the commands that follow them are run.
+FOREVER = ('motor_driver.py', 'bare_dds_driver.py', '/controller', '/reference')
+SHORT = {'--duration': '3'}  # s; the pages give a user more time
+DEADLINE_S = 90.0
+# Of a driver that a machine under load holds up, a run says nothing.
+HELD_UP, ATTEMPTS = ('✗ jitter', '✗ lost samples'), 5
+
+sys.path.insert(0, str(EXAMPLES))
+from find_model import find_model, rising_part  # noqa: E402
+from simulated_motor import ENCODER_STEP, SimulatedMotor  # noqa: E402
+
+
+@contextmanager
+def running(
+    command: list[str], environment: dict[str, str], folder: Path = ROOT
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that is ended with the context."""
+    process = subprocess.Popen(
+        command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def final_estimates(world: RosWorld, driver: str) -> tuple[float, float, float]:
+    """m, c_r, c_l that controller and reference come to with a driver, within 1 % of the paper."""
+    probe = world.probe()
+    heard = probe.collect(topics.ESTIMATES, Float64MultiArray)
+    world.start('reference')
+    world.start('controller', {'estimator.use_applied_control': True})
+    with running([sys.executable, str(EXAMPLES / driver)], world.environment):
+        probe.wait_until(lambda: heard and within_one_percent(heard[-1]), 'estimates within 1 %')
+    m, c_r, c_l = heard[-1].data[:3]
+    return m, c_r, c_l
+
+
+def within_one_percent(message: Float64MultiArray) -> bool:
+    return bool(np.allclose(message.data[:3], (1.3, 3.0, -3.0), rtol=0.01, atol=0.0))
+
+
+def test_a_bare_dds_program_is_a_driver(tmp_path: Path) -> None:
+    pytest.importorskip('cyclonedds')
+    with ros_world(tmp_path) as world:
+        assert final_estimates(world, 'bare_dds_driver.py') == pytest.approx(
+            (1.3, 3.0, -3.0), rel=0.01
+        )
+
+
+@pytest.mark.parametrize('driver', ['motor_driver.py', 'bare_dds_driver.py'])
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_example_drivers_end_on_a_signal(
+    tmp_path: Path, driver: str, number: signal.Signals
+) -> None:
+    if driver.startswith('bare'):
+        pytest.importorskip('cyclonedds')
+    with ros_world(tmp_path) as world:
+        probe = world.probe()
+        command = [sys.executable, str(EXAMPLES / driver)]
+        with running(command, world.environment) as process:
+            probe.wait_until(
+                lambda: probe.node.count_publishers('plant_output') > 0, 'the driver'
+            )
+            process.send_signal(number)
+            assert process.wait(DEADLINE_S) == 0
+
+
+def test_model_is_found_from_a_rising_record() -> None:
+    motor, drive = SimulatedMotor(0.005), GentleDrive(Range(-12.6, 12.6, 300.0), 0.005, 5.0, True)
+    v, y = np.empty(1000), np.empty(1000)
+    for k in range(1000):
+        y[k] = ENCODER_STEP * round(motor._x1 / ENCODER_STEP)
+        v[k] = motor.move_to(drive.step())
+        motor._step()
+    numerator, denominator, noise_std = find_model(*rising_part(v, y, 100), 2)
+    assert numerator / 0.098 == pytest.approx([0.15678154, 0.12688103], rel=0.01)
+    assert denominator == pytest.approx([1.0, -1.24982552, 0.53348809], rel=0.01)
+    assert noise_std == pytest.approx(ENCODER_STEP / 12.0**0.5, rel=0.1)
+
+
+def commands_of_driver_page() -> list[list[str]]:
+    """The words of every command, in the order of the page."""
+    lines = [line for block in BLOCKS for line in block.splitlines()]
+    return [words for line in lines if (words := shlex.split(line)) and words[0] != 'export']
+
+
+def runnable(words: list[str]) -> list[str]:
+    """The command as it is run here: this interpreter, and less time."""
+    program, *arguments = words
+    name = program.removeprefix('.venv/bin/')
+    modules = dict(
+        re.findall(r"f'(\w+) = \{PACKAGE\}\.([\w.]+):main'", (ROOT / 'setup.py').read_text())
+    )
+    for i, argument in enumerate(arguments[:-1]):
+        arguments[i + 1] = SHORT.get(argument, arguments[i + 1])
+    arguments = [a.replace('.venv/bin/python', sys.executable) for a in arguments]
+    if name == 'python':
+        return [sys.executable, *arguments]
+    return [sys.executable, '-m', f'backlash_ros.{modules[name]}', *arguments]
+
+
+def page_in_parts() -> list[list[list[str]]]:
+    """Commands grouped: those that run forever, then what is run beside them."""
+    parts: list[list[list[str]]] = [[]]
+    ended = False
+    for words in commands_of_driver_page():
+        forever = any(mark in ' '.join(words) for mark in FOREVER) and '--driver' not in words
+        if forever and ended:
+            parts.append([])
+        ended = not forever
+        parts[-1].append(words)
+    return parts
+
+
+@pytest.mark.parametrize('part', page_in_parts(), ids=lambda part: part[0][-1])
+def test_commands_of_the_driver_page_run(tmp_path: Path, part: list[list[str]]) -> None:
+    if any('bare_dds' in ' '.join(words) for words in part):
+        pytest.importorskip('cyclonedds')
+    for name in ('examples', 'config'):
+        (tmp_path / name).symlink_to(ROOT / name)
+    with free_domain() as domain:
+        environment = child_environment(tmp_path, domain)
+        started: list[subprocess.Popen[bytes]] = []
+        try:
+            for words in part:
+                run_or_start(words, environment, tmp_path, started)
+            assert all(process.poll() is None for process in started)
+        finally:
+            for process in started:
+                process.kill()
+                process.wait()
+
+
+def run_or_start(
+    words: list[str], environment: dict[str, str], folder: Path,
+    started: list[subprocess.Popen[bytes]],
+) -> None:
+    """Start what runs forever; run the rest, which has to do what it is for."""
+    text = ' '.join(words)
+    if any(mark in text for mark in FOREVER) and '--driver' not in words:
+        started.append(subprocess.Popen(
+            runnable(words), cwd=folder, env=environment, stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        ))
+        return
+    if '--driver' in words:
+        for process in started:
+            process.kill()
+            process.wait()
+        started.clear()
+    for _ in range(ATTEMPTS):
+        done = subprocess.run(
+            runnable(words), cwd=folder, env=environment, capture_output=True, text=True,
+            timeout=DEADLINE_S,
+        )
+        if not any(word in done.stdout for word in HELD_UP):
+            break
+    if 'check_driver' in text:
+        assert done.returncode in (0, 1), done.stderr
+        assert '✓ sign and units' in done.stdout, done.stdout + done.stderr
+        assert '✓ G(z)' in done.stdout, done.stdout
+    else:
+        assert done.returncode == 0, done.stdout + done.stderr
