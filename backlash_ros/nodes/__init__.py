@@ -5,7 +5,7 @@ import signal
 import sys
 from types import FrameType
 
-EXECUTABLES = ('controller', 'plant', 'reference', 'recorder')
+EXECUTABLES = ('controller', 'plant', 'reference', 'recorder', 'check_driver')
 
 
 def _end(number: int, frame: FrameType | None) -> None:

@@ -144,10 +144,15 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
     stamps = np.array([message.stamp_ns for message in outputs], dtype=np.int64)
     rough = max(float(np.median(np.diff(stamps))), 1.0)
     counter = SampleCounter(rough * 1e-9)
-    index, missing = [], 0
+    index, missing, samples = [], 0, []
     for message in outputs:
-        missing += counter.count(message.stamp_ns, message.number)
-        index.append(counter.index)
+        arrival = counter.count(message.stamp_ns, message.number)
+        if arrival.is_sample:
+            missing += arrival.missing
+            index.append(counter.index)
+            samples.append(message)
+    repeated += len(outputs) - len(samples)
+    outputs, stamps = samples, np.array([message.stamp_ns for message in samples], dtype=np.int64)
     numbers = np.array(index, dtype=np.intp) - index[0]
     slope, offset = np.polyfit(numbers, (stamps - stamps[0]) * 1e-9, 1)
     late = (stamps - stamps[0]) * 1e-9 - slope * numbers - offset
