@@ -25,6 +25,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core.parameter_table import CONTROLLER, PARAMETERS
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.processes import (
     ProcessPlan,
@@ -189,17 +190,19 @@ def node_command(name: str, values: Mapping[str, object]) -> list[str]:
     return [sys.executable, '-m', f'{NODES}.{name}', *arguments]
 
 
-def measure_latency(rate: float, law: str, duration_s: float) -> Latencies:
+def measure_latency(
+    rate: float, law: str, duration_s: float, changes: Mapping[str, object] | None = None,
+) -> Latencies:
     """Latency of the controller process with this law at this rate."""
-    values = {
-        'sample_period': 1.0 / rate, 'estimator.law': law, 'estimator.output_noise_std': 1e-3,
-    }
-    # The same waves per sample at every rate: G is given in samples, not in seconds.
+    # The same waves per sample at every rate: G is given in samples, not in seconds. While the
+    # echo is asked the controller hears nothing, which is no silence of the driver.
     parameters = Parameters({
-        **values, 'output_noise_std': 1e-3, 'frequency': 0.126 * rate,
+        'sample_period': 1.0 / rate, 'estimator.law': law, 'estimator.output_noise_std': 1e-3,
+        'timeout.plant_output': 0.0, 'output_noise_std': 1e-3, 'frequency': 0.126 * rate,
+        **(changes or {}),
     })
     commands = {
-        'controller': node_command('controller', values),
+        'controller': node_command('controller', _values_of(CONTROLLER, parameters)),
         'echo': [sys.executable, str(Path(__file__).with_name('echo_node.py'))],
     }
     with processes(commands) as (supervisor, domain):
@@ -213,6 +216,13 @@ def measure_latency(rate: float, law: str, duration_s: float) -> Latencies:
         if not (result.controller and result.echo):
             raise RuntimeError(f'{law}, {rate:g} Hz: nobody answered')
         return result
+
+
+def _values_of(executable: str, parameters: Parameters) -> dict[str, object]:
+    return {
+        parameter.name: parameters[parameter.name] for parameter in PARAMETERS
+        if executable in parameter.used_by and parameters[parameter.name] != parameter.default
+    }
 
 
 def latency_checks(latencies: Sequence[Latencies], law: str) -> list[Check]:
@@ -232,13 +242,17 @@ def lockstep_speed(law: str, samples: int = LOCKSTEP_SAMPLES) -> float:
         name: node_command(name, values) for name in ('controller', 'reference', 'plant')
     }
     with processes(commands) as (supervisor, _):
-        started = _wait_for(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
-        done = _wait_for(supervisor, lambda kind, _: kind == 'done')
+        started = wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
+        done = wait_for_event(supervisor, lambda kind, _: kind == 'done')
     return samples / (done - started)
 
 
-def _wait_for(supervisor: ProcessSupervisor, wanted: Callable[[str, str], bool]) -> float:
-    deadline = time.monotonic() + 10.0 * DEADLINE_S
+def wait_for_event(
+    supervisor: ProcessSupervisor, wanted: Callable[[str, str], bool],
+    patience_s: float = 10.0 * DEADLINE_S,
+) -> float:
+    """Time at which an event of this kind and process came [s]."""
+    deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
         for event in supervisor.events(0.1):
             if wanted(event.kind, event.plan.name):
