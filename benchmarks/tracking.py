@@ -1,6 +1,6 @@
 """How closely y follows y_m, against the same loop without backlash and without compensation.
 
-    python benchmarks/tracking.py [--point N] [--cases N]
+    python benchmarks/tracking.py [--point N] [--cases N] [--first-seed N]
 
 Each line of the table is a bound and what was measured. Errors are against y_m delayed by the
 preview window. Point 2 is about the measured y, as it stands in samples.csv; what is left of it
@@ -314,17 +314,18 @@ def tracked_case(seed: int) -> tuple[dict[str, object], int]:
     return values, case.samples // 3
 
 
-def point_5(simulate: Simulate, cases: int = 100) -> Iterator[Check]:
+def point_5(simulate: Simulate, cases: int = 100, first: int = 0) -> Iterator[Check]:
     """Random plants, gaps and noise."""
-    chosen = [tracked_case(seed) for seed in range(cases)]
+    seeds = range(first, first + cases)
+    chosen = [tracked_case(seed) for seed in seeds]
     jobs = []
     for values, period in chosen:
         delay = Parameters(values).integer('tracking.preview')
         jobs += three(values, delay + 8 * period)
     results = simulate(jobs)
     unstable, cancelled = [], 0
-    for seed, (_, period) in enumerate(chosen):
-        learns, ideal, plain = results[3 * seed:3 * seed + 3]
+    for i, (seed, (_, period)) in enumerate(zip(seeds, chosen, strict=True)):
+        learns, ideal, plain = results[3 * i:3 * i + 3]
         since = 0.01 * (learns.delay + 3 * period)
         a, b, c = (r.error(since) for r in (learns, ideal, plain))
         kind = random_case(seed).kind
@@ -377,6 +378,7 @@ def main(args: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--point', type=int, choices=sorted(POINTS), action='append')
     parser.add_argument('--cases', type=int, default=100, help='random cases of point 5')
+    parser.add_argument('--first-seed', type=int, default=0, help='of these cases')
     options = parser.parse_args(args)
     checks: list[Check] = []
     with ProcessPoolExecutor() as pool:
@@ -384,7 +386,7 @@ def main(args: Sequence[str] | None = None) -> int:
             return list(pool.map(run_job, list(jobs), chunksize=1))
         for number in options.point or sorted(POINTS):
             if number == 5:
-                checks += point_5(simulate, options.cases)
+                checks += point_5(simulate, options.cases, options.first_seed)
             else:
                 checks += POINTS[number](simulate)
     print(format_table(('point', 'what', 'bound', 'measured', ''), [

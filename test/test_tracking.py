@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.lq_preview import preview_gains
 from backlash_ros.core.metrics import (
     delayed_reference,
     delayed_tracking_error_rms,
@@ -16,6 +19,9 @@ from backlash_ros.core.metrics import (
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.reference_signal import ReferenceSignal
 from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.core.slope_tolerance import tolerates
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.transfer_function import TransferFunction
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 KNOWN = {'estimator.law': 'fixed', 'estimator.initial.m': 1.3}
@@ -90,8 +96,26 @@ def test_nothing_moves_before_there_is_anything_to_do() -> None:
 def test_wrong_first_slope_stays_bounded_until_the_truth_is_learned() -> None:
     for slope in (0.13, 4.0):
         run = simulate(tracking(estimator__initial__m=slope), 400)
-        assert np.abs(run.column('y')).max() < 2.0
+        assert np.abs(run.column('y')).max() < 3.0
         assert np.abs(run.column('y')[300:]).max() < 0.25
+
+
+def test_feedback_by_the_first_guess_is_left_out_where_a_wrong_slope_would_destabilise() -> None:
+    quick = StateModel(TransferFunction([0.1], [1.0, -0.9]))
+    slow = StateModel(TransferFunction([1e-6], np.poly([1.0, 0.99, 0.985, 0.98]).tolist()))
+    for model, bears in ((quick, True), (slow, False)):
+        gain = preview_gains(model, 1.0, 0.0, 0).state
+        assert tolerates(model, gain, 1.0)
+        assert tolerates(model, gain, 3.0) is bears
+
+
+@given(st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=2))
+def test_with_the_true_slope_the_observer_changes_no_pole_of_the_loop(gain: list[float]) -> None:
+    model = StateModel(TransferFunction([0.1, 0.05], [1.0, -1.7, 0.72]))
+    k = np.array(gain)
+    radius = np.abs(np.linalg.eigvals(model.a - np.outer(model.b, k))).max()
+    assume(abs(radius - 1.0) > 1e-3)
+    assert tolerates(model, k, 1.0) == (radius < 1.0)
 
 
 @pytest.mark.parametrize('law', ['kalman', 'fixed'])

@@ -28,6 +28,7 @@ from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.reference_file import read_reference_file
 from backlash_ros.core.reference_signal import ReferenceSignal
 from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.slope_tolerance import tolerates
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import Structure
 from backlash_ros.core.tracking import Tracking
@@ -39,6 +40,9 @@ DOUBT_OF_FIRST_GUESS = 0.5
 LITTLE_SMOOTHING = 0.1
 # Times the input weight while v meets its limits; the last one while the backlash is unknown.
 SOFTER = (1e1, 1e2, 1e3, 1e4)
+# Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
+# are led astray by any feedback that would help, and learn faster than they go astray without.
+WRONG_SLOPE = 1.35
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -227,8 +231,9 @@ def _tracking(p: Parameters) -> Structure:
         state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview')
     )
     softer = [preview_gains(state, more * weight, 0.0, 0).state for more in SOFTER]
+    careful = softer[-1] if tolerates(state, softer[-1], WRONG_SLOPE) else None
     return Tracking(
-        state, gains, softer[-1], p.real('inverse.caution'),
+        state, gains, careful, p.real('inverse.caution'),
         p.real('estimator.output_noise_std'), softer,
     )
 

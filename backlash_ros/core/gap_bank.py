@@ -107,6 +107,7 @@ class GapBank:
         self.cov[:, n:, n:] = believed
         self._plausible = IMPLAUSIBLE * np.sqrt(believed.diagonal(axis1=1, axis2=2).max(axis=1))
         self.log_likelihood = np.zeros(count)
+        self._paid = np.zeros(count)  # log-likelihood that learning x and theta has cost
         self.active = 0  # hypotheses [:active] have started
         self.since_motion = 0  # samples since u last moved under the leader
         self.turned = False  # whether the leader engaged the other side with the last step
@@ -156,7 +157,9 @@ class GapBank:
         """Make the most likely hypothesis the leader and return its log-likelihood.
 
         A hypothesis g that fits the data with another m (c_r - c_l) than m g contradicts itself:
-        its own gap counts as one more measurement, m g of theta[1] - theta[2]. How far the
+        its own gap counts as one more measurement, m g of theta[1] - theta[2]. What learning x
+        and theta costs in likelihood is made equal: else a hypothesis that has just started,
+        and has paid little of it, would lead over the true one. How far the
         estimates of likely hypotheses lie apart is kept as `doubt`.
         """
         rows = slice(self._first, self.active)
@@ -171,6 +174,8 @@ class GapBank:
         variance = np.maximum(variance, 0.0) + (self.tolerance * gaps * theta[:, 0]) ** 2
         score = self.log_likelihood[:self.active].copy()
         score[rows] -= 0.5 * (mismatch**2 / variance + np.log(variance))
+        paid = self._paid[rows]
+        score[rows] += paid - paid.max(initial=-inf)
         score[rows][theta[:, 0] <= 0.0] = -inf
         self.leader = leader = int(score.argmax())
         if leader >= self._first and score[leader] > -inf:
@@ -199,7 +204,7 @@ class GapBank:
         rows = slice(first, last)
         for name in (
             'gaps', 'mean', 'cov', 'log_likelihood', '_plausible', '_transition', '_reach',
-            '_left', '_phi',
+            '_left', '_phi', '_paid',
         ):
             setattr(part, name, getattr(self, name)[rows].copy())
         part.active, part._first = last - first, 0
@@ -250,6 +255,7 @@ class GapBank:
         # Every filter pays once for how little it believes of x; repaid, so that filters that
         # believed differently can be compared.
         self.log_likelihood[new] += n * log(std)
+        self._paid[new] -= n * log(std)
 
     def _play(self, count: int, v: float) -> None:
         """Move the play operators; phi is that of the last engagement."""
@@ -316,7 +322,9 @@ class GapBank:
         self._corrections += 1
         if self._corrections % SYMMETRISE_EVERY == 0:
             cov[:] = 0.5 * (cov + cov.transpose(0, 2, 1))
-        self.log_likelihood[:count] -= 0.5 * (e * e / variance + np.log(variance))
+        spread = np.log(variance)
+        self.log_likelihood[:count] -= 0.5 * (e * e / variance + spread)
+        self._paid[:count] += 0.5 * (spread - log(self.noise_var))
         if self._corrections % ELECT_EVERY == 0:
             self.elect()
         return True

@@ -239,10 +239,14 @@ class GapSearch:
         if end < self.samples:
             return
         self._replay = None
+        if not replay.active:
+            return  # gaps that v has not even swung over yet
         fine = self.fine
+        if self._behind(replay):
+            self._earliest = self.samples  # refuted while it was read: no reason to wait
         if fine is None or self._behind(fine):
             self._fine_since = self.samples
-        elif replay.elect() < fine.elect() - REPLAY_MARGIN:
+        elif replay.elect() < fine.elect() - REPLAY_MARGIN or fine.nis < NIS_SETTLED < replay.nis:
             return  # reading the record afresh explained it worse
         replay.elect()
         self.fine, self._read_with = replay, replay.gaps

@@ -26,6 +26,7 @@ NIS_LIMIT = 3.0  # mean normalised innovation squared that contradicts an estima
 NIS_TRUSTED = 2.0  # mean normalised innovation squared below which an estimate is consistent
 PROVEN = 25  # samples a new search must be consistent for before it replaces an estimate
 RESTART_AFTER = 150  # inconsistent samples after which a search begins afresh
+RESTART_IN_VAIN = 50  # the same while no estimate is known, so that nothing good can be lost
 NO_DATA_AFTER = 20  # lost samples in a row that are worth a status
 UNDECIDED_AFTER = 100  # samples after which a search says that nothing usable comes out
 PRECISE_SLOPE, PRECISE_GAP = 0.2, 0.3  # relative deviations below which an estimate is published
@@ -154,7 +155,8 @@ class KalmanEstimator:
 
     def _restart_in_vain(self, watched: _Watched) -> None:
         """Begin afresh where a first search found nothing, and remember why."""
-        if watched.inconsistent_for >= RESTART_AFTER:
+        patience = RESTART_IN_VAIN if watched.contradicted else RESTART_AFTER
+        if watched.inconsistent_for >= patience:
             self._in_vain = Status.INCONSISTENT
         elif watched.search.exhausted:
             self._in_vain = Status.NOT_EXCITED

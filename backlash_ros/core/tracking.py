@@ -29,6 +29,9 @@ STEADY = 0.01  # share of the tolerance by which an ideal trajectory at rest may
 
 HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
 WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
+# Samples for which an estimate has to hold before it gets full feedback: one that is confidently
+# wrong is contradicted by then.
+TRUSTED_AFTER = 40
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.
@@ -43,8 +46,8 @@ class Tracking:
     The trajectory is what the LQ preview controller does without backlash, for the reference r,
     which is y_m delayed by the preview window: the delay is what the preview costs. Before the
     first reference has passed the window r is the output at the start, so that nothing jumps.
-    While the backlash is unknown, `careful` replaces K: little feedback cannot destabilise a loop
-    whose gain is unknown, and the trajectory itself excites it.
+    While the backlash is unknown, `careful` replaces K, or nothing where it is None: the trajectory
+    itself excites the backlash.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
     softer: gains to replace K with, step by step, while v meets its limits: full feedback through
     a limited actuator cycles between the limits. noise_std: of y; while the trajectory rests and
@@ -54,7 +57,7 @@ class Tracking:
     needs_output = True
 
     def __init__(
-        self, model: StateModel, gains: PreviewGains, careful: Array, caution: float,
+        self, model: StateModel, gains: PreviewGains, careful: Array | None, caution: float,
         noise_std: float = 0.0, softer: Sequence[Array] = (),
     ) -> None:
         self.delay = len(gains.preview) - 1
@@ -66,6 +69,7 @@ class Tracking:
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
         self._noise_std, self._reach, self._u_reach = noise_std, 0.0, 0.0
+        self._trusted_for = 0  # samples
         self._soft = (gains.state, *softer)
         self._level = self._free = 0  # gain in use, samples since v last met a limit
         self._resting: float | None = 0.0  # u* at which v rests, None while it moves
@@ -76,7 +80,7 @@ class Tracking:
         self._integral, self._ideal = other._integral, other._ideal
         self._reach, self._u_reach = other._reach, other._u_reach
         self._level, self._free = other._level, other._free
-        self._resting = other._resting
+        self._trusted_for, self._resting = other._trusted_for, other._resting
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
@@ -87,7 +91,7 @@ class Tracking:
         ideal = -float(gains.state @ self._x) - gains.integral * self._q
         ideal -= float(gains.preview @ window)
         deviation = np.zeros(len(self._x)) if first else situation.x_hat - self._x
-        trusted = _trusted(situation.estimate)
+        trusted = self._is_trusted(situation.estimate, first)
         if trusted:
             u_d = ideal - float(self._gain(inverse.limited) @ deviation)
             u_d -= gains.integral * (self._integral - self._q)
@@ -102,6 +106,8 @@ class Tracking:
             onward = (ideal - self._ideal) * inverse.side >= 0.0
             band = ONWARD_BAND if onward else NOISE_BAND
             inverse.widen_band(band * sqrt(max(variance, 0.0)))
+        else:
+            inverse.widen_band(0.0)  # no noise of x enters u_d, a turn is one
         self._ideal = ideal
         # A single move cannot start a limit cycle, and should leave as little drift as possible.
         caution = self._caution if self._resting is None else 0.0
@@ -135,6 +141,8 @@ class Tracking:
         A wrong slope may make the loop unstable, which bounded feedback slows down. The bound
         widens while it is met: a gap wider than the first guess has to be crossed some day.
         """
+        if self._careful is None:
+            return 0.0
         self._u_reach = max(
             self._u_reach, abs(ideal), estimate.m * (estimate.c_r - estimate.c_l)
         )
@@ -143,6 +151,12 @@ class Tracking:
             feedback = self._u_reach if feedback > 0.0 else -self._u_reach
             self._u_reach *= WIDENING
         return feedback
+
+    def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
+        # Constants that are given, not learned, are trusted from the start.
+        known = TRUSTED_AFTER if first else self._trusted_for + 1
+        self._trusted_for = known if _trusted(estimate) else 0
+        return self._trusted_for >= TRUSTED_AFTER
 
     def _rest(self, situation: Situation, deviation: Array, ideal: float) -> None:
         """Decide whether v rests: the trajectory does, and y needs no correction."""
