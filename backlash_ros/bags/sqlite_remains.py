@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
@@ -53,30 +54,45 @@ class SqliteRemains:
     @contextmanager
     def _database(self) -> Iterator[sqlite3.Connection]:
         """The database, and nothing in the folder of the bag is changed."""
+        torn = _torn_bytes(self._file)
         try:
-            database = _connect(self._file, 'ro')
+            database = None if torn else _connect(self._file, 'ro')
         except sqlite3.OperationalError:
+            # The last transaction was torn. SQLite takes it back, for which it has to write.
             if not any(part.is_file() for part in self._journals()):
                 raise
-        else:
+            database = None
+        if database is not None:
             with closing(database):
                 yield database
             return
-        # The last transaction was torn. SQLite takes it back, for which it has to write.
         with TemporaryDirectory(prefix='backlash_ros-') as folder:
-            try:
-                for part in (self._file, *self._journals()):
-                    if part.is_file():
-                        shutil.copyfile(part, Path(folder) / part.name)
-            except OSError as error:
-                raise BagError(
-                    f'{self._file}: cannot be copied to {folder}: {error.strerror}'
-                ) from None
-            with closing(_connect(Path(folder) / self._file.name, 'rw')) as database:
+            copy = self._copy_to(Path(folder))
+            # What is missing of a page would read as zeros, in messages too.
+            os.truncate(copy, copy.stat().st_size - torn)
+            with closing(_connect(copy, 'rw')) as database:
                 yield database
+
+    def _copy_to(self, folder: Path) -> Path:
+        try:
+            for part in (self._file, *self._journals()):
+                if part.is_file():
+                    shutil.copyfile(part, folder / part.name)
+        except OSError as error:
+            raise BagError(
+                f'{self._file}: cannot be copied to {folder}: {error.strerror}'
+            ) from None
+        return folder / self._file.name
 
     def _journals(self) -> list[Path]:
         return [self._file.with_name(self._file.name + suffix) for suffix in ('-journal', '-wal')]
+
+
+def _torn_bytes(file: Path) -> int:
+    """How many bytes of a page that is not all there the file ends with."""
+    with file.open('rb') as stream:
+        page = int.from_bytes(stream.read(18)[16:], 'big')
+    return 0 if page < 512 else file.stat().st_size % page
 
 
 def _connect(file: Path, mode: str) -> sqlite3.Connection:

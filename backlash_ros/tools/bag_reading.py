@@ -175,10 +175,16 @@ def _read_complete(path: Path) -> _Content:
 def _read_remains(path: Path, reason: str) -> _Content:
     content, types = _Content(), get_typestore(Stores.ROS2_JAZZY)
     remains = open_remains(path)
-    first, last, count = 2**63, 0, 0
+    first, last, count, garbled = 2**63, 0, 0, 0
     for topic, stamp_ns, raw in remains.messages():
         if _is_array_topic(topic.name):
-            content.add(topic.name, stamp_ns, types.deserialize_cdr(raw, topic.message_type))
+            try:
+                message = types.deserialize_cdr(raw, topic.message_type)
+            # Whatever the damaged bytes make the library stumble over, the message is lost.
+            except Exception:
+                garbled += 1
+                continue
+            content.add(topic.name, stamp_ns, message)
         first, last, count = min(first, stamp_ns), max(last, stamp_ns), count + 1
     if not count:
         raise BagError('it holds no message')
@@ -186,7 +192,7 @@ def _read_remains(path: Path, reason: str) -> _Content:
     cure = 'stop the recorder' if is_being_written(path) else f'{CURE} {path}'
     content.damage = (
         f'{path} {reason}: this is what is left, {count} messages of {(last - first) * 1e-9:.1f} '
-        f's. To have it complete: {cure}'
+        f's{f", {garbled} more cannot be decoded" if garbled else ""}. To have it complete: {cure}'
     )
     return content
 
