@@ -49,7 +49,9 @@ class McapRemains:
                 opcode, length = record
                 after = at + RECORD.size + length
                 if opcode == CHUNK:
-                    yield from self._of_chunk(stream.read(length), length)
+                    # A length that is garbage may be more than any memory holds.
+                    content = stream.read(min(length, size))
+                    yield from self._of_chunk(content, length, stream.read(1))
                 elif opcode in (SCHEMA, CHANNEL, MESSAGE) and after <= size:
                     yield from self._of_records([(opcode, stream.read(length))])
                 if after > size:
@@ -78,8 +80,11 @@ class McapRemains:
             raise BagError(f'{self._file}: was not recorded from ROS 2')
         return library.startswith('rosbags')
 
-    def _of_chunk(self, content: bytes, length: int) -> Iterator[Message]:
-        """Messages of a chunk of which `content` is there; it should be as long as `length`."""
+    def _of_chunk(self, content: bytes, length: int, following: bytes) -> Iterator[Message]:
+        """Messages of a chunk of which `content` is there; it should be as long as `length`.
+
+        following: the byte behind it, empty at the end of the file.
+        """
         try:
             *_, checksum = CHUNK_HEAD.unpack_from(content)
             compression, at = _text(content, CHUNK_HEAD.size)
@@ -95,7 +100,7 @@ class McapRemains:
         if checksum and len(content) == length and zlib.crc32(records) != checksum:
             self._skipped += len(records)
             return
-        sound, end = _sound_records(records)
+        sound, end = _sound_records(records, following)
         self._skipped += len(records) - end
         yield from self._of_records(sound)
 
@@ -139,16 +144,18 @@ def _head(stream: BinaryIO, at: int, size: int) -> tuple[int, int] | None:
     return (opcode, length) if opcode in OPCODES else None
 
 
-def _sound_records(data: bytes) -> tuple[list[tuple[int, bytes]], int]:
+def _sound_records(data: bytes, following: bytes) -> tuple[list[tuple[int, bytes]], int]:
     """The records that data begins with, and how many bytes they take.
 
     After a power cut pages may be missing: they read as zeros, which are no opcode. A record that
-    such a page follows may have lost its own end to it, and counts as lost.
+    such a page follows may have lost its own end to it, and counts as lost. following: the byte
+    behind data, empty at the end of the file; behind a chunk that was flushed more records stand.
     """
     records: list[tuple[int, bytes]] = []
     at = begin_of_last = 0
-    while at < len(data):
-        if data[at] not in OPCODES:
+    while True:
+        next_byte = data[at:at + 1] or following
+        if not next_byte or next_byte[0] not in OPCODES:
             return records[:-1], begin_of_last
         if at + RECORD.size > len(data):
             break

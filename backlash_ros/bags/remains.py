@@ -6,9 +6,16 @@ from pathlib import Path
 
 from rosbags.rosbag2 import Reader
 
-from backlash_ros.bags.content import METADATA, SUFFIXES, BagError, Remains, the_message_file
+from backlash_ros.bags.content import (
+    METADATA,
+    SUFFIXES,
+    BagError,
+    Remains,
+    message_files,
+    the_message_file,
+)
 from backlash_ros.bags.mcap_remains import McapRemains
-from backlash_ros.bags.sqlite_remains import SqliteRemains
+from backlash_ros.bags.sqlite_remains import SqliteRemains, torn_bytes
 
 
 def open_remains(bag: Path) -> Remains:
@@ -20,10 +27,21 @@ def open_remains(bag: Path) -> Remains:
         raise BagError(f'{file}: cannot be read: {error.strerror}') from None
 
 
-def damage(bag: Path) -> str:
-    """What keeps a bag from being complete, in words; empty for one that is."""
+def visible_damage(bag: Path) -> str:
+    """What can be said to be wrong with a bag without reading it; empty if nothing."""
     if not (bag / METADATA).is_file():
         return 'was never closed'
+    # SQLite itself would take what is missing for zeros.
+    if any(file.suffix == '.db3' and torn_bytes(file) for file in message_files(bag)):
+        return 'has lost its end'
+    return ''
+
+
+def damage(bag: Path) -> str:
+    """What keeps a bag from being complete, in words; empty for one that is."""
+    visible = visible_damage(bag)
+    if visible:
+        return visible
     try:
         with Reader(bag) as reader:
             found = sum(1 for _ in reader.messages())

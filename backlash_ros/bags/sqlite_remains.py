@@ -54,7 +54,7 @@ class SqliteRemains:
     @contextmanager
     def _database(self) -> Iterator[sqlite3.Connection]:
         """The database, and nothing in the folder of the bag is changed."""
-        torn = _torn_bytes(self._file)
+        torn = torn_bytes(self._file)
         try:
             database = None if torn else _connect(self._file, 'ro')
         except sqlite3.OperationalError:
@@ -88,8 +88,8 @@ class SqliteRemains:
         return [self._file.with_name(self._file.name + suffix) for suffix in ('-journal', '-wal')]
 
 
-def _torn_bytes(file: Path) -> int:
-    """How many bytes of a page that is not all there the file ends with."""
+def torn_bytes(file: Path) -> int:
+    """How many bytes of a page that is not all there an SQLite file ends with."""
     with file.open('rb') as stream:
         page = int.from_bytes(stream.read(18)[16:], 'big')
     return 0 if page < 512 else file.stat().st_size % page

@@ -13,8 +13,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.bags.content import CURE, METADATA, BagError, is_being_written
-from backlash_ros.bags.remains import open_remains
+from backlash_ros.bags.content import CURE, BagError, is_being_written
+from backlash_ros.bags.remains import open_remains, visible_damage
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.errors import InputError
 
@@ -143,8 +143,8 @@ def _read_content(path: Path) -> _Content:
     if not path.is_dir():
         rule = 'is a file: give the folder of the bag' if path.exists() else 'does not exist'
         raise InputError(f'{path}: {rule}')
-    reason = 'was never closed'
-    if (path / METADATA).is_file():
+    reason = visible_damage(path)
+    if not reason:
         try:
             return _read_complete(path)
         # Whatever a damaged file makes the library stumble over, the file is damaged.
