@@ -33,6 +33,7 @@ DEADLINE_S = 60.0
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 CDR = b'\x00\x01\x00\x00'
 MESSAGES, PER_FLUSH = 400, 40
+PAGE = 4096  # of SQLite
 
 # Writes without end, or until it has flushed so often, and tells after each flush what is safe.
 WRITER = """
@@ -254,6 +255,40 @@ def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_erro
         changed[at:at + len(garbage)] = garbage
     with whole.with_file(bytes(changed), data.draw(st.booleans())) as bag:
         is_complete_after_repair(bag)
+
+
+def test_length_that_is_garbage_is_not_taken_for_a_need_of_memory(
+    finished: dict[str, Finished],
+) -> None:
+    whole = finished['mcap']
+    begin, flushed = whole.flushed[5]
+    assert whole.data[begin] == 6  # a chunk
+    changed = whole.data[:begin + 1] + struct.pack('<Q', 2**62) + whole.data[begin + 9:]
+    with whole.with_file(changed, metadata=False) as bag:
+        assert len(repaired_numbers(bag)) >= flushed
+
+
+def test_sqlite_that_lost_its_last_pages_gives_the_messages_before_them(
+    finished: dict[str, Finished],
+) -> None:
+    whole = finished['sqlite3']
+    with whole.with_file(whole.data[:-2 * PAGE], metadata=True) as bag:
+        found = repaired_numbers(bag)
+    assert MESSAGES // 2 < len(found) < MESSAGES
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_bag_with_less_than_its_metadata_promise_is_not_complete(
+    finished: dict[str, Finished], storage: str,
+) -> None:
+    with finished[storage].with_file(finished[storage].data, metadata=True) as bag:
+        metadata = bag / 'metadata.yaml'
+        text = metadata.read_text()
+        metadata.write_text(text.replace('message_count: 440', 'message_count: 441'))
+        done = repair(bag)
+        assert done is not None
+        assert done.why == 'holds 440 of 441 messages'
+        assert damage(bag) == ''
 
 
 def test_page_of_zeros_costs_only_the_block_that_it_lies_in(
