@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import os
 from collections.abc import Iterator
@@ -109,8 +108,10 @@ def sync_path(path: Path) -> None:
     """Let a file or the entries of a folder survive a power cut; raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
+        os.fsync(descriptor)
+    except OSError:
         # Some file systems cannot do it for folders.
-        with contextlib.suppress(*([OSError] if path.is_dir() else [])):
-            os.fsync(descriptor)
+        if not path.is_dir():
+            raise
     finally:
         os.close(descriptor)
