@@ -18,11 +18,12 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from ros_processes import NodeProcess, Probe, RosWorld, ros_world
+from ros_processes import NodeProcess, Probe, RosWorld, ros_world, wait_until
 from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
+from backlash_ros.bags.content import message_files
 from backlash_ros.bags.remains import damage, open_remains
 from backlash_ros.nodes.bag import STORAGE
 from backlash_ros.tools import report
@@ -151,12 +152,15 @@ def test_signal_amid_a_flood_ends_with_a_complete_bag(
         node.wait_for('ready')
         flood = probe.publisher(topics.CONTROL, Float64)
         probe.wait_until(flood.get_subscription_count, 'the recorder')
-        for i in range(20_000):
-            flood.publish(Float64(data=float(i)))
-            if i == 10_000:
-                node.send(number)
-            if node.process.poll() is not None:
-                break
+
+        def pour() -> None:
+            for _ in range(100):
+                flood.publish(Float64(data=1.0))
+
+        (file,) = message_files(bag)
+        wait_until(lambda: file.stat().st_size > 100_000, 'messages in the bag', pour)
+        node.send(number)
+        wait_until(lambda: node.process.poll() is not None, 'the end of the recorder', pour)
         assert node.wait() == 0, node.stderr
         counts = node.events('closed')[0]['messages']
     assert damage(bag) == ''
