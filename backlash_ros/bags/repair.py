@@ -52,7 +52,7 @@ def repair_command(path: Path) -> int:
         print(f'recorder: {error}', file=sys.stderr)
         return BAD_INPUT if isinstance(error, NoBagError) else FAILED
     except KeyboardInterrupt:
-        print(f'recorder: interrupted, {path} is as it was', file=sys.stderr)
+        print(f'recorder: interrupted, nothing of {path} is lost', file=sys.stderr)
         return FAILED
     if done is None:
         print(f'{path} is complete: nothing to repair')
@@ -121,11 +121,12 @@ def _rewrite(bag: Path, why: str) -> Repair:
         for file in (*repaired.iterdir(), repaired):
             sync_path(file)
         original = _beside(bag, 'damaged')
-        bag.rename(original)
         try:
+            bag.rename(original)
             repaired.rename(bag)
         except BaseException:
-            original.rename(bag)
+            if not bag.exists():
+                original.rename(bag)
             raise
         sync_path(bag.parent)
     finally:
