@@ -1,4 +1,4 @@
-"""Layers: core <- nodes, core <- tools; ROS is imported in nodes only."""
+"""Layers: core <- bags <- nodes, bags <- tools; ROS is imported in nodes only."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = 'backlash_ros'
 SHARED = {PACKAGE, f'{PACKAGE}.topics', f'{PACKAGE}.files'}
+LAYERS = ('core', 'bags', 'nodes', 'tools')
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
 ROS_PREFIXES = ('rclpy', 'rosidl', 'launch')
@@ -32,7 +33,7 @@ def imported_modules(source: str, module: str, is_package: bool) -> Iterator[str
             # `from backlash_ros import nodes` imports a module too.
             yield from (
                 [f'{base}.{alias.name}' for alias in node.names]
-                if base in (PACKAGE, f'{PACKAGE}.core', f'{PACKAGE}.nodes', f'{PACKAGE}.tools')
+                if base in (PACKAGE, *(f'{PACKAGE}.{layer}' for layer in LAYERS))
                 else [base]
             )
 
@@ -52,6 +53,11 @@ def is_allowed(module: str, imported: str) -> bool:
     if within(module, 'core'):
         known = top in sys.stdlib_module_names | NUMERIC or within(imported, 'core')
         return known or imported == f'{PACKAGE}.files'
+    if within(module, 'bags'):
+        return (
+            top in sys.stdlib_module_names | {'rosbags'} or imported in SHARED
+            or within(imported, 'core') or within(imported, 'bags')
+        )
     if within(module, 'nodes'):
         return not within(imported, 'tools')
     if within(module, 'tools'):
@@ -74,7 +80,7 @@ def test_module_imports_only_what_its_layer_may(path: Path) -> None:
 
 def test_every_layer_is_looked_at() -> None:
     layers = {path.relative_to(ROOT / PACKAGE).parts[0] for path in SOURCES}
-    assert {'core', 'nodes', 'tools', 'topics.py'} <= layers
+    assert {*LAYERS, 'topics.py'} <= layers
 
 
 @pytest.mark.parametrize(
@@ -89,6 +95,10 @@ def test_every_layer_is_looked_at() -> None:
         ('tools.report', 'import backlash_ros.nodes.plant', 'backlash_ros.nodes.plant'),
         ('tools.report', 'from ..nodes.plant import main', 'backlash_ros.nodes.plant'),
         ('nodes.plant', 'from backlash_ros.tools import report', 'backlash_ros.tools.report'),
+        ('bags.repair', 'import rclpy', 'rclpy'),
+        ('bags.repair', 'from ..tools.errors import InputError', 'backlash_ros.tools.errors'),
+        ('bags.repair', 'from backlash_ros.nodes import bag', 'backlash_ros.nodes.bag'),
+        ('core.plant', 'from backlash_ros.bags import repair', 'backlash_ros.bags.repair'),
         ('topics', 'import numpy', 'numpy'),
     ],
 )
@@ -102,6 +112,9 @@ def test_import_across_layers_is_found(module: str, source: str, found: str) -> 
         ('core.plant', 'from math import pi\nimport numpy as np\nimport scipy.linalg'),
         ('core.plant', 'from .backlash import Backlash\nfrom . import inverse'),
         ('nodes.plant', 'import rclpy\nfrom ..core import plant\nfrom backlash_ros import topics'),
+        ('bags.repair', 'import sqlite3\nimport rosbags\nfrom ..core.errors import ParameterError'),
+        ('nodes.plant', 'from backlash_ros.bags import repair'),
+        ('tools.report', 'from backlash_ros.bags.content import is_bag'),
         ('tools.report', 'import matplotlib\nimport rosbags\nfrom ..core import metrics'),
     ],
 )

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
+import shutil
+import signal
 import sys
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import nan
+from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Connection
@@ -18,22 +23,23 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
+from backlash_ros.bags.content import CURE
+from backlash_ros.bags.repair import repair_command
 from backlash_ros.core.parameter_table import RECORDER
-from backlash_ros.nodes.bag import Bag
+from backlash_ros.nodes.bag import Bag, RecordingError
 from backlash_ros.nodes.events import ENABLED, emit
-from backlash_ros.nodes.messages import stamp_ns_of
+from backlash_ros.nodes.messages import DiagnosticsPublisher, stamp_ns_of
 from backlash_ros.nodes.sample_counter import UNNUMBERED
-from backlash_ros.nodes.spin import ProcessNode, run
+from backlash_ros.nodes.spin import BAD_INPUT, ProcessNode, run
 
 DEPTH = 10_000  # messages that may wait while the disk is slow
 PROGRESS_PERIOD_S = 0.2
-DRAIN_S = 1.0  # longest time to take in what has arrived before the bag is closed
+FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that a flush takes
+DIAGNOSTICS_PERIOD_S = 1.0
+# Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
+DRAIN_S = 0.3
+FAILED = 1
 
-TYPE_NAMES: dict[type[Any], str] = {
-    Float64: 'std_msgs/msg/Float64',
-    Float64MultiArray: 'std_msgs/msg/Float64MultiArray',
-    DiagnosticArray: 'diagnostic_msgs/msg/DiagnosticArray',
-}
 # All but plant_output, which comes last: it starts the loop.
 BEFORE_THE_LOOP: dict[str, type[Any]] = {
     topics.REFERENCE: Float64, topics.CONTROL: Float64, topics.APPLIED_CONTROL: Float64,
@@ -52,6 +58,7 @@ class Channel:
     name: str = ''  # with namespace and remappings, as it is recorded
     connection: Connection | None = None
     received: int = 0
+    recorded: int = 0
     missed: int = 0
     sequence: int = UNNUMBERED
 
@@ -110,7 +117,8 @@ class Progress:
 class RecorderNode(ProcessNode):
     """Writes messages as they came, stamped with the time at which they left their node.
 
-    In lockstep the stamp is the simulated time. Without a bag it only tells the progress.
+    In lockstep the stamp is the simulated time. Without a bag it only tells the progress, which
+    is also what it goes on with when the disk takes no more.
     """
 
     def __init__(self) -> None:
@@ -118,12 +126,15 @@ class RecorderNode(ProcessNode):
         p = self.settings
         self._lockstep = p.flag('lockstep')
         self._now_ns = 0  # simulated time
-        path = p.word('bag')
-        self._bag = Bag(path, p.word('storage')) if path else None
-        if self._bag is None:
-            self.log.info('nothing is recorded: the parameter bag names no folder')
+        self._bag: Bag | None = None
+        self._diagnostics: DiagnosticsPublisher | None = None
+        self.failure = ''  # why the recording has stopped before its time
         self._channels: list[Channel] = []
         self._progress = Progress()
+        if p.word('bag'):
+            self._open_bag(p.word('bag'), p.word('storage'))
+        else:
+            self.log.info('nothing is recorded: the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
         for topic, message_type in BEFORE_THE_LOOP.items():
             subscription = self._record(topic, message_type)
@@ -147,19 +158,53 @@ class RecorderNode(ProcessNode):
             executor.spin_once(timeout_sec=0.0)
 
     def finish(self) -> None:
-        if self._bag is not None:
-            self._bag.close()
+        self._with_bag(Bag.close)
         for channel in self._channels:
             if channel.missed:
                 self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
+        if self.failure:
+            unrecorded = self._received - sum(channel.recorded for channel in self._channels)
+            self.log.warning(f'{unrecorded} messages came after the recording had stopped')
         emit(
-            'closed', messages={channel.name: channel.received for channel in self._channels},
-            missed=sum(channel.missed for channel in self._channels),
+            'closed', messages={channel.name: channel.recorded for channel in self._channels},
+            missed=sum(channel.missed for channel in self._channels), failure=self.failure,
         )
 
     @property
     def _received(self) -> int:
         return sum(channel.received for channel in self._channels)
+
+    def _open_bag(self, path: str, storage: str) -> None:
+        self._bag = Bag(path, storage)
+        if not self._bag.survives_a_crash:
+            self.log.warning(
+                'the installed version of rosbags cannot be flushed: a crash of the recorder or a '
+                'power cut loses everything. Install the version that requirements/run.txt names'
+            )
+        self._diagnostics = DiagnosticsPublisher(self)
+        self.create_timer(
+            FLUSH_PERIOD_S, lambda: self._with_bag(Bag.flush), clock=self.steady_clock
+        )
+        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
+
+    def _with_bag(self, action: Callable[[Bag], None]) -> bool:
+        """Do something with the bag; returns whether there is one and it went well."""
+        bag = self._bag
+        if bag is None:
+            return False
+        try:
+            action(bag)
+        except RecordingError as error:
+            self._bag = None
+            self.failure = (
+                f'recording to {bag.path} stopped: {error}; saved are {bag.saved} messages of '
+                f'{bag.saved_ns * 1e-9:.1f} s; all else goes on. Make room, then: {CURE} {bag.path}'
+            )
+            self.log.error(self.failure)
+            emit('recording_stopped', reason=self.failure)
+            self._diagnose()
+            return False
+        return True
 
     def _record(self, topic: str, message_type: type[Any]) -> Callable[[], bool]:
         """Record a topic; return what says whether somebody publishes it."""
@@ -168,8 +213,11 @@ class RecorderNode(ProcessNode):
             message_type, topic, partial(self._on_message, channel), DEPTH, raw=True
         )
         channel.name = str(subscription.topic_name)
-        if self._bag is not None:
-            channel.connection = self._bag.add_topic(channel.name, TYPE_NAMES[message_type])
+
+        def announce(bag: Bag) -> None:
+            channel.connection = bag.add_topic(channel.name, _type_name(message_type))
+
+        self._with_bag(announce)
         self._channels.append(channel)
         return partial(_is_published, subscription)
 
@@ -179,9 +227,11 @@ class RecorderNode(ProcessNode):
 
     def _on_message(self, channel: Channel, message: bytes, info: dict[str, Any]) -> None:
         channel.count(info['publication_sequence_number'])
-        if self._bag is not None and channel.connection is not None:
+        connection = channel.connection
+        if self._bag is not None and connection is not None:
             stamp_ns = self._now_ns if self._lockstep else info['source_timestamp']
-            self._bag.write(channel.connection, stamp_ns, message)
+            if self._with_bag(lambda bag: bag.write(connection, stamp_ns, message)):
+                channel.recorded += 1
         self._progress.take(channel.topic, message)
 
     def _on_clock(self, message: Clock) -> None:
@@ -192,6 +242,24 @@ class RecorderNode(ProcessNode):
         if content:
             emit('progress', **content)
 
+    def _diagnose(self) -> None:
+        if self._diagnostics is None:
+            return
+        if self._bag is None:
+            self._diagnostics.publish(DiagnosticStatus.ERROR, self.failure, {})
+            return
+        folder = self._bag.path
+        self._diagnostics.publish(DiagnosticStatus.OK, f'recording to {folder}', {
+            'saved messages': self._bag.saved, 'free on the disk [MB]': _free_megabytes(folder),
+        })
+
+
+def _free_megabytes(folder: Path) -> float:
+    try:
+        return shutil.disk_usage(folder).free * 1e-6
+    except OSError:  # somebody has removed the folder
+        return nan
+
 
 def _is_published(subscription: Any) -> bool:
     return bool(subscription.get_publisher_count() > 0)
@@ -201,9 +269,33 @@ def _row(message: bytes, labels: tuple[str, ...]) -> dict[str, float]:
     return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=True))
 
 
+def _type_name(message_type: type[Any]) -> str:
+    """The name that bags know a type by, like std_msgs/msg/Float64."""
+    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+
+
 def main(args: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(RECORDER, RecorderNode, args)
+    """Entry point; returns the exit code: 1 if the recording stopped before its time."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument('--repair', type=Path, metavar='BAG')
+    try:
+        options, others = parser.parse_known_args(args)
+    except argparse.ArgumentError:
+        print(f'{RECORDER}: --repair needs the folder of a bag', file=sys.stderr)
+        return BAD_INPUT
+    if options.repair is not None and not others:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        return repair_command(options.repair)
+    if {'-h', '--help'} & set(others):
+        print(f'{RECORDER} --repair BAG: make a bag readable that was never closed, or is damaged')
+    nodes: list[RecorderNode] = []
+
+    def make_node() -> RecorderNode:
+        nodes.append(RecorderNode())
+        return nodes[0]
+
+    code = run(RECORDER, make_node, args)
+    return FAILED if nodes and nodes[0].failure else code
 
 
 if __name__ == '__main__':

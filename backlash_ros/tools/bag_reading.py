@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,15 +9,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.interfaces import Connection
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
+from backlash_ros.bags.content import CURE, BagError, is_being_written
+from backlash_ros.bags.remains import open_remains, visible_damage
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.errors import InputError
 
-METADATA = 'metadata.yaml'  # written when a bag is closed
 LABELS = {
     topics.SIGNALS: topics.SIGNAL_LABELS,
     topics.ESTIMATES: topics.ESTIMATE_LABELS,
@@ -42,12 +40,26 @@ class BagRun:
     """What a bag says about a run.
 
     latency_s: arrival of y(k) to departure of v(k), shape (N,), nan where unknown.
-    unpaired: samples left out because only one of signals and estimates was recorded.
+    unpaired: samples left out because only one of signals and estimates was recorded. damage:
+    what is wrong with the bag and the cure, empty if it is complete.
     """
 
     run: RunRecord
     latency_s: NDArray[np.float64]
     unpaired: int
+    damage: str = ''
+
+
+@dataclass
+class _Content:
+    """Stamps and messages of the array topics, under their recorded names; see BagRun."""
+
+    names: set[str] = field(default_factory=set)
+    messages: dict[str, list[tuple[int, Any]]] = field(default_factory=dict)
+    damage: str = ''
+
+    def add(self, name: str, stamp_ns: int, message: Any) -> None:
+        self.messages.setdefault(name, []).append((stamp_ns, message))
 
 
 @dataclass
@@ -62,19 +74,19 @@ class _Table:
         return self.columns['sample'].astype(np.int64)
 
 
-def is_bag(path: Path) -> bool:
-    """Whether path is the folder of a bag, properly closed or not."""
-    return any(next(path.glob(name), None) for name in (METADATA, '*.mcap', '*.db3'))
-
-
 def read_bag(path: Path, sample_period: float | None = None) -> BagRun:
     """Join the signals, estimates and truth of a bag on their sample count.
 
     t = (sample - first) * sample_period; None takes the median distance of the stamps. A gap in
-    the count is a lost sample. Raises InputError, in one line, for a bag that cannot be read or
+    the count is a lost sample. Of a bag that was never closed, or is damaged, what is left is
+    read, and nothing is changed. Raises InputError, in one line, for a bag that cannot be read or
     holds no run.
     """
-    tables = _read_tables(path)
+    content = _read_content(path)
+    try:
+        tables = {topic: _find_table(path, content, topic) for topic in LABELS}
+    except InputError as error:
+        raise InputError(f'{error}; {content.damage}' if content.damage else str(error)) from None
     signals, estimates = tables[topics.SIGNALS], tables[topics.ESTIMATES]
     count, of_signals, of_estimates = np.intersect1d(
         signals.sample, estimates.sample, assume_unique=True, return_indices=True
@@ -92,7 +104,9 @@ def read_bag(path: Path, sample_period: float | None = None) -> BagRun:
     heard = np.union1d(signals.sample, estimates.sample)
     lost = int(heard[-1] - heard[0]) + 1 - heard.size
     latency = signals.columns['latency_s'][of_signals]
-    return BagRun(RunRecord(rows, sample_period, lost), latency, heard.size - count.size)
+    return BagRun(
+        RunRecord(rows, sample_period, lost), latency, heard.size - count.size, content.damage
+    )
 
 
 def _fill_truth(
@@ -125,44 +139,74 @@ def _median_period(
     return period
 
 
-def _read_tables(path: Path) -> dict[str, _Table]:
+def _read_content(path: Path) -> _Content:
     if not path.is_dir():
         rule = 'is a file: give the folder of the bag' if path.exists() else 'does not exist'
         raise InputError(f'{path}: {rule}')
-    if not (path / METADATA).is_file():
-        raise InputError(f'{path}: has no {METADATA}: the bag was never closed, or is none')
+    reason = visible_damage(path)
+    if not reason:
+        try:
+            return _read_complete(path)
+        # Whatever a damaged file makes the library stumble over, the file is damaged.
+        except Exception as error:
+            reason = f'is damaged ({" ".join(str(error).split()) or type(error).__name__})'
     try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            return {topic: _read_table(path, reader, topic) for topic in LABELS}
-    except (
-        AnyReaderError, OSError, ValueError, KeyError, AttributeError, struct.error, sqlite3.Error,
-    ) as error:
-        if isinstance(error, InputError):
-            raise
-        reason = ' '.join(str(error).split()) or type(error).__name__
-        raise InputError(f'{path}: cannot be read as a bag: {reason}') from None
+        return _read_remains(path, reason)
+    except BagError as error:
+        raise InputError(f'{path}: {reason}, and nothing of it can be read: {error}') from None
 
 
-def _read_table(path: Path, reader: AnyReader, topic: str) -> _Table:
-    connections = [c for c in reader.connections if f'/{c.topic}'.endswith(f'/{topic}')]
-    names = sorted({c.topic for c in connections})
+def _is_array_topic(name: str) -> bool:
+    return any(f'/{name}'.endswith(f'/{topic}') for topic in LABELS)
+
+
+def _read_complete(path: Path) -> _Content:
+    content = _Content()
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+        content.names = {connection.topic for connection in reader.connections}
+        wanted = [found for found in reader.connections if _is_array_topic(found.topic)]
+        # No choice would be all of them.
+        for connection, stamp_ns, raw in reader.messages(wanted) if wanted else ():
+            message = reader.deserialize(raw, connection.msgtype)
+            content.add(connection.topic, stamp_ns, message)
+    return content
+
+
+def _read_remains(path: Path, reason: str) -> _Content:
+    content, types = _Content(), get_typestore(Stores.ROS2_JAZZY)
+    remains = open_remains(path)
+    first, last, count, garbled = 2**63, 0, 0, 0
+    for topic, stamp_ns, raw in remains.messages():
+        if _is_array_topic(topic.name):
+            try:
+                message = types.deserialize_cdr(raw, topic.message_type)
+            # Whatever the damaged bytes make the library stumble over, the message is lost.
+            except Exception:
+                garbled += 1
+                continue
+            content.add(topic.name, stamp_ns, message)
+        first, last, count = min(first, stamp_ns), max(last, stamp_ns), count + 1
+    if not count:
+        raise BagError('it holds no message')
+    content.names = {topic.name for topic in remains.topics.values()}
+    cure = 'stop the recorder' if is_being_written(path) else f'{CURE} {path}'
+    content.damage = (
+        f'{path} {reason}: this is what is left, {count} messages of {(last - first) * 1e-9:.1f} '
+        f's{f", {garbled} more cannot be decoded" if garbled else ""}. To have it complete: {cure}'
+    )
+    return content
+
+
+def _find_table(path: Path, content: _Content, topic: str) -> _Table:
+    names = sorted(name for name in content.names if f'/{name}'.endswith(f'/{topic}'))
     if len(names) > 1:
         raise InputError(f'{path}: holds several runs: {", ".join(names)}')
-    if not connections:
+    if not names:
         if topic == topics.TRUTH:
             return _Table()  # a real plant does not know its truth
-        heard = ', '.join(sorted({c.topic for c in reader.connections})) or 'nothing'
+        heard = ', '.join(sorted(content.names)) or 'nothing'
         raise InputError(f'{path}: holds no {topic}, only {heard}')
-    return _tabulate(path, names[0], LABELS[topic], _messages(reader, connections))
-
-
-def _messages(
-    reader: AnyReader, connections: Sequence[Connection],
-) -> list[tuple[int, Any]]:
-    return [
-        (stamp, reader.deserialize(raw, connection.msgtype))
-        for connection, stamp, raw in reader.messages(connections)
-    ]
+    return _tabulate(path, names[0], LABELS[topic], content.messages.get(names[0], []))
 
 
 def _tabulate(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.bags.content import is_bag
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.files import write_atomically
@@ -22,7 +23,7 @@ from backlash_ros.tools.analysis import (
     followed_reference,
     interesting_parts,
 )
-from backlash_ros.tools.bag_reading import is_bag, read_bag
+from backlash_ros.tools.bag_reading import read_bag
 from backlash_ros.tools.command_line import OptionParser, run_tool
 from backlash_ros.tools.configuration import effective_parameters, load_config, write_config
 from backlash_ros.tools.drawing import png
@@ -56,14 +57,17 @@ class Source:
     parameters: Parameters | None
     latency_s: Array | None = None
     warnings: tuple[str, ...] = ()
+    damage: str = ''  # of the bag it was read from
 
 
 def report_bag(bag: Path, out: Path, parameters: Parameters | None) -> dict[str, Any]:
     """Write report, figures, samples.csv and summary.json of a bag to out; return the summary.
 
-    Raises InputError for a bag without a run.
+    Says on stderr if the bag is damaged. Raises InputError for a bag without a run.
     """
-    return _write(_from_bag(bag, parameters), out)
+    source = _from_bag(bag, parameters)
+    _tell_damage(source)
+    return _write(source, out)
 
 
 def report_run(run: RunRecord, out: Path, parameters: Parameters) -> dict[str, Any]:
@@ -74,6 +78,8 @@ def report_run(run: RunRecord, out: Path, parameters: Parameters) -> dict[str, A
 def _from_bag(bag: Path, parameters: Parameters | None) -> Source:
     found = read_bag(bag, parameters.real('sample_period') if parameters else None)
     warnings = []
+    if found.damage:
+        warnings.append(f'The bag {found.damage}')
     if found.unpaired:
         warnings.append(
             f'{found.unpaired} samples were left out: only one of signals and estimates is in '
@@ -84,7 +90,12 @@ def _from_bag(bag: Path, parameters: Parameters | None) -> Source:
             f'The sample period of {found.run.sample_period:.6g} s was taken from the stamps of '
             'the bag: no parameters were given.'
         )
-    return Source(found.run, parameters, found.latency_s, tuple(warnings))
+    return Source(found.run, parameters, found.latency_s, tuple(warnings), found.damage)
+
+
+def _tell_damage(source: Source) -> None:
+    if source.damage:
+        print(f'report: warning: {source.damage}', file=sys.stderr)
 
 
 def _write(source: Source, out: Path) -> dict[str, Any]:
@@ -233,6 +244,7 @@ def _report(args: Sequence[str] | None) -> None:
     source = open_source(options.path.resolve(), options.config)
     if source.run.samples == 0:
         raise InputError(f'{options.path}: holds no sample')
+    _tell_damage(source)
     out = result_directory(options.out)
     _write(source, out)
     print(out / PAGE)

@@ -1,0 +1,1 @@
+"""Bags on disk, whole or damaged: their parts, their remains, their repair."""
