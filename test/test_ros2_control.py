@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 
 from backlash_ros import topics
+from backlash_ros.tools import report
 
 
 class StandIn:
@@ -80,6 +82,27 @@ def test_backlash_is_learned_through_the_messages_of_ros2_control(
         driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
         driver.check_sanity()
         assert controller.stop() == 0
+
+
+def test_the_loop_through_ros2_control_is_recorded_and_reported(tmp_path: Path) -> None:
+    style = {'io.style': 'ros2_control', 'estimator.output_noise_std': NOISE}
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', style)
+        recorder = world.start('recorder', {
+            'io.style': 'ros2_control', 'bag': str(tmp_path / 'bag'),
+        })
+        recorder.wait_for('ready')
+        stand_in = StandIn(world, 'position', ['axle'], best_effort=False)
+        stand_in.meet()
+        stand_in.driver.run_until(lambda: stand_in.driver.error() < 0.02, 'the estimates')
+        assert controller.stop() == 0
+        assert recorder.stop() == 0
+        recorded = recorder.wait_for('closed')['messages']
+        assert recorded[f'/{topics.JOINT_STATES}'] > 20
+        assert recorded[f'/{topics.JOINT_COMMANDS}'] > 20
+    assert report.main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 0
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert summary['final']['m'] == pytest.approx(1.3, rel=0.02)
 
 
 def test_a_joint_that_is_not_there_is_told(tmp_path: Path) -> None:

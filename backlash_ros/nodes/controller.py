@@ -129,7 +129,7 @@ class ControllerNode(ManagedNode):
         needed = self._conditions_of_start()
         self.call_when(
             lambda: all(condition() for condition in needed), self._listen_to_driver,
-            f'{topics.REFERENCE} and the listeners of {self._io.control_topic}',
+            f'{topics.REFERENCE} and the listeners of {self._io.topics.control}',
         )
 
     def deactivate(self) -> None:
@@ -235,7 +235,7 @@ class ControllerNode(ManagedNode):
         self._publish_rows(loop, step)
         if was_silent:
             self._end_ramp()
-            self.log.info(f'{self._io.output_topic} is back')
+            self.log.info(f'{self._io.topics.output} is back')
         if was_silent or step.estimate.status != self._told:
             self._told = step.estimate.status
             self._diagnose()
@@ -267,7 +267,7 @@ class ControllerNode(ManagedNode):
             loop.give_up()
             action = self._live.parameters.word('on_timeout')
             self.log.warning(
-                f'no {self._io.output_topic} for {timeout:g} s: is the driver running? '
+                f'no {self._io.topics.output} for {timeout:g} s: is the driver running? '
                 f'on_timeout: {action}'
             )
             self._begin_ramp(loop, action)
@@ -317,19 +317,19 @@ class ControllerNode(ManagedNode):
         findings: list[Finding] = []
         if self._driver is not None and self._driver.get_publisher_count() > 1:
             findings.append((
-                WARN, f'{self._driver.get_publisher_count()} publishers of {io.output_topic}, '
+                WARN, f'{self._driver.get_publisher_count()} publishers of {io.topics.output}, '
                 'the first one is used: stop the others',
             ))
         if io.skipped:
             findings.append((
-                WARN, f'{io.skipped} messages of {io.output_topic} without '
+                WARN, f'{io.skipped} messages of {io.topics.output} without '
                 f'{self.settings.word("io.field")} of joint {self.settings.word("io.joint")!r}: '
                 f'set io.joint and io.field, the joints are {io.seen}',
             ))
         if loop.silent:
-            findings.append((WARN, f'no {io.output_topic}: is the driver running?'))
+            findings.append((WARN, f'no {io.topics.output}: is the driver running?'))
         elif loop.last is None:
-            missing = io.output_topic if isfinite(loop.y_m) else topics.REFERENCE
+            missing = io.topics.output if isfinite(loop.y_m) else topics.REFERENCE
             findings.append((WARN, f'waiting for {missing}'))
         else:
             findings.append(STATES[loop.last.estimate.status])

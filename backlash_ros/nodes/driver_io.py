@@ -31,6 +31,31 @@ class Output(NamedTuple):
     sequence: int
 
 
+class DriverTopics(NamedTuple):
+    """Where y comes from and v goes to."""
+
+    output: str
+    output_type: type[Any]
+    control: str
+    control_type: type[Any]
+
+
+STYLES = {
+    'native': DriverTopics(topics.PLANT_OUTPUT, Float64, topics.CONTROL, Float64),
+    'ros2_control': DriverTopics(
+        topics.JOINT_STATES, JointState, topics.JOINT_COMMANDS, Float64MultiArray
+    ),
+}
+
+
+def output_qos(p: Parameters, depth: int) -> QoSProfile:
+    """How y is listened to."""
+    best_effort = p.flag('io.best_effort')
+    return QoSProfile(depth=depth, reliability=(
+        ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+    ))
+
+
 class DriverIo:
     """What a node says to the driver and hears from it, in the messages that io.style names.
 
@@ -39,23 +64,12 @@ class DriverIo:
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
         self.skipped, self.seen = 0, ''
-        self._node = node
-        self._ros2_control = p.word('io.style') == 'ros2_control'
+        self._node, self._p = node, p
+        self.topics = STYLES[p.word('io.style')]
         self._joint, self._field = p.word('io.joint'), p.word('io.field')
-        self._best_effort = p.flag('io.best_effort')
         # On simulated time the stamps of the middleware, which are real time, say nothing.
         self._simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._publisher: Publisher | None = None
-
-    @property
-    def output_topic(self) -> str:
-        """Name of the topic that y comes from."""
-        return topics.JOINT_STATES if self._ros2_control else topics.PLANT_OUTPUT
-
-    @property
-    def control_topic(self) -> str:
-        """Name of the topic that v goes to."""
-        return topics.JOINT_COMMANDS if self._ros2_control else topics.CONTROL
 
     @property
     def listeners(self) -> int:
@@ -70,12 +84,6 @@ class DriverIo:
 
     def listen(self, hear: Callable[[Output], None], depth: int) -> Subscription:
         """Call hear with every y."""
-        node = self._node
-        qos = QoSProfile(
-            depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT if self._best_effort
-            else ReliabilityPolicy.RELIABLE,
-        )
-
         def hear_number(message: Float64, info: dict[str, Any]) -> None:
             sent_ns = info['source_timestamp']
             stamp_ns = self.now_ns() if self._simulated_time else sent_ns
@@ -98,22 +106,24 @@ class DriverIo:
                 info['received_timestamp'], UNNUMBERED,
             ))
 
-        if self._ros2_control:
-            return node.listen(JointState, topics.JOINT_STATES, hear_joint, qos)
-        return node.listen(Float64, topics.PLANT_OUTPUT, hear_number, qos)
+        hear_message = hear_joint if self.topics.output_type is JointState else hear_number
+        return self._node.listen(
+            self.topics.output_type, self.topics.output, hear_message, output_qos(self._p, depth)
+        )
 
     def advertise(self) -> Publisher:
         """Make the publisher of v."""
-        kind = Float64MultiArray if self._ros2_control else Float64
-        publisher: Publisher = self._node.create_publisher(kind, self.control_topic, DEPTH)
-        self._message = kind()
+        to = self.topics
+        publisher: Publisher = self._node.create_publisher(to.control_type, to.control, DEPTH)
+        self._message = to.control_type()
         self._publisher = publisher
         return publisher
 
     def publish(self, v: float) -> None:
         """Send v to the driver."""
         assert self._publisher is not None
-        self._message.data = array('d', (v,)) if self._ros2_control else v
+        several = self.topics.control_type is Float64MultiArray
+        self._message.data = array('d', (v,)) if several else v
         self._publisher.publish(self._message)
 
     def wait_until_received(self, timeout_s: float) -> None:

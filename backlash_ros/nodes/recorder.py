@@ -17,6 +17,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
@@ -27,6 +28,7 @@ from backlash_ros.bags.content import CURE
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.core.parameter_table import RECORDER
 from backlash_ros.nodes.bag import Bag, RecordingError
+from backlash_ros.nodes.driver_io import STYLES, output_qos
 from backlash_ros.nodes.events import ENABLED, emit
 from backlash_ros.nodes.messages import DiagnosticsPublisher, stamp_ns_of
 from backlash_ros.nodes.sample_counter import UNNUMBERED
@@ -40,13 +42,13 @@ DIAGNOSTICS_PERIOD_S = 1.0
 DRAIN_S = 0.3
 FAILED = 1
 
-# All but plant_output, which comes last: it starts the loop.
-BEFORE_THE_LOOP: dict[str, type[Any]] = {
-    topics.REFERENCE: Float64, topics.CONTROL: Float64, topics.APPLIED_CONTROL: Float64,
+# All but those of the driver; y comes last of all: it starts the loop.
+OF_THE_LOOP: dict[str, type[Any]] = {
+    topics.REFERENCE: Float64, topics.APPLIED_CONTROL: Float64,
     topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
     topics.TRUTH: Float64MultiArray, topics.DIAGNOSTICS: DiagnosticArray,
 }
-NEEDED_PUBLISHERS = (topics.REFERENCE, topics.CONTROL, topics.ESTIMATES, topics.SIGNALS)
+NEEDED_PUBLISHERS = (topics.REFERENCE, topics.ESTIMATES, topics.SIGNALS)
 
 
 @dataclass
@@ -136,16 +138,19 @@ class RecorderNode(ProcessNode):
         else:
             self.log.info('nothing is recorded: the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
-        for topic, message_type in BEFORE_THE_LOOP.items():
-            subscription = self._record(topic, message_type)
-            if p.flag('wait_for_publishers') and topic in NEEDED_PUBLISHERS:
+        self._driver = STYLES[p.word('io.style')]
+        wanted = (*NEEDED_PUBLISHERS, self._driver.control)
+        recorded = {**OF_THE_LOOP, self._driver.control: self._driver.control_type}
+        for topic, message_type in recorded.items():
+            subscription = self._record(topic, message_type, DEPTH)
+            if p.flag('wait_for_publishers') and topic in wanted:
                 needed.append(subscription)
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, DEPTH)
         if ENABLED:
             self.create_timer(PROGRESS_PERIOD_S, self._tell, clock=self.steady_clock)
         self.call_when(
-            lambda: all(heard() for heard in needed), self._start, ', '.join(NEEDED_PUBLISHERS)
+            lambda: all(heard() for heard in needed), self._start, ', '.join(wanted)
         )
 
     def work(self, executor: SingleThreadedExecutor) -> None:
@@ -206,11 +211,13 @@ class RecorderNode(ProcessNode):
             return False
         return True
 
-    def _record(self, topic: str, message_type: type[Any]) -> Callable[[], bool]:
+    def _record(
+        self, topic: str, message_type: type[Any], qos: QoSProfile | int,
+    ) -> Callable[[], bool]:
         """Record a topic; return what says whether somebody publishes it."""
         channel = Channel(topic, several_publishers=topic == topics.DIAGNOSTICS)
         subscription = self.listen(
-            message_type, topic, partial(self._on_message, channel), DEPTH, raw=True
+            message_type, topic, partial(self._on_message, channel), qos, raw=True
         )
         channel.name = str(subscription.topic_name)
 
@@ -222,7 +229,8 @@ class RecorderNode(ProcessNode):
         return partial(_is_published, subscription)
 
     def _start(self) -> None:
-        self._record(topics.PLANT_OUTPUT, Float64)
+        qos = output_qos(self.settings, DEPTH)
+        self._record(self._driver.output, self._driver.output_type, qos)
         emit('ready')
 
     def _on_message(self, channel: Channel, message: bytes, info: dict[str, Any]) -> None:

@@ -262,6 +262,9 @@ class Run:
             axis.plant_is_done = True
         elif event.kind == 'progress':
             axis.take(event.content)
+        elif event.kind == 'recording_stopped':
+            # The log may lie on the very disk that is full.
+            complain(str(event.content.get('reason', '')))
 
     def _missing(self) -> list[Child]:
         return [
