@@ -112,8 +112,9 @@ def test_a_good_driver_passes_and_its_record_is_saved(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('fault', 'subject'), [
-    ('rate', 'rate'), ('loss', 'lost samples'), ('nan', 'values'), ('best_effort', 'QoS'),
-    ('second', 'publisher'), ('delay', 'reaction delay'), ('sign', 'sign and units'),
+    # What has to be seen through ROS; test_driver_judgement.py has the others.
+    ('loss', 'lost samples'), ('best_effort', 'QoS'), ('second', 'publisher'),
+    ('delay', 'reaction delay'),
 ])
 def test_a_fault_is_told_and_only_that(tmp_path: Path, fault: str, subject: str) -> None:
     code, told = check_undisturbed(tmp_path, fault, '--drive')
@@ -188,7 +189,7 @@ def test_a_controller_that_drives_already_is_not_disturbed(tmp_path: Path) -> No
         finally:
             probe.close()
     assert process.returncode == 2
-    assert '/control is published by /probe' in err
+    assert '/control is published by ' in err
 
 
 @pytest.mark.parametrize(('options', 'word'), [

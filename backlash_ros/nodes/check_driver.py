@@ -298,7 +298,9 @@ def _misfit(offered: QoSProfile, asked: QoSProfile) -> str:
 
 def _names_of(endpoints: Sequence[TopicEndpointInfo]) -> str:
     return ', '.join(sorted({
-        f'{info.node_namespace.rstrip("/")}/{info.node_name}' for info in endpoints
+        f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+        # Names are discovered a little later than topics.
+        if 'UNKNOWN' not in info.node_name else 'another node' for info in endpoints
     }))
 
 

@@ -17,6 +17,7 @@ from backlash_ros.tools.run_plan import AxisPlan, RunPlan
 
 READY_DEADLINE_S = 30.0
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
+STANDS_STILL = 5  # reports without a newer sample after which none is to come
 STALL_DEADLINE_S = 10.0  # without a new sample
 LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
 
@@ -71,7 +72,7 @@ class AxisProgress:
     first: int = 0
     began: float = 0.0
     moved: float = 0.0
-    standing_still: bool = False
+    repeats: int = 0  # times in a row that the recorder has told of no newer sample
     plant_is_done: bool = False
     silence_told: bool = False
 
@@ -109,8 +110,8 @@ class AxisProgress:
             # A driver may have been running before; a simulated plant begins with sample 0.
             self.first = int(sample) if self.plan.has_driver else 0
         made = int(sample) + 1 - self.first
-        self.standing_still = made <= self.made
-        if not self.standing_still:
+        self.repeats = self.repeats + 1 if made <= self.made else 0
+        if not self.repeats:
             self.made, self.moved, self.silence_told = made, time.monotonic(), False
             self.display.show(progress, made)
 
@@ -231,11 +232,12 @@ class Run:
         """Wait until the recorder has told of the last sample."""
         behind = [axis for axis in self._axes.values() if not axis.plan.has_driver]
         for axis in behind:
-            axis.standing_still = False
+            axis.repeats = 0
         deadline = time.monotonic() + STALL_DEADLINE_S
-        # The last outputs may have been lost on purpose: then the recorder says the same again.
+        # The last outputs may have been lost on purpose: then the recorder says the same for a
+        # second. On a busy machine it may do so once or twice with samples still to come.
         while not self._over and any(
-            axis.made < axis.plan.samples and not axis.standing_still for axis in behind
+            axis.made < axis.plan.samples and axis.repeats < STANDS_STILL for axis in behind
         ):
             self._listen()
             if time.monotonic() > deadline:
