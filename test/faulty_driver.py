@@ -9,7 +9,6 @@ import contextlib
 import signal
 import sys
 import time
-from math import nan
 
 import rclpy
 from made_up_driver import PERIOD_S, plant_parameters
@@ -28,7 +27,7 @@ class FaultyDriver:
 
     def __init__(self, fault: str) -> None:
         self.fault, self.sample = fault, 0
-        self.period = PERIOD_S * (1.25 if fault == 'rate' else 1.0)
+        self.period = PERIOD_S
         self.plant = build_plant(plant_parameters())
         self.held_up = 0.0  # share of a period
         self.commands = [0.0, 0.0, 0.0]  # the newest one last, one per sample
@@ -54,9 +53,7 @@ class FaultyDriver:
         self.sample += 1
         if fault == 'loss' and tenth:
             return
-        if fault == 'nan' and tenth:
-            y = nan
-        self.output.publish(Float64(data=-y if fault == 'sign' else y))
+        self.output.publish(Float64(data=y))
 
     def run(self) -> None:
         executor = SingleThreadedExecutor()
