@@ -24,7 +24,7 @@ from reporting import CHECK_HEADER, Check, text_table
 from scipy import linalg, signal
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.processes import ProcessSupervisor
+from backlash_ros.tools.processes import Child, ProcessSupervisor
 
 PERIOD_S = 1e-3
 LATENCY_LIMIT = 1.5  # of p99
@@ -78,7 +78,7 @@ def run_loop(seconds: float, minutes: float) -> list[Check]:
         patience_s = 2.0 * samples * PERIOD_S
         wait_for_event(supervisor, lambda kind, _: kind == 'done', patience_s)
         supervisor.stop()
-        log = next(c for c in supervisor.children if c.plan.name == 'controller').log.read_text()
+        log = _controller(supervisor).plan.log.read_text()
     counts = dict(re.findall(r'([a-z][a-z ]*): (\d+)', log))
     lost = int(counts.get('lost', 0))
     checks.insert(0, Check(
@@ -88,9 +88,12 @@ def run_loop(seconds: float, minutes: float) -> list[Check]:
     return checks
 
 
+def _controller(supervisor: ProcessSupervisor) -> Child:
+    return next(c for c in supervisor.children if c.plan.name == 'controller')
+
+
 def _resident_mb(supervisor: ProcessSupervisor) -> float:
-    child = next(c for c in supervisor.children if c.plan.name == 'controller')
-    status = Path(f'/proc/{child.process.pid}/status').read_text()
+    status = Path(f'/proc/{_controller(supervisor).process.pid}/status').read_text()
     found = re.search(r'VmRSS:\s+(\d+) kB', status)
     assert found
     return int(found[1]) / 1024.0

@@ -21,7 +21,7 @@ ABSURD = (nan, inf, -inf, 1e300, -1e300)
 def learn(driver: PacedDriver) -> None:
     """Go on until the backlash is known for some time."""
     driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
-    driver.run(1.0)
+    driver.run(0.6)
     driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 % once more')
 
 
@@ -112,7 +112,7 @@ def test_lost_outputs_leave_the_estimates_within_5_percent(tmp_path: Path, share
         controller, driver = controller_and_driver(world)
         # They are never published, so the numbers have no gap: arrival times have to do.
         driver.sent = lambda k, y: [] if driver.rng.random() < share else [y]
-        driver.run(3.0)
+        driver.run(2.0)
         assert driver.error() < 0.05
         driver.run_until(lambda: driver.value('lost') > 0, 'the count of the lost ones')
         driver.check_sanity()
@@ -149,7 +149,7 @@ def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent
         controller, driver = controller_and_driver(world)
         learn(driver)
         driver.sent = fault  # type: ignore[assignment]
-        driver.run(3.0)
+        driver.run(2.0)
         assert driver.error() < 0.05
         driver.check_sanity()
         assert controller.stop() == 0
@@ -164,7 +164,7 @@ def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_perc
             world, reports_applied=True, **{'estimator.use_applied_control': True}
         )
         driver.heard = lambda: bool(driver.rng.random() > share)
-        driver.run(3.0)
+        driver.run(2.0)
         assert driver.error() < 0.05
         driver.check_sanity()
         assert controller.stop() == 0
@@ -221,7 +221,7 @@ def test_broken_sensor_holds_the_last_good_estimates_and_is_an_error(
         assert status.level == DiagnosticStatus.ERROR
         assert driver.signals[-1].data[6] == Status.INCONSISTENT
         held = driver.estimate()
-        driver.run(1.5)
+        driver.run(1.0)
         assert driver.estimate() == held
         assert driver.error() < 0.05
         driver.check_sanity()

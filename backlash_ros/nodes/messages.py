@@ -43,7 +43,9 @@ class LabelledArrayPublisher:
         return self._publisher.get_subscription_count()
 
     def publish(self, row: Sequence[float]) -> None:
-        """Publish one value per label."""
+        """Publish one value per label, if anybody listens."""
+        if not self.listeners:
+            return
         # An array is taken as it is; a list would be checked element by element.
         self._message.data = array('d', row)
         self._publisher.publish(self._message)
