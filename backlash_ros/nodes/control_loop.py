@@ -52,6 +52,7 @@ class ControlLoop:
         self._lockstep = p.flag('lockstep')
         self._use_applied = p.flag('estimator.use_applied_control') and not self._lockstep
         self._missing = 0  # outputs since the newest one that was used
+        self._anew = False  # whether sender or clock began anew since then
         self._begun = False  # whether the present core has taken a step
         self.core = build_controller(p, inherited)
 
@@ -103,15 +104,18 @@ class ControlLoop:
         if not arrival.is_sample:
             statistics.extra += 1
             return None
-        self.heard_at = time.monotonic()
-        self._interrupt_if_long(arrival)
-        if not (plausible(output.y) and plausible(y_m)):
-            if plausible(output.y):
-                statistics.without_reference += 1
-            else:
-                statistics.dropped += 1
+        self._note_missing(arrival)
+        if not plausible(output.y):
+            # A sensor that has nothing to say is as good as silent.
+            statistics.dropped += 1
             self._missing += 1
             return None
+        self.heard_at = time.monotonic()
+        if not plausible(y_m):
+            statistics.without_reference += 1
+            self._missing += 1
+            return None
+        self._interrupt_if_long()
         step = self._step_core(output.y, y_m, output.stamp_ns)
         self.send(step.v)
         statistics.note(
@@ -161,22 +165,22 @@ class ControlLoop:
                 structure.go_on_from(core.structure)
             core.structure = structure
 
-    def _interrupt_if_long(self, arrival: Arrival) -> None:
-        """Count what is missing; where that is too much to step over, begin with a new core."""
-        timeout = self._p.real('timeout.plant_output')
-        missing = self._missing + arrival.missing
-        too_long = missing > LONGEST_GAP or (
-            not self._lockstep and 0.0 < timeout < missing * self._p.real('sample_period')
-        )
-        if self.silent or arrival.anew or too_long:
-            self.statistics.interruptions += 1
-            if self._begun:
-                self.renew(self.estimate)
-        else:
-            self._missing = missing
+    def _note_missing(self, arrival: Arrival) -> None:
+        self._missing += arrival.missing
+        self._anew = self._anew or arrival.anew
         if not (self.silent or arrival.anew):
             self.statistics.lost += arrival.missing
-        self.silent = False
+
+    def _interrupt_if_long(self) -> None:
+        """Begin with a new core where there is too much to step over."""
+        timeout = self._p.real('timeout.plant_output')
+        too_long = self._missing > LONGEST_GAP or (
+            not self._lockstep and 0.0 < timeout < self._missing * self._p.real('sample_period')
+        )
+        if self.silent or self._anew or (too_long and self._begun):
+            self.statistics.interruptions += 1
+            self.renew(self.estimate)
+        self.silent = self._anew = False
 
     def _step_core(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
         """Step the core over the missing outputs to y, with the v that was really applied."""

@@ -215,6 +215,8 @@ class ControllerNode(ManagedNode):
             return
         was_silent = loop.silent
         step = loop.answer(output)
+        if was_silent and not loop.silent:
+            self._end_ramp()
         if step is not None:
             self._follow_up(loop, step, was_silent)
 
@@ -234,7 +236,6 @@ class ControllerNode(ManagedNode):
         loop.core.refine()
         self._publish_rows(loop, step)
         if was_silent:
-            self._end_ramp()
             self.log.info(f'{self._io.topics.output} is back')
         if was_silent or step.estimate.status != self._told:
             self._told = step.estimate.status
