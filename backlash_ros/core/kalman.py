@@ -108,7 +108,7 @@ class KalmanEstimator:
             self.outliers += 1
         if not self._adapting:
             self._challenger = None
-        elif not self._confirmed:
+        elif not (self._confirmed or (self._known and watched.contradicted)):
             self._restart_in_vain(watched)
         elif watched.contradicted:
             self._challenge(y, interval.v)
@@ -257,7 +257,7 @@ class _Watched:
         self.outside_for = 0  # samples for which a precise estimate lay outside the bounds
         self.contradicted = False
         self._waiting: tuple[float | None, float, bool] | None = None
-        self._proven = False
+        self._proven = search.inherits  # what was learned before is believed until contradicted
         self._refused = 0  # in a row
         self._calm: list[float] = []  # normalised innovations squared since a contradiction
 

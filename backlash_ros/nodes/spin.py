@@ -32,6 +32,7 @@ from backlash_ros.nodes.declare import declare_parameters
 
 DONE, BAD_INPUT = 0, 2
 LOOK_S = 0.01  # between two looks at a condition of start-up
+AGAIN_S = 0.1  # between two requests to stop, until the node is gone
 REMIND_S = 5.0  # between two lines that say what start-up waits for
 # A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
 NAP_NS = 3_000_000
@@ -177,7 +178,10 @@ class _SignalPipe:
             os.read(self._read_end, 1)
             # The node may be ending by itself.
             with contextlib.suppress(InvalidHandle):
-                condition.trigger()
+                # An executor that is busy may overlook a single one.
+                while True:
+                    condition.trigger()
+                    time.sleep(AGAIN_S)
 
         threading.Thread(target=wait, daemon=True).start()
 
