@@ -40,6 +40,7 @@ FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that
 DIAGNOSTICS_PERIOD_S = 1.0
 # Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
 DRAIN_S = 0.3
+IDLE_SPINS = 5  # without a message, timers and requests to stop being served in between
 FAILED = 1
 
 # All but those of the driver; y comes last of all: it starts the loop.
@@ -157,10 +158,11 @@ class RecorderNode(ProcessNode):
         super().work(executor)
         # What has arrived belongs into the bag.
         deadline = time.monotonic() + DRAIN_S
-        received = -1
-        while received != self._received and time.monotonic() < deadline:
+        idle = 0
+        while idle < IDLE_SPINS and time.monotonic() < deadline:
             received = self._received
             executor.spin_once(timeout_sec=0.0)
+            idle = idle + 1 if received == self._received else 0
 
     def finish(self) -> None:
         self._with_bag(Bag.close)
