@@ -84,6 +84,12 @@ class PacedDriver:
         """Let the plant go on until condition holds."""
         wait_until(condition, what, self._tick)
 
+    def learn(self) -> None:
+        """Go on until the backlash is known for some time."""
+        self.run_until(lambda: self.error() < 0.02, 'estimates within 2 %')
+        self.run(0.6)
+        self.run_until(lambda: self.error() < 0.02, 'estimates within 2 % once more')
+
     def rest(self) -> None:
         """Let the plant stand still while nobody is served."""
         self._start = time.monotonic() - self.k * self._period_s

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from paced_driver import PacedDriver, controller_and_driver
+from paced_driver import controller_and_driver
 from ros_processes import ros_world
 from std_msgs.msg import Float64
 
@@ -18,20 +18,13 @@ from backlash_ros.core.estimator import Status
 ABSURD = (nan, inf, -inf, 1e300, -1e300)
 
 
-def learn(driver: PacedDriver) -> None:
-    """Go on until the backlash is known for some time."""
-    driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
-    driver.run(0.6)
-    driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 % once more')
-
-
 def test_absurd_numbers_are_dropped_counted_and_change_nothing(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(
             world, reports_applied=True, **{'estimator.use_applied_control': True}
         )
         assert driver.applied is not None
-        learn(driver)
+        driver.learn()
         for bad in ABSURD:
             before, commands = driver.value('non-finite dropped'), len(driver.controls)
             driver.output.publish(Float64(data=bad))
@@ -53,7 +46,7 @@ def test_denormal_numbers_are_numbers_like_others(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
         driver.sent = lambda k, y: [5e-324 if k < 20 else y]
-        learn(driver)
+        driver.learn()
         assert driver.value('non-finite dropped') == 0
         driver.check_sanity()
         assert controller.stop() == 0
@@ -68,7 +61,7 @@ def test_silent_driver_brings_the_configured_command_and_a_return_without_a_jump
         controller, driver = controller_and_driver(world, **{
             'on_timeout': action, 'timeout.plant_output': 0.2, 'control.rate_max': rate_max,
         })
-        learn(driver)
+        driver.learn()
         driver.run_until(lambda: abs(driver.v) > 5.0, 'a v away from 0')
         sound, driver.sent = driver.sent, lambda k, y: []
         driver.run_until(lambda: driver.says('no plant_output'), 'a word about the silence')
@@ -97,7 +90,7 @@ def test_silent_driver_brings_the_configured_command_and_a_return_without_a_jump
 def test_missing_reference_is_held_and_told(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world, **{'timeout.reference': 0.3})
-        learn(driver)
+        driver.learn()
         driver.referred = False
         driver.run_until(lambda: driver.says('no reference'), 'a word about the reference')
         assert driver.signals[-1].data[0] == driver.signals[-10].data[0]
@@ -147,7 +140,7 @@ def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent
 ) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
-        learn(driver)
+        driver.learn()
         driver.sent = fault  # type: ignore[assignment]
         driver.run(2.0)
         assert driver.error() < 0.05
@@ -173,7 +166,7 @@ def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_perc
 def test_lost_controls_that_nobody_reports_are_said_to_be_inconsistent(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
-        learn(driver)
+        driver.learn()
         driver.heard = lambda: bool(driver.rng.random() > 0.3)
         driver.run_until(lambda: driver.says('does not follow from v'), 'the contradiction')
         driver.run(2.0)
@@ -185,7 +178,7 @@ def test_lost_controls_that_nobody_reports_are_said_to_be_inconsistent(tmp_path:
 def test_second_publisher_is_told_and_the_first_one_kept(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
-        learn(driver)
+        driver.learn()
         second = world.probe().publisher(topics.PLANT_OUTPUT, Float64)
         sound = driver.sent
 
@@ -212,7 +205,7 @@ def test_broken_sensor_holds_the_last_good_estimates_and_is_an_error(
 ) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
-        learn(driver)
+        driver.learn()
         stuck = driver.y[-1]
         driver.sent = lambda k, y: [-y if broken == 'sign' else stuck]
         driver.run_until(lambda: driver.says('does not follow from v'), 'the contradiction')
@@ -231,7 +224,7 @@ def test_broken_sensor_holds_the_last_good_estimates_and_is_an_error(
 def test_flood_is_survived_and_leaves_nothing_behind(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
-        learn(driver)
+        driver.learn()
         driver.sent = lambda k, y: [y] * 20
         driver.run(1.0)
         driver.sent = lambda k, y: [y]

@@ -52,11 +52,6 @@ class Asked:
         return self(service, Trigger, Trigger.Request())
 
 
-def learn(driver: PacedDriver) -> None:
-    driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
-    driver.run(1.0)
-
-
 def test_controller_goes_through_its_life_and_publishes_only_while_active(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller = world.start('controller', {'autostart': False})
@@ -92,7 +87,7 @@ def test_reactivation_keeps_the_estimates_and_makes_no_jump(
             world, structure=structure, **{'control.rate_max': RATE_MAX, 'on_stop': 'ramp'}
         )
         asked = Asked(driver)
-        learn(driver)
+        driver.learn()
         assert asked.change(Transition.TRANSITION_DEACTIVATE)
         driver.run(0.3)
         assert driver.controls[-1].data == 0.0
@@ -110,7 +105,7 @@ def test_frozen_estimates_stay_and_learning_goes_on_afterwards(tmp_path: Path) -
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
         asked = Asked(driver)
-        learn(driver)
+        driver.learn()
         assert asked.set('freeze_adaptation', True)
         driver.run(0.1)
         held = driver.estimate()
@@ -127,7 +122,7 @@ def test_without_compensation_v_no_longer_jumps_over_the_gap(tmp_path: Path) -> 
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
         asked = Asked(driver)
-        learn(driver)
+        driver.learn()
         gap = 5.0
         steps = [abs(b.data - a.data) for a, b in pairwise(driver.controls[-100:])]
         assert max(steps) > gap
@@ -147,7 +142,7 @@ def test_reset_estimates_begins_with_the_first_guess(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
         asked = Asked(driver)
-        learn(driver)
+        driver.learn()
         rows = len(driver.estimates)
         assert asked.trigger('reset_estimates').success
         driver.run_until(
@@ -164,14 +159,14 @@ def test_estimates_are_saved_on_request_or_the_reason_is_told(tmp_path: Path) ->
             world, **{'estimates.file': str(file), 'estimates.save_period': 0.0}
         )
         asked = Asked(driver)
-        learn(driver)
+        driver.learn()
         assert not file.exists()
         answer = asked.trigger('save_estimates')
         assert answer.success, answer.message
         assert json.loads(file.read_text())['estimate']['m'] == pytest.approx(1.3, rel=0.02)
         assert controller.stop() == 0
         nowhere, driver = another(world, str(tmp_path / 'missing' / 'estimates.json'))
-        learn(driver)
+        driver.learn()
         answer = Asked(driver).trigger('save_estimates')
         assert not answer.success
         assert 'cannot be written: No such file or directory' in answer.message
@@ -188,7 +183,7 @@ def test_live_parameters_change_together_or_not_at_all(tmp_path: Path) -> None:
             world, structure='tracking', **{'control.min': -200.0, 'control.max': 200.0}
         )
         asked = Asked(driver)
-        learn(driver)
+        driver.learn()
 
         def change(**values: object) -> Any:
             request = SetParametersAtomically.Request(parameters=[

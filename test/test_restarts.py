@@ -21,11 +21,6 @@ from backlash_ros import topics
 PLANT = {'output_noise_std': NOISE}
 
 
-def learn(driver: PacedDriver) -> None:
-    driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
-    driver.run(1.0)
-
-
 def test_killed_driver_comes_back_and_the_estimates_are_kept(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller = world.start('controller', {
@@ -61,7 +56,7 @@ def test_killed_controller_goes_on_with_the_saved_estimates(tmp_path: Path) -> N
         controller = world.start('controller', keep)
         driver = PacedDriver(world.probe())
         driver.meet(controller)
-        learn(driver)
+        driver.learn()
         driver.run_until(file.exists, 'saved estimates')
         controller.kill()
         rows = len(driver.estimates)
@@ -82,7 +77,7 @@ def test_saved_estimates_of_another_plant_are_refused(tmp_path: Path) -> None:
     file = tmp_path / 'estimates.json'
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world, **{'estimates.file': str(file)})
-        learn(driver)
+        driver.learn()
         assert controller.stop() == 0
         other = world.start('controller', {
             'estimates.file': str(file), 'estimates.load': True, 'sample_period': 0.02,
@@ -112,7 +107,7 @@ def test_clock_jump_on_simulated_time_is_an_interruption_not_the_end(
 
         driver.sent = with_clock
         driver.meet(controller)
-        learn(driver)
+        driver.learn()
         commands = len(driver.controls)
         offset += jump_s
         driver.run(2.0)
@@ -125,7 +120,7 @@ def test_clock_jump_on_simulated_time_is_an_interruption_not_the_end(
 def test_reconfiguration_under_load_keeps_the_loop_and_the_estimates(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
-        learn(driver)
+        driver.learn()
         client = driver.probe.node.create_client(SetParameters, 'controller/set_parameters')
         driver.run_until(client.service_is_ready, 'the parameter service')
         for k in range(20):
@@ -154,7 +149,7 @@ def test_a_signal_ends_the_loop_with_the_configured_command(
         controller, driver = controller_and_driver(
             world, **{'on_stop': action, 'control.rate_max': rate_max}
         )
-        learn(driver)
+        driver.learn()
         driver.run_until(lambda: abs(driver.v) > 5.0, 'a v away from 0')
         controller.send(number)
         driver.run_until(lambda: controller.process.poll() is not None, 'the end')

@@ -123,8 +123,10 @@ class ControllerNode(ManagedNode):
     def activate(self) -> None:
         assert self.loop is not None
         if self._driver is not None:
-            # v goes on from the last command, but what the plant did meanwhile is unknown.
+            # v goes on from the last command, but what the plant did meanwhile is unknown, and
+            # that nobody was listened to is no silence of the driver.
             self.loop.renew(self.loop.estimate)
+            self.loop.heard_at = None
             return
         needed = self._conditions_of_start()
         self.call_when(
@@ -184,8 +186,10 @@ class ControllerNode(ManagedNode):
         ]
 
     def _listen_to_driver(self) -> None:
-        self._driver = self._io.listen(self._on_output, KEPT_OUTPUTS)
-        emit('ready')
+        # Whoever is activated twice before everybody is there has two that wait.
+        if self._driver is None:
+            self._driver = self._io.listen(self._on_output, KEPT_OUTPUTS)
+            emit('ready')
 
     def _on_reference(self, message: Float64) -> None:
         loop = self.loop

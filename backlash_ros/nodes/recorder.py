@@ -40,7 +40,7 @@ FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that
 DIAGNOSTICS_PERIOD_S = 1.0
 # Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
 DRAIN_S = 0.3
-IDLE_SPINS = 5  # without a message, timers and requests to stop being served in between
+IDLE_SPINS = 5  # without a message, timers being served in between
 FAILED = 1
 
 # All but those of the driver; y comes last of all: it starts the loop.

@@ -18,7 +18,6 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidHandle, NameValidationException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.guard_condition import GuardCondition
 from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -32,7 +31,7 @@ from backlash_ros.nodes.declare import declare_parameters
 
 DONE, BAD_INPUT = 0, 2
 LOOK_S = 0.01  # between two looks at a condition of start-up
-AGAIN_S = 0.1  # between two requests to stop, until the node is gone
+AGAIN_S = 0.1  # between two requests to stop, until the node has heard one
 REMIND_S = 5.0  # between two lines that say what start-up waits for
 # A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
 NAP_NS = 3_000_000
@@ -140,7 +139,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
             node = make_node()
         except (ParameterError, NameValidationException) as error:
             return _refuse(executable, str(error))
-        signals.trigger_at_arrival(node.stop_request)
+        signals.stop_at_arrival(node)
         try:
             executor = SingleThreadedExecutor()
             executor.add_node(node)
@@ -172,15 +171,15 @@ class _SignalPipe:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, frame: None)
 
-    def trigger_at_arrival(self, condition: GuardCondition) -> None:
-        """Trigger the condition when a signal arrives or has arrived since the construction."""
+    def stop_at_arrival(self, node: ProcessNode) -> None:
+        """Ask the node to stop when a signal arrives or has arrived since the construction."""
         def wait() -> None:
             os.read(self._read_end, 1)
             # The node may be ending by itself.
             with contextlib.suppress(InvalidHandle):
                 # An executor that is busy may overlook a single one.
-                while True:
-                    condition.trigger()
+                while not node.stopping:
+                    node.stop_request.trigger()
                     time.sleep(AGAIN_S)
 
         threading.Thread(target=wait, daemon=True).start()
