@@ -22,7 +22,6 @@ from backlash_ros.nodes.spin import ProcessNode, run
 # plant_output counts as silent after this; then the own clock takes over.
 SILENT_PERIODS, SHORTEST_SILENCE_S = 3.0, 0.1
 LONGEST_SLEEP_S = 0.05  # so that the end of the process is noticed
-CALLBACKS_AT_ONCE = 3
 
 
 class ReferenceNode(ProcessNode):
@@ -78,9 +77,7 @@ class ReferenceNode(ProcessNode):
             if remaining > 0.0:
                 time.sleep(min(remaining, LONGEST_SLEEP_S))
                 continue
-            # The newest output, and whatever else has come in.
-            for _ in range(CALLBACKS_AT_ONCE):
-                executor.spin_once(timeout_sec=0.0)
+            executor.spin_once(timeout_sec=0.0)  # the newest output
             self._publish(self._sample)
             now = time.monotonic()
             if now <= self._heard_at + silence:

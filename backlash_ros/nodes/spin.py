@@ -28,6 +28,7 @@ from rclpy.utilities import remove_ros_args
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import PARAMETERS
 from backlash_ros.nodes.declare import declare_parameters
+from backlash_ros.nodes.prompt_executor import PromptExecutor
 
 DONE, BAD_INPUT = 0, 2
 LOOK_S = 0.01  # between two looks at a condition of start-up
@@ -141,8 +142,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
             return _refuse(executable, str(error))
         signals.stop_at_arrival(node)
         try:
-            executor = SingleThreadedExecutor()
-            executor.add_node(node)
+            executor = PromptExecutor(node)
             # A full collection would look through all of numpy and scipy and cost many samples.
             gc.collect()
             gc.freeze()
