@@ -2,7 +2,9 @@
 
     python benchmarks/soak.py [--seconds 60] [--minutes 10]
 
-G(z) of the paper's example, resampled to a period of 1 ms, on real nodes in real time.
+G(z) of the paper's example, resampled to a period of 1 ms, on real nodes in real time. Beside them
+a bare clock, which does nothing but sleep until the next period, tells for how many periods the
+machine itself stood still.
 """
 
 from __future__ import annotations
@@ -62,6 +64,9 @@ def run_loop(seconds: float, minutes: float) -> list[Check]:
         'plant': node_command('plant', {
             **plant, 'wait_for_subscribers': 1, 'samples': samples, 'output_noise_std': NOISE,
         }),
+        'bare clock': [
+            sys.executable, str(Path(__file__).with_name('bare_clock.py')), str(PERIOD_S),
+        ],
     }
     checks = []
     with processes(commands) as (supervisor, _):
@@ -78,13 +83,17 @@ def run_loop(seconds: float, minutes: float) -> list[Check]:
         patience_s = 2.0 * samples * PERIOD_S
         wait_for_event(supervisor, lambda kind, _: kind == 'done', patience_s)
         supervisor.stop()
-        log = _controller(supervisor).plan.log.read_text()
-    counts = dict(re.findall(r'([a-z][a-z ]*): (\d+)', log))
+        logs = {
+            child.plan.name: child.plan.log.read_text().strip().splitlines()[-1]
+            for child in supervisor.children if child.plan.log.stat().st_size
+        }
+    counts = dict(re.findall(r'([a-z][a-z ]*): (\d+)', logs['controller']))
     lost = int(counts.get('lost', 0))
     checks.insert(0, Check(
         f'samples lost of {counts["samples"]} at {1.0 / PERIOD_S:g} Hz', '0', str(lost), lost == 0
     ))
-    print(f'controller: {log.strip().splitlines()[-1]}')
+    for name in ('plant', 'controller', 'bare clock'):
+        print(f'{name}: {logs[name]}')
     return checks
 
 

@@ -1,0 +1,35 @@
+"""Sleeps until each next period, like a plant that has nothing to do; a yardstick for pauses.
+
+    python benchmarks/bare_clock.py PERIOD_S
+
+At the end, SIGINT, it tells how many periods it was too late for: the machine did not run it.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from backlash_ros.nodes.plant import LATEST
+
+
+def main() -> None:
+    """Count until interrupted."""
+    period_s = float(sys.argv[1])
+    due = time.monotonic()
+    ticks = missed = 0
+    longest = 0.0
+    try:
+        while True:
+            ticks, due = ticks + 1, due + period_s
+            time.sleep(max(due - time.monotonic(), 0.0))
+            late = time.monotonic() - due
+            longest = max(longest, late)
+            missed += late > LATEST * period_s
+    except KeyboardInterrupt:
+        print(f'{ticks} periods, {missed} missed, the latest by {1e3 * longest:.1f} ms',
+              file=sys.stderr)
+
+
+if __name__ == '__main__':
+    main()
