@@ -7,10 +7,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from backlash_ros.core.assembly import build_model
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimator import Status
+from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
+from backlash_ros.core.state_model import StateModel
 
 NOISE = 1e-3
 NAMES = ('m', 'c_r', 'c_l')
@@ -69,3 +72,19 @@ def test_plant_without_a_gap_is_recognised() -> None:
     assert record.column('status')[-1] == Status.TRACKING
     assert record.column('m')[-1] == pytest.approx(1.3, rel=0.01)
     assert record.column('c_r')[-1] - record.column('c_l')[-1] < 0.05
+
+
+def test_a_hypothesis_goes_on_when_its_gap_moves_beyond_the_swing_of_v() -> None:
+    model = StateModel(build_model(Parameters()))
+    gaps = np.array([1.0, 2.0, 4.0])
+    bank = GapBank(gaps, model, Prior(np.array([1.0, 1.0, -1.0]), 1.0), Noise(NOISE))
+    for v in (0.0, 2.5):
+        bank.predict(v)
+        bank.correct(0.1 * v)
+    bank.log_likelihood[1] += 100.0
+    bank.elect()
+    assert (bank.active, bank.leader) == (2, 1)
+    bank.move_gaps(np.array([2.8, 3.0, 4.0]))
+    bank.predict(2.6)
+    assert bank.correct(0.26)
+    assert (bank.active, bank.leader) == (2, 1)

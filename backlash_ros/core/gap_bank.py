@@ -234,7 +234,8 @@ class GapBank:
             return
         self._v_low, self._v_high = min(v, self._v_low), max(v, self._v_high)
         before = self.active
-        self.active = int(np.searchsorted(self.gaps, self.swing, side='right'))
+        # Who has started goes on, even if its gap has moved beyond the swing since.
+        self.active = max(before, int(np.searchsorted(self.gaps, self.swing, side='right')))
         new = slice(before, self.active)
         self._reach[new] = v if rising else v + self.gaps[new]
         self._left[new] = 0.0 if rising else 1.0
