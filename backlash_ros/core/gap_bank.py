@@ -34,6 +34,7 @@ STATE_REACH = 30.0  # standard deviation of x at the start, in terms of what was
 PRECISION = 1e-7  # least ratio of the deviations of the noise and of x at the start
 IMPLAUSIBLE = 1e4  # standard deviations of the prior that no theta is away from 0
 IMPOSSIBLE = -1e12  # log-likelihood of a hypothesis that is out
+TINY = 1e-300  # keeps a division finite
 ELECT_EVERY = 4  # corrections between two looks for the most likely hypothesis
 NIS_MEMORY = 1.0 / 40.0  # the mean of a true hypothesis is 1, its standard deviation then 0.16
 NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
@@ -164,14 +165,16 @@ class GapBank:
         """
         rows = slice(self._first, self.active)
         gaps, theta, cov = self.gaps[rows], self.theta[rows], self.theta_cov[rows]
-        lost = ~(np.abs(theta).max(axis=1, initial=0.0) <= self._plausible[rows])
+        lost = ~np.isfinite(self.log_likelihood[:self.active])
+        lost[rows] |= ~(np.abs(theta).max(axis=1, initial=0.0) <= self._plausible[rows])
         if lost.any():
-            self._give_up(np.flatnonzero(lost) + self._first)
+            self._give_up(np.flatnonzero(lost))
         weights = np.empty((len(gaps), 3))
         weights[:, 0], weights[:, 1], weights[:, 2] = -gaps, 1.0, -1.0
         mismatch = (weights * theta).sum(axis=1)
         variance = ((weights[:, None, :] @ cov)[:, 0, :] * weights).sum(axis=1)
         variance = np.maximum(variance, 0.0) + (self.tolerance * gaps * theta[:, 0]) ** 2
+        variance = np.maximum(variance, TINY)  # 0 for those that are out
         score = self.log_likelihood[:self.active].copy()
         score[rows] -= 0.5 * (mismatch**2 / variance + np.log(variance))
         paid = self._paid[rows]
@@ -187,8 +190,7 @@ class GapBank:
     def _give_up(self, rows: NDArray[np.intp]) -> None:
         """Take hypotheses out that contradict the data so much that rounding has taken over."""
         self.mean[rows], self.cov[rows] = 0.0, 0.0
-        self.mean[rows, self._n] = 1.0
-        self.log_likelihood[rows] = IMPOSSIBLE
+        self.log_likelihood[rows] = self._paid[rows] = IMPOSSIBLE
 
     def found(self) -> Crossings | None:
         """Estimate of the leader, the doubt about the gap included; None unless m > 0."""

@@ -50,6 +50,9 @@ SETTLED = 100  # samples of the fine bank after which the coarse one may rest
 NIS_SETTLED = 1.6  # normalised innovation squared of a fine bank that may be trusted to go alone
 # Without noise the filter still needs some, this far below what one sample of u does to x.
 NOISE_FLOOR = 1e-6
+# Share of the widest gap within which v counts as at rest at the start. A trajectory with preview
+# begins with moves that are nothing but rounding, and say nothing of the scale of things.
+AT_REST = 1e-6
 SLOPE_REACH = 30.0  # standard deviation of the slope before the first sample, in first guesses
 # Share of the slope and of the gap that may have changed while nobody looked.
 CHANGED_MEANWHILE = 0.01
@@ -76,6 +79,7 @@ class GapSearch:
         self.coarse: GapBank | None = None
         self.samples = 0
         self._settings = settings
+        self._widest = settings.bounds.c_r[1] - settings.bounds.c_l[0]
         self._inherited = None if inherited is None else _aged(inherited)
         self._y, self._v = np.empty(CAPACITY), np.empty(CAPACITY)
         self._replay: GapBank | None = None
@@ -128,8 +132,8 @@ class GapSearch:
     def add(self, y: float | None, v: float, accepted: bool = True) -> None:
         """Take in a sample; y is None if it was lost, not accepted if it is an outlier."""
         value = nan if y is None or not accepted else y
-        if self.coarse is None and self.samples and v == self._v[0]:
-            self.samples = 0  # at rest nothing is worth a record
+        if self.coarse is None and self.samples and abs(v - self._v[0]) <= AT_REST * self._widest:
+            self.samples, v = 0, float(self._v[0])  # at rest nothing is worth a record
         if self.samples < CAPACITY:
             self._y[self.samples], self._v[self.samples] = value, v
         self.samples += 1
@@ -150,10 +154,8 @@ class GapSearch:
         s = self._settings
         motion = float(np.abs(self._v[:count]).max()) * s.initial.m
         self._noise_floor = NOISE_FLOOR * float(np.linalg.norm(s.model.b)) * motion
-        bounds = s.bounds
-        widest = bounds.c_r[1] - bounds.c_l[0]
         steps = ceil(-log(SMALLEST_GAP) / log(GRID_RATIO))
-        grid = widest * SMALLEST_GAP ** np.linspace(1.0, 0.0, steps + 1)
+        grid = self._widest * SMALLEST_GAP ** np.linspace(1.0, 0.0, steps + 1)
         banks = [self._bank(np.asarray(grid, dtype=np.float64), with_null=True)]
         self.coarse = banks[0]
         if self._inherited is not None:

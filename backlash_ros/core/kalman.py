@@ -98,6 +98,8 @@ class KalmanEstimator:
         fine = self._search.search.fine
         return fine.innovation if fine is not None and self._lost_in_a_row == 0 else nan
 
+    # Hypotheses that contradict the data may overflow before they are given up.
+    @np.errstate(over='ignore', invalid='ignore')
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
@@ -147,6 +149,7 @@ class KalmanEstimator:
         root = self._sample_period**0.5
         return std[0] * root, std[1] * root, std[2] * root
 
+    @np.errstate(over='ignore', invalid='ignore')
     def refine(self) -> None:
         """Search on: read the record again, compare all gaps."""
         self._search.refine()
