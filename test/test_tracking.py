@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy import signal
 
+from backlash_ros.core.assembly import build_model
 from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.lq_preview import preview_gains
 from backlash_ros.core.metrics import (
     delayed_reference,
@@ -18,9 +24,12 @@ from backlash_ros.core.metrics import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.reference_signal import ReferenceSignal
+from backlash_ros.core.rest import SHORT, Mode, Rest
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.core.slope_tolerance import tolerates
 from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Situation
+from backlash_ros.core.tracking import cautious_crossings
 from backlash_ros.core.transfer_function import TransferFunction
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
@@ -86,6 +95,53 @@ def test_v_rests_while_the_reference_rests(noise: float) -> None:
     v = run.column('v')[550:]
     # A loop that cycles moves v at every other sample.
     assert np.mean(np.diff(v) != 0.0) < 0.15
+
+
+@pytest.mark.parametrize('seed', range(21, 27))
+def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
+    sigma = 1e-3
+    t = np.arange(1600) * 0.01
+    y_m = np.where(t < 4.5, 0.2 * np.sin(12.6 * t), 0.2 * np.sin(12.6 * 4.5))
+    p = tracking(output_noise_std=sigma, seed=seed)
+    run = simulate(p, 1600, y_m)
+    moves = np.diff(run.column('v')[1000:])
+    moves = moves[moves != 0.0]
+    # G integrates what is left of u, so y may have to be brought back, once: there and back again.
+    assert len(moves) <= 10
+    assert np.count_nonzero(np.diff(np.sign(moves))) <= 1
+    model = build_model(p)
+    y = signal.lfilter(model.numerator, model.denominator, run.column('u'))
+    assert np.abs(y[1000:] - y_m[-1]).max() < 6.0 * sigma
+
+
+def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> None:
+    rest, inverse, situation = resting(std=0.01)
+    x, window = np.zeros(2), deque([0.0])
+    assert rest.decide(situation, window, x, 0.0, x) is Mode.HOLD
+    rest.step(situation, 0.0, x, inverse, begins=True)
+    c_r, c_l = cautious_crossings(situation.estimate, rest.caution)
+    # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
+    assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.01)
+    rest.step(situation, 0.0, x, inverse, begins=False)
+    assert not inverse.taking_up, 'nothing more is known, so nothing more is done'
+    known = resting(std=0.001)[2]
+    rest.step(known, 0.0, x, inverse, begins=False)
+    c_r, c_l = cautious_crossings(known.estimate, rest.caution)
+    assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.001)
+
+
+def resting(std: float) -> tuple[Rest, BacklashInverse, Situation]:
+    """v engaged at u = 1 on the right of a gap from -1 to 1 with m = 1, and x known."""
+    model = StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9]))
+    inverse = BacklashInverse()
+    inverse.step(1.0, 1.0, 1.0, -1.0)
+    estimate = Estimate(1.0, 1.0, -1.0, 0.0, std, std, std, Status.TRACKING)
+
+    class Known:
+        x_hat = np.zeros(2)
+        x_cov = np.zeros((2, 2))
+
+    return Rest(model, np.zeros(2), 1e-3), inverse, Situation(0.0, 0.0, estimate, Known())
 
 
 def test_nothing_moves_before_there_is_anything_to_do() -> None:
