@@ -156,6 +156,19 @@ def test_wrong_first_slope_stays_bounded_until_the_truth_is_learned() -> None:
         assert np.abs(run.column('y')[300:]).max() < 0.25
 
 
+def test_y_is_led_back_as_soon_as_there_is_an_estimate() -> None:
+    # Too many slow poles for feedback by the first guess: y goes where u happens to be held.
+    p = tracking(
+        plant__numerator=[0.05], plant__denominator=np.poly([1.0, 0.985, 0.977, 0.977]).tolist(),
+        backlash__m=0.93, backlash__c_r=3.75, backlash__c_l=-7.4, backlash__initial_u=-2.5,
+        estimator__initial__m=2.75, estimator__initial__c_r=3.1, estimator__initial__c_l=-27.0,
+        amplitude=1e4, frequency=13.4, output_noise_std=1500.0, seed=4,
+    )
+    y = np.abs(simulate(p, 400).column('y')) / 1e4
+    assert y[:200].max() > 10.0
+    assert y[200:].max() < 3.0
+
+
 def test_feedback_by_the_first_guess_is_left_out_where_a_wrong_slope_would_destabilise() -> None:
     quick = StateModel(TransferFunction([0.1], [1.0, -0.9]))
     slow = StateModel(TransferFunction([1e-6], np.poly([1.0, 0.99, 0.985, 0.98]).tolist()))

@@ -39,7 +39,8 @@ from backlash_ros.core.transfer_function import TransferFunction
 DOUBT_OF_FIRST_GUESS = 0.5
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
-# Times the input weight while v meets its limits; the last one while the backlash is unknown.
+# Times the input weight while v meets its limits or the estimate is new; the last one while the
+# backlash is unknown.
 SOFTER = (1e1, 1e2, 1e3, 1e4)
 # Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
 # are led astray by any feedback that would help, and learn faster than they go astray without.

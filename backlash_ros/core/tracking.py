@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
 WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
-# wrong is contradicted by then.
+# wrong is contradicted by then. Where nothing was fed back before, feedback hardens step by step
+# until then: y must not go on the way it went.
 TRUSTED_AFTER = 40
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
@@ -38,11 +39,11 @@ class Tracking:
     which is y_m delayed by the preview window: the delay is what the preview costs. Before the
     first reference has passed the window r is the output at the start, so that nothing jumps.
     While the backlash is unknown, `careful` replaces K, or nothing where it is None: the trajectory
-    itself excites the backlash.
+    itself excites the backlash. Nothing gives way to softer gains with the first estimate.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
-    softer: gains to replace K with, step by step, while v meets its limits: full feedback through
-    a limited actuator cycles between the limits. rest: what v does while the trajectory rests.
-    noise_std: of y.
+    softer: gains to replace K with, step by step, while v meets its limits, where full feedback
+    would cycle between them, and while the estimate is new, if `careful` is None.
+    rest: what v does while the trajectory rests. noise_std: of y.
     """
 
     needs_output = True
@@ -83,11 +84,12 @@ class Tracking:
         ideal -= float(gains.preview @ window)
         deviation = np.zeros(len(self._x)) if first else situation.x_hat - self._x
         trusted = self._is_trusted(situation.estimate, first)
-        if trusted:
+        if trusted or (self._careful is None and self._trusted_for > 0):
             u_d = ideal - float(self._gain(inverse.limited) @ deviation)
-            u_d -= gains.integral * (self._integral - self._q)
         else:
             u_d = ideal - self._careful_feedback(situation.estimate, deviation, ideal)
+        if trusted:
+            u_d -= gains.integral * (self._integral - self._q)
         before = self._rest.mode
         mode = self._rest.decide(situation, self._window, self._x, ideal, deviation)
         caution = self._caution
@@ -115,13 +117,15 @@ class Tracking:
         self._window.append(situation.y_m)
 
     def _gain(self, limited: bool) -> Array:
-        """K, or a softer one the longer v meets its limits; back step by step once it is free."""
+        """K, or a softer one: the longer v meets its limits, and the newer the estimate."""
         self._free = 0 if limited else self._free + 1
         if limited:
             self._level = min(self._level + 1, len(self._soft) - 1)
         elif self._level > 0 and self._free % HARDEN_AFTER == 0:
             self._level -= 1
-        return self._soft[self._level]
+        levels = len(self._soft)
+        unproven = levels - 1 - self._trusted_for * levels // TRUSTED_AFTER
+        return self._soft[max(self._level, unproven)]
 
     def _careful_feedback(self, estimate: Estimate, deviation: Array, ideal: float) -> float:
         """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.
