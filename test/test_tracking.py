@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from scipy import signal
 
+from backlash_ros.core.assembly import build_model
 from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.lq_preview import preview_gains
 from backlash_ros.core.metrics import (
     delayed_reference,
@@ -18,9 +24,12 @@ from backlash_ros.core.metrics import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.reference_signal import ReferenceSignal
+from backlash_ros.core.rest import SHORT, Mode, Rest
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.core.slope_tolerance import tolerates
 from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Situation
+from backlash_ros.core.tracking import cautious_crossings
 from backlash_ros.core.transfer_function import TransferFunction
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
@@ -88,6 +97,53 @@ def test_v_rests_while_the_reference_rests(noise: float) -> None:
     assert np.mean(np.diff(v) != 0.0) < 0.15
 
 
+@pytest.mark.parametrize('seed', range(21, 27))
+def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
+    sigma = 1e-3
+    t = np.arange(1600) * 0.01
+    y_m = np.where(t < 4.5, 0.2 * np.sin(12.6 * t), 0.2 * np.sin(12.6 * 4.5))
+    p = tracking(output_noise_std=sigma, seed=seed)
+    run = simulate(p, 1600, y_m)
+    moves = np.diff(run.column('v')[1000:])
+    moves = moves[moves != 0.0]
+    # G integrates what is left of u, so y may have to be brought back, once: there and back again.
+    assert len(moves) <= 10
+    assert np.count_nonzero(np.diff(np.sign(moves))) <= 1
+    model = build_model(p)
+    y = signal.lfilter(model.numerator, model.denominator, run.column('u'))
+    assert np.abs(y[1000:] - y_m[-1]).max() < 6.0 * sigma
+
+
+def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> None:
+    rest, inverse, situation = resting(std=0.01)
+    x, window = np.zeros(2), deque([0.0])
+    assert rest.decide(situation, window, x, 0.0, x) is Mode.HOLD
+    rest.step(situation, 0.0, x, inverse, begins=True)
+    c_r, c_l = cautious_crossings(situation.estimate, rest.caution)
+    # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
+    assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.01)
+    rest.step(situation, 0.0, x, inverse, begins=False)
+    assert not inverse.taking_up, 'nothing more is known, so nothing more is done'
+    known = resting(std=0.001)[2]
+    rest.step(known, 0.0, x, inverse, begins=False)
+    c_r, c_l = cautious_crossings(known.estimate, rest.caution)
+    assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.001)
+
+
+def resting(std: float) -> tuple[Rest, BacklashInverse, Situation]:
+    """v engaged at u = 1 on the right of a gap from -1 to 1 with m = 1, and x known."""
+    model = StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9]))
+    inverse = BacklashInverse()
+    inverse.step(1.0, 1.0, 1.0, -1.0)
+    estimate = Estimate(1.0, 1.0, -1.0, 0.0, std, std, std, Status.TRACKING)
+
+    class Known:
+        x_hat = np.zeros(2)
+        x_cov = np.zeros((2, 2))
+
+    return Rest(model, np.zeros(2), 1e-3), inverse, Situation(0.0, 0.0, estimate, Known())
+
+
 def test_nothing_moves_before_there_is_anything_to_do() -> None:
     run = simulate(tracking(amplitude=0.0, output_noise_std=1e-3), 300)
     assert not np.any(run.column('v'))
@@ -98,6 +154,19 @@ def test_wrong_first_slope_stays_bounded_until_the_truth_is_learned() -> None:
         run = simulate(tracking(estimator__initial__m=slope), 400)
         assert np.abs(run.column('y')).max() < 3.0
         assert np.abs(run.column('y')[300:]).max() < 0.25
+
+
+def test_y_is_led_back_as_soon_as_there_is_an_estimate() -> None:
+    # Too many slow poles for feedback by the first guess: y goes where u happens to be held.
+    p = tracking(
+        plant__numerator=[0.05], plant__denominator=np.poly([1.0, 0.985, 0.977, 0.977]).tolist(),
+        backlash__m=0.93, backlash__c_r=3.75, backlash__c_l=-7.4, backlash__initial_u=-2.5,
+        estimator__initial__m=2.75, estimator__initial__c_r=3.1, estimator__initial__c_l=-27.0,
+        amplitude=1e4, frequency=13.4, output_noise_std=1500.0, seed=4,
+    )
+    y = np.abs(simulate(p, 400).column('y')) / 1e4
+    assert y[:200].max() > 10.0
+    assert y[200:].max() < 3.0
 
 
 def test_feedback_by_the_first_guess_is_left_out_where_a_wrong_slope_would_destabilise() -> None:

@@ -27,6 +27,7 @@ from backlash_ros.core.printed_law import PrintedLaw
 from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.reference_file import read_reference_file
 from backlash_ros.core.reference_signal import ReferenceSignal
+from backlash_ros.core.rest import Rest
 from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
 from backlash_ros.core.slope_tolerance import tolerates
 from backlash_ros.core.state_model import StateModel
@@ -38,11 +39,13 @@ from backlash_ros.core.transfer_function import TransferFunction
 DOUBT_OF_FIRST_GUESS = 0.5
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
-# Times the input weight while v meets its limits; the last one while the backlash is unknown.
+# Times the input weight while v meets its limits or the estimate is new; the last one while the
+# backlash is unknown.
 SOFTER = (1e1, 1e2, 1e3, 1e4)
 # Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
 # are led astray by any feedback that would help, and learn faster than they go astray without.
 WRONG_SLOPE = 1.35
+AT_REST = 1.0 / 80.0  # rad per sample, up to which y is corrected while the reference rests
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -205,10 +208,13 @@ def _proportional(p: Parameters) -> Structure:
     return Proportional()
 
 
+def _power_gain(model: TransferFunction, frequency: float) -> float:
+    """|G|^2 at so many rad per sample."""
+    return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
+
+
 def _input_weight(p: Parameters, model: TransferFunction) -> float:
-    z = np.exp(1j * np.pi / 10.0)
-    scale = float(abs(model.response(np.array([z]))[0])) ** 2
-    return p.real('tracking.input_weight') * scale
+    return p.real('tracking.input_weight') * _power_gain(model, np.pi / 10.0)
 
 
 def _pole_placement(p: Parameters) -> Structure:
@@ -232,9 +238,12 @@ def _tracking(p: Parameters) -> Structure:
     )
     softer = [preview_gains(state, more * weight, 0.0, 0).state for more in SOFTER]
     careful = softer[-1] if tolerates(state, softer[-1], WRONG_SLOPE) else None
+    noise_std = p.real('estimator.output_noise_std')
+    # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
+    gentle = preview_gains(state, _power_gain(model, AT_REST), 0.0, 0).state
     return Tracking(
-        state, gains, careful, p.real('inverse.caution'),
-        p.real('estimator.output_noise_std'), softer,
+        state, gains, careful, p.real('inverse.caution'), Rest(state, gentle, noise_std),
+        noise_std, softer,
     )
 
 

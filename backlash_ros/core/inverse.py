@@ -70,6 +70,10 @@ class BacklashInverse:
             self.v, self.taking_up = target, False
         return self.v
 
+    def aim(self, u_d: float, side: Region) -> None:
+        """Let the next step go to u_d on the line of this side, whatever it came from."""
+        self.side, self.extreme, self.taking_up = side, u_d, True
+
     def hold(self, u_d: float) -> float:
         """Keep v although u_d moved to where no line fits, and return v."""
         if self.direction_band == 0.0:

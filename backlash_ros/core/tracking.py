@@ -12,25 +12,17 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimator import Estimate, Status
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.lq_preview import PreviewGains
+from backlash_ros.core.rest import OFF, Mode, Rest
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import Command, Situation
 
 Array = NDArray[np.float64]
 
-# While the reference rests, v rests as well as long as |x - x*| is within so many standard
-# deviations of the noise on y (StateModel scales x so that |x| is the energy of the free response
-# of y over some 50 samples: 7 stands for an error of the size of the noise). Feedback through a
-# gap that is not known to the last digit would cross it for ever.
-REST_TOLERANCE = 7.0
-REST_DOUBT = 2.0  # the same in standard deviations of x, where that is more
-REST_SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
-OFF_AT_REST = 6.0  # standard deviations of y that mean a deviation while the state is unknown
-STEADY = 0.01  # share of the tolerance by which an ideal trajectory at rest may still move
-
 HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
 WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
-# wrong is contradicted by then.
+# wrong is contradicted by then. Where nothing was fed back before, feedback hardens step by step
+# until then: y must not go on the way it went.
 TRUSTED_AFTER = 40
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
@@ -47,18 +39,18 @@ class Tracking:
     which is y_m delayed by the preview window: the delay is what the preview costs. Before the
     first reference has passed the window r is the output at the start, so that nothing jumps.
     While the backlash is unknown, `careful` replaces K, or nothing where it is None: the trajectory
-    itself excites the backlash.
+    itself excites the backlash. Nothing gives way to softer gains with the first estimate.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
-    softer: gains to replace K with, step by step, while v meets its limits: full feedback through
-    a limited actuator cycles between the limits. noise_std: of y; while the trajectory rests and
-    y is on it within the noise, v rests as well.
+    softer: gains to replace K with, step by step, while v meets its limits, where full feedback
+    would cycle between them, and while the estimate is new, if `careful` is None.
+    rest: what v does while the trajectory rests. noise_std: of y.
     """
 
     needs_output = True
 
     def __init__(
         self, model: StateModel, gains: PreviewGains, careful: Array | None, caution: float,
-        noise_std: float = 0.0, softer: Sequence[Array] = (),
+        rest: Rest, noise_std: float = 0.0, softer: Sequence[Array] = (),
     ) -> None:
         self.delay = len(gains.preview) - 1
         self._model, self._gains = model, gains
@@ -68,19 +60,19 @@ class Tracking:
         self._q = 0.0
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
-        self._noise_std, self._reach, self._u_reach = noise_std, 0.0, 0.0
+        self._noise_std, self._u_reach = noise_std, 0.0
         self._trusted_for = 0  # samples
         self._soft = (gains.state, *softer)
         self._level = self._free = 0  # gain in use, samples since v last met a limit
-        self._resting: float | None = 0.0  # u* at which v rests, None while it moves
+        self._rest = rest
 
     def go_on_from(self, other: Tracking) -> None:
         """Take over the trajectory of a structure with the same model and preview."""
         self._window, self._x, self._q = other._window, other._x, other._q
         self._integral, self._ideal = other._integral, other._ideal
-        self._reach, self._u_reach = other._reach, other._u_reach
         self._level, self._free = other._level, other._free
-        self._trusted_for, self._resting = other._trusted_for, other._resting
+        self._trusted_for, self._u_reach = other._trusted_for, other._u_reach
+        self._rest.go_on_from(other._rest)
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
@@ -92,25 +84,23 @@ class Tracking:
         ideal -= float(gains.preview @ window)
         deviation = np.zeros(len(self._x)) if first else situation.x_hat - self._x
         trusted = self._is_trusted(situation.estimate, first)
-        if trusted:
+        if trusted or (self._careful is None and self._trusted_for > 0):
             u_d = ideal - float(self._gain(inverse.limited) @ deviation)
-            u_d -= gains.integral * (self._integral - self._q)
         else:
             u_d = ideal - self._careful_feedback(situation.estimate, deviation, ideal)
-        self._rest(situation, deviation, ideal)
-        if self._resting is not None:
-            u_d = self._resting
-            inverse.widen_band(0.0)
-        elif situation.x_cov is not None:
-            variance = float(gains.state @ situation.x_cov @ gains.state)
-            onward = (ideal - self._ideal) * inverse.side >= 0.0
-            band = ONWARD_BAND if onward else NOISE_BAND
-            inverse.widen_band(band * sqrt(max(variance, 0.0)))
+        if trusted:
+            u_d -= gains.integral * (self._integral - self._q)
+        before = self._rest.mode
+        mode = self._rest.decide(situation, self._window, self._x, ideal, deviation)
+        caution = self._caution
+        if mode is Mode.FOLLOW:
+            inverse.widen_band(self._noise_band(situation, ideal, inverse))
         else:
-            inverse.widen_band(0.0)  # no noise of x enters u_d, a turn is one
+            if situation.x_cov is not None:
+                self._rest.step(situation, ideal, deviation, inverse, mode is not before)
+            u_d, caution = self._rest.u_d, self._rest.caution
+            inverse.widen_band(0.0)
         self._ideal = ideal
-        # A single move cannot start a limit cycle, and should leave as little drift as possible.
-        caution = self._caution if self._resting is None else 0.0
         c_r, c_l = cautious_crossings(situation.estimate, caution)
         v = inverse.step(u_d, situation.estimate.m, c_r, c_l)
         self._advance(ideal, situation.y, trusted, inverse.limited)
@@ -118,7 +108,7 @@ class Tracking:
 
     def _take_in(self, situation: Situation) -> None:
         if not self._window:
-            start, noise = situation.y, OFF_AT_REST * self._noise_std
+            start, noise = situation.y, OFF * self._noise_std
             # What may be noise is no distance to go: a loop at rest stays at rest.
             near = abs(start - situation.y_m) <= noise
             self._window.extend([situation.y_m if near else start] * (self.delay + 1))
@@ -127,13 +117,15 @@ class Tracking:
         self._window.append(situation.y_m)
 
     def _gain(self, limited: bool) -> Array:
-        """K, or a softer one the longer v meets its limits; back step by step once it is free."""
+        """K, or a softer one: the longer v meets its limits, and the newer the estimate."""
         self._free = 0 if limited else self._free + 1
         if limited:
             self._level = min(self._level + 1, len(self._soft) - 1)
         elif self._level > 0 and self._free % HARDEN_AFTER == 0:
             self._level -= 1
-        return self._soft[self._level]
+        levels = len(self._soft)
+        unproven = levels - 1 - self._trusted_for * levels // TRUSTED_AFTER
+        return self._soft[max(self._level, unproven)]
 
     def _careful_feedback(self, estimate: Estimate, deviation: Array, ideal: float) -> float:
         """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.
@@ -158,27 +150,15 @@ class Tracking:
         self._trusted_for = known if _trusted(estimate) else 0
         return self._trusted_for >= TRUSTED_AFTER
 
-    def _rest(self, situation: Situation, deviation: Array, ideal: float) -> None:
-        """Decide whether v rests: the trajectory does, and y needs no correction."""
-        self._reach = max(self._reach, sqrt(float(self._x @ self._x)))
-        tolerance = max(REST_TOLERANCE * self._noise_std, REST_SHARE * self._reach)
-        motion = self._model.a @ self._x + self._model.b * ideal - self._x
-        still = max(self._window) - min(self._window) <= self._noise_std
-        if not still or sqrt(float(motion @ motion)) > STEADY * tolerance:
-            self._resting = None
-            return
+    def _noise_band(
+        self, situation: Situation, ideal: float, inverse: BacklashInverse,
+    ) -> float:
         if situation.x_cov is None:
-            off = abs(situation.y - self._window[0]) > OFF_AT_REST * self._noise_std
-        else:
-            # x is scaled so that its norm is that of the free response of y over a horizon.
-            doubt = REST_DOUBT * sqrt(max(float(np.trace(situation.x_cov)), 0.0))
-            limit = max(tolerance, doubt)
-            size = sqrt(float(deviation @ deviation))
-            off = size > (0.25 * limit if self._resting is None else limit)
-        if off:
-            self._resting = None
-        elif self._resting is None:
-            self._resting = ideal
+            return 0.0  # no noise of x enters u_d, a turn is one
+        gain = self._gains.state
+        variance = float(gain @ situation.x_cov @ gain)
+        onward = (ideal - self._ideal) * inverse.side >= 0.0
+        return (ONWARD_BAND if onward else NOISE_BAND) * sqrt(max(variance, 0.0))
 
     def _advance(self, ideal: float, y: float, trusted: bool, limited: bool) -> None:
         r = self._window[0]

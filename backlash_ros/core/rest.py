@@ -1,0 +1,153 @@
+"""What v does while the reference rests: as little as keeps y where it belongs.
+
+Feedback through a gap that is not known to the last digit would cross it for ever. So v is held
+while y is within a tolerance of the trajectory, and otherwise moves in single steps:
+
+- to the u that holds G at rest, stopping short of it by what is uncertain about the crossing. What
+  is left of u shows in y. Once it is known it is taken away by going on in the same direction,
+  which crosses no gap;
+- where y has left the tolerance, to a u that brings it back, and then to rest again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum, auto
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.backlash import Region
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Situation
+
+Array = NDArray[np.float64]
+
+# v is held as long as |x - x*| is within so many standard deviations of the noise on y (StateModel
+# scales x so that |x| is the energy of the free response of y over some 50 samples: 7 stands for
+# an error of the size of the noise).
+TOLERANCE = 21.0
+DOUBT = 2.0  # the same in standard deviations of x, where that is more
+SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
+ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
+ARRIVED = 0.5  # share of the tolerance within which v comes to rest after a motion
+STEADY = 0.004  # share of the tolerance by which x* may still move per sample
+OFF = 6.0  # standard deviations of y that mean a deviation while the state is unknown
+
+LED_BACK = 0.25  # share of what brings y back below which it is no longer needed
+TOO_WEAK = 0.5  # share of it with which y would not come back
+SHORT = 2.0  # standard deviations of the crossing by which v stops short of the u at rest
+GAIN = 1.5  # least factor by which a step has to lessen what u is off
+HORIZON = 300  # samples within which what u is off must matter to be worth a step
+MATTERS = 0.25  # share of the tolerance that it must move x by
+
+
+class Mode(Enum):
+    """What v does."""
+
+    FOLLOW = auto()  # the trajectory moves, or y is far from it
+    HOLD = auto()  # u is to be that at rest
+    LEAD_BACK = auto()  # u is to bring y back
+
+
+class Rest:
+    """Decides whether v rests, and steps it there.
+
+    gain: gentle state feedback, shape (n,), which says what u brings y back. noise_std: of y.
+    """
+
+    def __init__(self, model: StateModel, gain: Array, noise_std: float) -> None:
+        self.mode = Mode.HOLD
+        self.u_d = 0.0  # where v rests
+        self.caution = 0.0  # standard deviations by which the crossings are shrunk for it
+        self._model, self._gain, self._noise_std = model, gain, noise_std
+        self._reach = 0.0  # largest |x*| so far
+        self._limit = 0.0  # tolerance in use
+        self._pull = 0.0  # u - u* with which leading back began
+        self._push = float(np.linalg.norm(_response_to_step(model, HORIZON)))
+
+    def go_on_from(self, other: Rest) -> None:
+        """Take over where another one of the same model rests."""
+        self.mode, self.u_d, self.caution = other.mode, other.u_d, other.caution
+        self._reach, self._limit, self._pull = other._reach, other._limit, other._pull
+
+    def decide(
+        self, situation: Situation, window: Sequence[float], x: Array, ideal: float,
+        deviation: Array,
+    ) -> Mode:
+        """Set the mode for this sample.
+
+        window: r from now on. x, ideal: x* and u*. deviation: x_hat - x*.
+        """
+        self._reach = max(self._reach, sqrt(float(x @ x)))
+        tolerance = max(TOLERANCE * self._noise_std, SHARE * self._reach)
+        motion = self._model.a @ x + self._model.b * ideal - x
+        before = self.mode
+        if (
+            max(window) - min(window) > self._noise_std
+            or sqrt(float(motion @ motion)) > STEADY * tolerance
+        ):
+            self.mode = Mode.FOLLOW
+        elif situation.x_cov is None:
+            off = abs(situation.y - window[0]) > OFF * self._noise_std
+            self.mode = Mode.FOLLOW if off else Mode.HOLD
+            if before is Mode.FOLLOW:
+                self.u_d, self.caution = ideal, 0.0
+        else:
+            doubt = DOUBT * sqrt(max(float(np.trace(situation.x_cov)), 0.0))
+            self._limit = max(tolerance, doubt)
+            self.mode = self._mode_for(deviation)
+        return self.mode
+
+    def _mode_for(self, deviation: Array) -> Mode:
+        size = sqrt(float(deviation @ deviation))
+        if size > ASTRAY * self._limit:
+            return Mode.FOLLOW
+        if self.mode is Mode.FOLLOW:
+            return Mode.HOLD if size <= ARRIVED * self._limit else Mode.FOLLOW
+        pull = -float(self._gain @ deviation)
+        if self.mode is Mode.LEAD_BACK:
+            back = pull * self._pull <= LED_BACK * self._pull**2
+            return Mode.HOLD if back else Mode.LEAD_BACK
+        if size <= self._limit:
+            return Mode.HOLD
+        self._pull = pull
+        return Mode.LEAD_BACK
+
+    def step(
+        self, situation: Situation, ideal: float, deviation: Array, inverse: BacklashInverse,
+        begins: bool,
+    ) -> None:
+        """Aim the inverse at the u that is wanted, where that is better than to stay.
+
+        begins: whether the mode has changed with this sample.
+        """
+        if begins:
+            self.u_d, self.caution = inverse.extreme, 0.0
+        if inverse.taking_up:
+            return  # still on its way
+        estimate = situation.estimate
+        engaged = estimate.c_l if inverse.side == Region.LEFT else estimate.c_r
+        u = estimate.m * (inverse.v - engaged)
+        if self.mode is Mode.LEAD_BACK:
+            pull = -float(self._gain @ deviation)
+            if begins or (u - ideal) * pull < TOO_WEAK * pull * pull:
+                self._aim(ideal + pull, u, 0.0, inverse)
+            return
+        side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
+        away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
+        if away * self._push > MATTERS * self._limit and away > GAIN * uncertain:
+            self._aim(ideal, u, SHORT, inverse)
+
+    def _aim(self, u_d: float, u: float, caution: float, inverse: BacklashInverse) -> None:
+        self.u_d, self.caution = u_d, caution
+        inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)
+
+
+def _response_to_step(model: StateModel, samples: int) -> Array:
+    x = np.zeros(model.order)
+    for _ in range(samples):
+        x = model.a @ x + model.b
+    return x
