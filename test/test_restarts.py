@@ -39,7 +39,7 @@ def test_killed_driver_comes_back_and_the_estimates_are_kept(tmp_path: Path) -> 
         rows = len(watch.estimates)
         world.start('plant', {**PLANT, 'seed': 5, 'backlash.initial_u': 1.0})
         # A new driver may send y some time before it hears v.
-        wait_until(lambda: len(watch.estimates) > rows + 200, 'the loop', listen)
+        wait_until(lambda: len(watch.estimates) > rows + 100, 'the loop', listen)
         wait_until(lambda: watch.error() < 0.005, 'the estimates once more', listen)
         for row in watch.estimates[rows:]:
             assert abs(row.data[0] / 1.3 - 1.0) < 0.02
@@ -66,7 +66,7 @@ def test_killed_controller_goes_on_with_the_saved_estimates(tmp_path: Path) -> N
         m, c_r, c_l = driver.estimates[rows].data[:3]
         assert (m, c_r, c_l) == pytest.approx((1.3, 3.0, -3.0), rel=0.05)
         assert set(saved) >= {'m', 'c_r', 'c_l', 'std_m'}
-        driver.run(1.0)
+        driver.run(0.5)
         for row in driver.estimates[rows:]:
             assert abs(row.data[0] / 1.3 - 1.0) < 0.05
         assert again.stop() == 0
@@ -110,9 +110,8 @@ def test_clock_jump_on_simulated_time_is_an_interruption_not_the_end(
         driver.learn()
         commands = len(driver.controls)
         offset += jump_s
-        driver.run(2.0)
-        assert len(driver.controls) > commands + 150
-        assert driver.error() < 0.05
+        driver.run_until(lambda: len(driver.controls) > commands + 100, 'further commands')
+        driver.run_until_known(0.05)
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -134,7 +133,7 @@ def test_reconfiguration_under_load_keeps_the_loop_and_the_estimates(tmp_path: P
             driver.run_until(answer.done, 'the answer')
             assert all(result.successful for result in answer.result().results)
             driver.run(0.05)
-        assert driver.error() < 0.02
+        driver.run_until_known(0.02)
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -153,6 +152,8 @@ def test_a_signal_ends_the_loop_with_the_configured_command(
         driver.run_until(lambda: abs(driver.v) > 5.0, 'a v away from 0')
         controller.send(number)
         driver.run_until(lambda: controller.process.poll() is not None, 'the end')
+        if action != 'hold':
+            driver.run_until(lambda: driver.controls[-1].data == 0.0, 'v at 0')
         driver.run(0.1)
         assert controller.process.returncode == 0
         last = [message.data for message in driver.controls[-3:]]
