@@ -21,10 +21,10 @@ from backlash_ros.nodes.check_driver import main
 from backlash_ros.tools.processes import child_environment, free_domain
 
 HERE = Path(__file__).resolve().parent
-DURATION_S = 5.0
+DURATION_S = 6.0
 DEADLINE_S = 60.0
-# A machine under load may hold up the driver, which the check is right to find fault with, or the
-# check: a run that ends otherwise than it should says nothing unless it always does.
+# A machine under load may hold the driver up: then the check is right to find fault with it, and
+# a run that ends otherwise than it should says nothing.
 HELD_UP, ATTEMPTS = 0.3, 5
 REMAP = ['--ros-args', '-r', 'plant_output:=/motor/plant_output']
 
@@ -94,14 +94,12 @@ def subjects(told: str, mark: str) -> list[str]:
 
 def assert_told(folder: Path, fault: str, wrong: list[str], *options: str) -> str:
     """Run check_driver beside a driver: this and no more is wrong; return what it printed."""
-    held_up = []
     for _ in range(ATTEMPTS):
         with bench(folder, fault) as beside:
             code, told = beside.check(*options)
             if (subjects(told, '✗'), code) == (wrong, 1 if wrong else 0):
                 return told
-            held_up.append(beside.held_up())
-    assert min(held_up) > HELD_UP, told
+            assert beside.held_up() > HELD_UP, told
     pytest.skip(f'the machine held up the driver in each of {ATTEMPTS} runs')
 
 
