@@ -35,7 +35,7 @@ class FaultyDriver:
         profile = QoSProfile(
             depth=10, reliability=RELIABILITY.get(fault, ReliabilityPolicy.RELIABLE)
         )
-        topic = '/motor/plant_output' if fault == 'name' else 'plant_output'
+        topic = '/motor/plant_output' if fault == 'delay' else 'plant_output'
         self.output = self.node.create_publisher(Float64, topic, profile)
         if fault == 'second':
             self.second = self.node.create_publisher(Float64, topic, profile)

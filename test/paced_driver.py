@@ -86,9 +86,13 @@ class PacedDriver:
 
     def learn(self) -> None:
         """Go on until the backlash is known for some time."""
-        self.run_until(lambda: self.error() < 0.02, 'estimates within 2 %')
-        self.run(0.6)
-        self.run_until(lambda: self.error() < 0.02, 'estimates within 2 % once more')
+        self.run_until_known(0.02)
+        self.run(0.2)
+        self.run_until_known(0.02)
+
+    def run_until_known(self, error: float) -> None:
+        """Go on until no estimate is off by more than a share."""
+        self.run_until(lambda: self.error() < error, f'estimates within {error:.0%}')
 
     def rest(self) -> None:
         """Let the plant stand still while nobody is served."""

@@ -213,7 +213,7 @@ def is_complete_after_repair(bag: Path) -> bool:
     return True
 
 
-@settings(max_examples=200)
+@settings(max_examples=120)
 @given(st.data())
 def test_mcap_that_lost_its_end_keeps_every_block_before_it(
     finished: dict[str, Finished], data: st.DataObject,
@@ -228,7 +228,7 @@ def test_mcap_that_lost_its_end_keeps_every_block_before_it(
     assert len(found) >= whole.numbers_within(size)
 
 
-@settings(max_examples=100)
+@settings(max_examples=80)
 @given(st.data())
 def test_sqlite_that_lost_its_end_gives_what_it_still_can(
     finished: dict[str, Finished], data: st.DataObject,
@@ -242,7 +242,7 @@ def test_sqlite_that_lost_its_end_gives_what_it_still_can(
         assert len(found) == MESSAGES
 
 
-@settings(max_examples=200)
+@settings(max_examples=120)
 @given(st.data())
 def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_error(
     finished: dict[str, Finished], data: st.DataObject,

@@ -28,22 +28,22 @@ NODES = ('controller', 'plant', 'recorder', 'reference')
 
 
 def test_lockstep_run_ends_with_all_files_and_no_process(start: Callable[..., Session]) -> None:
-    session = start('--lockstep', '--duration', '3', '--seed', '5')
+    session = start('--lockstep', '--duration', '1', '--seed', '5')
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
 
     summary = json.loads((session.out / 'summary.json').read_text())
-    assert (summary['samples'], summary['lost_samples']) == (300, 0)
-    assert len((session.out / 'samples.csv').read_text().splitlines()) == 301
+    assert (summary['samples'], summary['lost_samples']) == (100, 0)
+    assert len((session.out / 'samples.csv').read_text().splitlines()) == 101
     assert (session.out / 'report.html').is_file()
     for node in NODES:
         assert (session.out / 'logs' / f'{node}.log').is_file()
     counts = bag_counts(session.out / 'bag')
     for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.SIGNALS, topics.ESTIMATES):
-        assert counts[topic] == 300
+        assert counts[topic] == 100
     effective = yaml.safe_load((session.out / 'parameters.yaml').read_text())
     parameters = effective['/**']['ros__parameters']
-    assert (parameters['seed'], parameters['lockstep'], parameters['samples']) == (5, True, 300)
+    assert (parameters['seed'], parameters['lockstep'], parameters['samples']) == (5, True, 100)
     assert 'c_r' in session.stdout
     assert str(session.out / 'report.html') in session.stdout
 

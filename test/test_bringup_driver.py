@@ -26,6 +26,8 @@ from backlash_ros.tools.progress import ProgressDisplay
 from backlash_ros.tools.run_plan import AxisPlan, RunPlan, plan_processes
 
 PLANT = f'{shlex.quote(sys.executable)} -m backlash_ros.nodes.plant'
+# Begins when controller, reference and recorder listen, so that nothing of it goes unrecorded.
+PATIENT_PLANT = f'{PLANT} --ros-args -p wait_for_subscribers:=3'
 
 # A driver that is none of this package: y follows v like a first-order lag, at 100 Hz.
 DRIVER = """
@@ -36,14 +38,14 @@ rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
 signal.signal(signal.SIGINT, signal.{sigint})
 node = rclpy.create_node('driver')
 output = node.create_publisher(Float64, 'plant_output', 10)
-state = {{'v': 0.0, 'y': 0.0, 'count': 0}}
+state = {{'v': 0.0, 'y': 0.0}}
+def die(number, frame):
+    sys.exit('the fuse has blown')
+signal.signal(signal.SIGUSR1, die)
 node.create_subscription(Float64, 'control', lambda m: state.update(v=m.data), 1)
 def tick():
     state['y'] += 0.1 * (state['v'] - state['y'])
     output.publish(Float64(data=state['y']))
-    state['count'] += state['v'] != 0.0
-    if state['count'] == {samples}:
-        sys.exit('the fuse has blown')
 node.create_timer(0.01, tick)
 try:
     rclpy.spin(node)
@@ -52,18 +54,26 @@ except KeyboardInterrupt:
 """
 
 
-def driver_command(folder: Path, samples: int = -1, sigint: str = 'default_int_handler') -> str:
-    """Command of a driver that dies after so many samples, and treats SIGINT like that."""
+def driver_command(folder: Path, sigint: str = 'default_int_handler') -> str:
+    """Command of a driver that dies of SIGUSR1, and treats SIGINT like that."""
     script = folder / 'driver.py'
-    script.write_text(DRIVER.format(samples=samples, sigint=sigint))
+    script.write_text(DRIVER.format(sigint=sigint))
     return shlex.join([sys.executable, str(script)])
+
+
+def drivers(session: Session) -> list[int]:
+    """Process ids of the drivers of a session."""
+    return [
+        pid for pid, command in session.survivors().items()
+        if 'driver.py' in command and 'tools.bringup' not in command
+    ]
 
 
 def test_driver_takes_the_place_of_the_plant_until_enough_samples_are_recorded(
     start: Callable[..., Session],
 ) -> None:
     session = start(
-        '--driver', PLANT, '--duration', '2', '--seed', '3', '--set', 'backlash.m=2',
+        '--driver', PATIENT_PLANT, '--duration', '1', '--seed', '3', '--set', 'backlash.m=2',
     )
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
@@ -74,7 +84,7 @@ def test_driver_takes_the_place_of_the_plant_until_enough_samples_are_recorded(
     assert '"event"' not in (session.out / 'logs' / 'driver.log').read_text()
     assert 'samples' in (session.out / 'logs' / 'driver.log').read_text()
     summary = json.loads((session.out / 'summary.json').read_text())
-    assert summary['samples'] + summary['lost_samples'] >= 200
+    assert summary['samples'] + summary['lost_samples'] >= 100
     assert summary['truth']['m'] == 1.3
     assert session.stderr.count('no use for what describes the simulated plant') == 1
     assert 'plant: backlash.*, seed\n' in session.stderr
@@ -83,7 +93,10 @@ def test_driver_takes_the_place_of_the_plant_until_enough_samples_are_recorded(
 def test_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported(
     start: Callable[..., Session], tmp_path: Path,
 ) -> None:
-    session = start('--driver', driver_command(tmp_path, samples=100), '--duration', '100')
+    session = start('--driver', driver_command(tmp_path), '--duration', '100')
+    session.wait_for_samples()
+    (driver,) = drivers(session)
+    os.kill(driver, signal.SIGUSR1)
     assert session.wait() == 1
     assert session.survivors() == {}
     assert 'driver died (exit code 1)' in session.stderr
@@ -131,7 +144,7 @@ def test_second_ctrl_c_ends_a_driver_that_ignores_the_first_one(
         lambda: not any('nodes.controller' in command for command in session.survivors().values()),
         'the controller has gone first',
     )
-    assert any('driver.py' in command for command in session.survivors().values())
+    assert drivers(session)
     session.process.send_signal(signal.SIGINT)
     assert session.wait() == 1
     assert session.survivors() == {}
@@ -377,21 +390,35 @@ def test_driver_without_a_first_sample_is_an_error(
     ('some command', False, False), ('none', False, True), ('some command', True, True),
 ])
 def test_controller_may_take_its_time_only_if_somebody_else_has_to_come(
-    watched: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path,
+    watched: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch,
     driver: str, managed: bool, patient: bool,
 ) -> None:
-    monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 1.0)
-    on = str(tmp_path / 'on')
-    late = f'time.sleep(3.0); {READY}; open({on!r}, "w").close()'
-    samples = (
-        f'import os\n{READY}\nwhile not os.path.exists({on!r}): time.sleep(0.01)\n'
-        f'{PROGRESS.format(0)}; {PROGRESS.format(99)}'
+    monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 0.1)
+    # In one piece, so that the first sample is there with the word that it is ready.
+    words = '\\n'.join(
+        ['{"event": "ready"}', *(f'{{"event": "progress", "sample": {k}}}' for k in (0, 99))]
     )
-    failure, _ = watched(driver, managed, controller=late, recorder=samples)
+    failure, _ = watched(driver, managed, controller=f"time.sleep(0.5); print('{words}')")
     if patient:
         assert failure == ''
     else:
-        assert failure.startswith('not ready within 1 s: controller (')
+        assert failure.startswith('not ready within 0.1 s: controller (')
+
+
+@pytest.mark.parametrize(('outputs', 'told'), [(0, 1), (3, 0)])
+def test_bag_without_outputs_of_the_driver_is_said_with_the_cause(
+    watched: Callable[..., tuple[str, str]], outputs: int, told: int,
+) -> None:
+    closed = json.dumps({
+        'event': 'closed', 'messages': {'/plant_output': outputs, '/plant/truth': 0}, 'failure': '',
+    })
+    failure, said = watched(recorder=(
+        f'{READY}; {PROGRESS.format(0)}; {PROGRESS.format(99)}\n'
+        f'signal.sigwait([signal.SIGINT]); print({closed!r}, flush=True); raise SystemExit'
+    ))
+    assert failure == ''
+    assert said.count('no message of /plant_output') == told
+    assert said.count('did not discover its publisher') == told
 
 
 def test_odd_exit_code_of_a_driver_that_was_told_to_end_is_said_and_no_error(

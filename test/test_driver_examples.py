@@ -27,7 +27,7 @@ BLOCKS = re.findall(
 )
 # Beside these the commands that follow them are run.
 FOREVER = ('motor_driver.py', 'bare_dds_driver.py', '/controller', '/reference')
-SHORT = {'--duration': '3'}  # s; the pages give a user more time
+SHORT = {'--duration': '2'}  # s; the pages give a user more time
 DEADLINE_S = 90.0
 # Of a driver that a machine under load holds up, a run says nothing.
 HELD_UP, ATTEMPTS = ('✗ jitter', '✗ lost samples'), 5
@@ -182,11 +182,14 @@ def run_or_start(
             runnable(words), cwd=folder, env=environment, capture_output=True, text=True,
             timeout=DEADLINE_S,
         )
-        if not any(word in done.stdout for word in HELD_UP):
+        if does_what_it_is_for(done) or not any(word in done.stdout for word in HELD_UP):
             break
-    if 'check_driver' in text:
-        assert done.returncode in (0, 1), done.stderr
-        assert '✓ sign and units' in done.stdout, done.stdout + done.stderr
-        assert '✓ G(z)' in done.stdout, done.stdout
-    else:
-        assert done.returncode == 0, done.stdout + done.stderr
+    assert does_what_it_is_for(done), done.stdout + done.stderr
+
+
+def does_what_it_is_for(done: subprocess.CompletedProcess[str]) -> bool:
+    """Whether a command has ended well; check_driver may find fault with the timing alone."""
+    if any('check_driver' in word for word in done.args):
+        fits = ('✓ sign and units', '✓ G(z)')
+        return done.returncode in (0, 1) and all(line in done.stdout for line in fits)
+    return bool(done.returncode == 0)

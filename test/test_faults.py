@@ -25,19 +25,22 @@ def test_absurd_numbers_are_dropped_counted_and_change_nothing(tmp_path: Path) -
         )
         assert driver.applied is not None
         driver.learn()
+        before = driver.value('non-finite dropped')
         for bad in ABSURD:
-            before, commands = driver.value('non-finite dropped'), len(driver.controls)
             driver.output.publish(Float64(data=bad))
             driver.reference.publish(Float64(data=bad))
             driver.applied.publish(Float64(data=bad))
             driver.rest()
+            commands = len(driver.controls)
             driver.run_until(
-                lambda before=before: driver.value('non-finite dropped') > before, 'the count'
+                lambda commands=commands: len(driver.controls) > commands + 5, 'further commands'
             )
-            assert len(driver.controls) > commands
-        driver.run(0.5)
+        # An output between two samples may be taken for a repetition before anybody looks into it.
+        driver.run_until(
+            lambda: driver.value('non-finite dropped') >= before + 2 * len(ABSURD), 'the count'
+        )
+        driver.run_until_known(0.02)
         assert all(isfinite(message.data) for message in driver.controls)
-        assert driver.error() < 0.02
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -76,8 +79,8 @@ def test_silent_driver_brings_the_configured_command_and_a_return_without_a_jump
             driver.run_until(lambda: driver.controls[-1].data == 0.0, 'v at 0')
         silent_from = len(driver.controls)
         driver.sent = sound
-        driver.run_until(lambda: len(driver.controls) > silent_from + 100, 'the return')
-        assert driver.error() < 0.05
+        driver.run_until(lambda: len(driver.controls) > silent_from + 50, 'the return')
+        driver.run_until_known(0.05)
         commands = [message.data for message in driver.controls]
         steps = [abs(b - a) for a, b in pairwise(commands)]
         # 0.01 s at rate_max; zero is at once.
@@ -105,8 +108,8 @@ def test_lost_outputs_leave_the_estimates_within_5_percent(tmp_path: Path, share
         controller, driver = controller_and_driver(world)
         # They are never published, so the numbers have no gap: arrival times have to do.
         driver.sent = lambda k, y: [] if driver.rng.random() < share else [y]
-        driver.run(2.0)
-        assert driver.error() < 0.05
+        driver.run(1.0)
+        driver.run_until_known(0.05)
         driver.run_until(lambda: driver.value('lost') > 0, 'the count of the lost ones')
         driver.check_sanity()
         assert controller.stop() == 0
@@ -142,8 +145,8 @@ def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent
         controller, driver = controller_and_driver(world)
         driver.learn()
         driver.sent = fault  # type: ignore[assignment]
-        driver.run(2.0)
-        assert driver.error() < 0.05
+        driver.run(1.6)  # longer than from burst to burst
+        driver.run_until_known(0.05)
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -157,8 +160,8 @@ def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_perc
             world, reports_applied=True, **{'estimator.use_applied_control': True}
         )
         driver.heard = lambda: bool(driver.rng.random() > share)
-        driver.run(2.0)
-        assert driver.error() < 0.05
+        driver.run(1.0)
+        driver.run_until_known(0.05)
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -169,9 +172,9 @@ def test_lost_controls_that_nobody_reports_are_said_to_be_inconsistent(tmp_path:
         driver.learn()
         driver.heard = lambda: bool(driver.rng.random() > 0.3)
         driver.run_until(lambda: driver.says('does not follow from v'), 'the contradiction')
-        driver.run(2.0)
+        driver.run(1.0)
+        driver.run_until_known(0.2)
         driver.check_sanity()
-        assert driver.error() < 0.2
         assert controller.stop() == 0
 
 
@@ -188,8 +191,8 @@ def test_second_publisher_is_told_and_the_first_one_kept(tmp_path: Path) -> None
 
         driver.sent = with_stranger
         driver.run_until(lambda: driver.says('2 publishers'), 'a word about the second one')
-        driver.run(2.0)
-        assert driver.error() < 0.02
+        driver.run(0.5)
+        driver.run_until_known(0.02)
         driver.run_until(
             lambda: driver.value('repeated or from a second driver') > 50, 'the count of refused'
         )
@@ -214,7 +217,7 @@ def test_broken_sensor_holds_the_last_good_estimates_and_is_an_error(
         assert status.level == DiagnosticStatus.ERROR
         assert driver.signals[-1].data[6] == Status.INCONSISTENT
         held = driver.estimate()
-        driver.run(1.0)
+        driver.run(0.5)
         assert driver.estimate() == held
         assert driver.error() < 0.05
         driver.check_sanity()
@@ -226,14 +229,18 @@ def test_flood_is_survived_and_leaves_nothing_behind(tmp_path: Path) -> None:
         controller, driver = controller_and_driver(world)
         driver.learn()
         driver.sent = lambda k, y: [y] * 20
-        driver.run(1.0)
+        driver.run(0.5)
         driver.sent = lambda k, y: [y]
-        driver.run(1.0)
-        commands = len(driver.controls)
-        driver.run(1.0)
+
+        def is_up_to_date() -> bool:
+            return driver.signals[-1].data[1] in driver.y[-5:]
+
+        driver.run_until(is_up_to_date, 'an answer to a new output')
+        outputs, commands = len(driver.y), len(driver.controls)
+        driver.run(0.5)
         # An answer per output again, none of them to an old one.
-        assert len(driver.controls) - commands <= 105
-        assert driver.signals[-1].data[1] in driver.y[-5:]
-        assert driver.error() < 0.05
+        assert len(driver.controls) - commands <= len(driver.y) - outputs + 5
+        driver.run_until(is_up_to_date, 'an answer to a new output once more')
+        driver.run_until_known(0.05)
         driver.check_sanity()
         assert controller.stop() == 0

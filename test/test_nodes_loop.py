@@ -128,7 +128,7 @@ def assert_mcap_reader_agrees(
 
 def test_stalled_controller_steps_over_what_it_missed_and_still_learns(tmp_path: Path) -> None:
     parameters = {
-        'samples': 400, 'output_loss': 0.05, 'estimator.use_applied_control': True,
+        'samples': 300, 'output_loss': 0.05, 'estimator.use_applied_control': True,
     }
     with ros_world(tmp_path) as world:
         probe = world.probe()

@@ -173,6 +173,18 @@ def test_second_sender_is_refused_while_the_first_one_sends(first: int, phase: f
     assert counter.index == 139
 
 
+@given(st.integers(0, 10**6), st.floats(0.05, 0.95))
+def test_two_senders_in_turn_are_not_taken_both(ahead: int, phase: float) -> None:
+    counter, used = SampleCounter(PERIOD_S), {False: 0, True: 0}
+    for k in range(100):
+        for stamp, number, older in (
+            (START_NS + k * PERIOD_NS, 1 + k + ahead, True),
+            (START_NS + int((k + phase) * PERIOD_NS), 1 + k, False),
+        ):
+            used[older] += counter.count(stamp, number).is_sample
+    assert used == {False: 0, True: 100}
+
+
 @given(st.integers(10, 10**7))
 def test_sender_that_begins_anew_after_a_silence_is_taken_up(silence: int) -> None:
     counter, due = paced_counter(100)

@@ -23,7 +23,7 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.bags.content import message_files
+from backlash_ros.bags.content import BagError, message_files
 from backlash_ros.bags.remains import damage, open_remains
 from backlash_ros.nodes.bag import STORAGE
 from backlash_ros.tools import report
@@ -75,6 +75,15 @@ def recorded_samples(bag: Path) -> set[int]:
         }
 
 
+def count_signals(bag: Path) -> int:
+    """Samples of the controller's signals that a recorder has flushed so far."""
+    try:
+        messages = open_remains(bag).messages()
+        return sum(message.topic.name == f'/{topics.SIGNALS}' for message in messages)
+    except BagError:
+        return 0
+
+
 def recorder(*arguments: object) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, '-m', 'backlash_ros.nodes.recorder', *map(str, arguments)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -86,22 +95,26 @@ def test_killed_recorder_loses_at_most_the_last_second(
 ) -> None:
     bag = tmp_path / 'bag'
     with ros_world(tmp_path) as world:
-        listener = Listener(world.probe())
+        probe = world.probe()
+        listener = Listener(probe)
         nodes = start_loop(world, bag, storage)
-        listener.wait_for(250)
+        probe.wait_until(
+            lambda: len(listener.before(time.monotonic() - LOST_S)) > 60, 'samples that must stay'
+        )
         nodes['recorder'].send(signal.SIGKILL)
         killed = time.monotonic()
         nodes['recorder'].wait()
-        listener.wait_for(50)  # nobody waits for a recorder
+        listener.wait_for(20)  # nobody waits for a recorder
         assert all(nodes[name].stop() == 0 for name in ('plant', 'reference', 'controller'))
     before = {path.name: path.read_bytes() for path in bag.iterdir()}
-    assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
-    warning = capsys.readouterr().err
     cure = f'ros2 run backlash_ros recorder --repair {bag}'
-    assert warning.startswith(f'report: warning: {bag} was never closed: this is what is left, ')
-    assert warning.endswith(f' To have it complete: {cure}\n')
-    assert cure in (tmp_path / 'out' / 'report.html').read_text()
     remains = read_bag(bag)
+    assert remains.damage.startswith(f'{bag} was never closed: this is what is left, ')
+    assert remains.damage.endswith(f' To have it complete: {cure}')
+    if storage == 'mcap':  # what it says depends on read_bag alone
+        assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
+        assert capsys.readouterr().err == f'report: warning: {remains.damage}\n'
+        assert cure in (tmp_path / 'out' / 'report.html').read_text()
     assert {path.name: path.read_bytes() for path in bag.iterdir()} == before
 
     done = recorder('--repair', bag)
@@ -126,9 +139,9 @@ def test_killed_recorder_loses_at_most_the_last_second(
 def test_recording_that_goes_on_is_read_and_not_repaired(tmp_path: Path, storage: str) -> None:
     bag = tmp_path / 'bag'
     with ros_world(tmp_path) as world:
-        listener = Listener(world.probe())
+        probe = world.probe()
         nodes = start_loop(world, bag, storage)
-        listener.wait_for(200)
+        probe.wait_until(lambda: count_signals(bag) > 50, 'samples in the bag')
         found = read_bag(bag)
         assert found.damage.endswith('To have it complete: stop the recorder')
         assert found.run.samples > 50
@@ -177,7 +190,7 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path, storage:
         listener = Listener(probe)
         diagnostics = probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
         nodes = start_loop(world, bag, storage)
-        listener.wait_for(100)
+        listener.wait_for(60)
         # As a file system does that is full: what goes beyond is refused.
         size = max(path.stat().st_size for path in bag.iterdir())
         limit = (size + 20_000,) * 2
@@ -193,7 +206,7 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path, storage:
             ), 'the error in the diagnostics',
         )
         told = len(nodes['recorder'].events('progress'))
-        listener.wait_for(100)
+        listener.wait_for(50)
         probe.wait_until(
             lambda: len(nodes['recorder'].events('progress')) > told, 'further progress'
         )
@@ -205,7 +218,7 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path, storage:
     assert re.search(r'[1-9]\d* messages came after the recording had stopped', log)
     saved = int(re.search(r'saved are (\d+) messages', reason)[1])
     assert sum(1 for _ in open_remains(bag).messages()) >= saved > 0
-    assert read_bag(bag).run.samples > 50
+    assert read_bag(bag).run.samples > 20
     assert recorder('--repair', bag).returncode == 0
     assert damage(bag) == ''
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from builtin_interfaces.msg import Time
-from paced_driver import NOISE, PacedDriver, controller_and_driver
+from paced_driver import NOISE, TRUTH, PacedDriver, controller_and_driver
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_processes import NodeProcess, ros_world, wait_until
@@ -39,7 +39,7 @@ def test_killed_driver_comes_back_and_the_estimates_are_kept(tmp_path: Path) -> 
         rows = len(watch.estimates)
         world.start('plant', {**PLANT, 'seed': 5, 'backlash.initial_u': 1.0})
         # A new driver may send y some time before it hears v.
-        wait_until(lambda: len(watch.estimates) > rows + 200, 'the loop', listen)
+        wait_until(lambda: len(watch.estimates) > rows + 100, 'the loop', listen)
         wait_until(lambda: watch.error() < 0.005, 'the estimates once more', listen)
         for row in watch.estimates[rows:]:
             assert abs(row.data[0] / 1.3 - 1.0) < 0.02
@@ -57,7 +57,7 @@ def test_killed_controller_goes_on_with_the_saved_estimates(tmp_path: Path) -> N
         driver = PacedDriver(world.probe())
         driver.meet(controller)
         driver.learn()
-        driver.run_until(file.exists, 'saved estimates')
+        driver.run_until(lambda: saved_error(file) < 0.02, 'saved estimates within 2 %')
         controller.kill()
         rows = len(driver.estimates)
         again = world.start('controller', keep)
@@ -66,11 +66,19 @@ def test_killed_controller_goes_on_with_the_saved_estimates(tmp_path: Path) -> N
         m, c_r, c_l = driver.estimates[rows].data[:3]
         assert (m, c_r, c_l) == pytest.approx((1.3, 3.0, -3.0), rel=0.05)
         assert set(saved) >= {'m', 'c_r', 'c_l', 'std_m'}
-        driver.run(1.0)
+        driver.run(0.5)
         for row in driver.estimates[rows:]:
             assert abs(row.data[0] / 1.3 - 1.0) < 0.05
         assert again.stop() == 0
         assert 'going on with the estimates' in again.stderr
+
+
+def saved_error(file: Path) -> float:
+    """The largest relative error of the estimates in a file, 1 where there is none."""
+    if not file.exists():
+        return 1.0
+    saved = json.loads(file.read_text())['estimate']
+    return max(abs(saved[name] / true - 1.0) for name, true in TRUTH.items())
 
 
 def test_saved_estimates_of_another_plant_are_refused(tmp_path: Path) -> None:
@@ -110,9 +118,8 @@ def test_clock_jump_on_simulated_time_is_an_interruption_not_the_end(
         driver.learn()
         commands = len(driver.controls)
         offset += jump_s
-        driver.run(2.0)
-        assert len(driver.controls) > commands + 150
-        assert driver.error() < 0.05
+        driver.run_until(lambda: len(driver.controls) > commands + 100, 'further commands')
+        driver.run_until_known(0.05)
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -134,7 +141,7 @@ def test_reconfiguration_under_load_keeps_the_loop_and_the_estimates(tmp_path: P
             driver.run_until(answer.done, 'the answer')
             assert all(result.successful for result in answer.result().results)
             driver.run(0.05)
-        assert driver.error() < 0.02
+        driver.run_until_known(0.02)
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -153,6 +160,8 @@ def test_a_signal_ends_the_loop_with_the_configured_command(
         driver.run_until(lambda: abs(driver.v) > 5.0, 'a v away from 0')
         controller.send(number)
         driver.run_until(lambda: controller.process.poll() is not None, 'the end')
+        if action != 'hold':
+            driver.run_until(lambda: driver.controls[-1].data == 0.0, 'v at 0')
         driver.run(0.1)
         assert controller.process.returncode == 0
         last = [message.data for message in driver.controls[-3:]]

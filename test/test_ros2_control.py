@@ -79,7 +79,7 @@ def test_backlash_is_learned_through_the_messages_of_ros2_control(
         stand_in = StandIn(world, field, names, best_effort)
         stand_in.meet()
         driver = stand_in.driver
-        driver.run_until(lambda: driver.error() < 0.02, 'estimates within 2 %')
+        driver.run_until_known(0.02)
         driver.check_sanity()
         assert controller.stop() == 0
 
@@ -94,7 +94,7 @@ def test_the_loop_through_ros2_control_is_recorded_and_reported(tmp_path: Path) 
         recorder.wait_for('ready')
         stand_in = StandIn(world, 'position', ['axle'], best_effort=False)
         stand_in.meet()
-        stand_in.driver.run_until(lambda: stand_in.driver.error() < 0.02, 'the estimates')
+        stand_in.driver.run_until_known(0.02)
         assert controller.stop() == 0
         assert recorder.stop() == 0
         recorded = recorder.wait_for('closed')['messages']

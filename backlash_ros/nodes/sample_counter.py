@@ -80,11 +80,13 @@ class SampleCounter:
         if numbered:
             passed = self._repeated if self._repeated < sequence else self._sequence
             by_number = sequence - passed - 1
-            if by_number < 0 and not keeps_time:
-                return self._anew(stamp_ns, sequence, by_time)
             if by_number < 0:
                 silent = stamp_ns - self._stamp_ns > SILENCE * period
-                return self._stranger(stamp_ns, sequence, by_time) if silent else NO_SAMPLE
+                if keeps_time and not silent:
+                    return NO_SAMPLE
+                # Two senders in turn must not each look like one that began anew.
+                begin = self._stranger if keeps_time or not silent else self._anew
+                return begin(stamp_ns, sequence, by_time)
             if keeps_time and by_number > late + 1.0 + NUMBER_SLACK:
                 # A second sender, or a flood of which the middleware has dropped a part.
                 if late < PATIENCE:

@@ -11,6 +11,7 @@ from math import inf, isfinite
 from types import FrameType, TracebackType
 from typing import Any
 
+from backlash_ros import topics
 from backlash_ros.tools.processes import Child, Event, ProcessSupervisor, RunError
 from backlash_ros.tools.progress import ProgressDisplay, number
 from backlash_ros.tools.run_plan import AxisPlan, RunPlan
@@ -20,6 +21,9 @@ LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
 STANDS_STILL = 5  # reports without a newer sample after which none is to come
 STALL_DEADLINE_S = 10.0  # without a new sample
 LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
+
+# Where y may come from, as the ends of full names.
+OUTPUTS = (f'/{topics.PLANT_OUTPUT}', f'/{topics.JOINT_STATES}')
 
 # How a driver may end that was told to by a signal; a shell adds 128 to its number.
 TOLD_TO_END = {
@@ -267,6 +271,21 @@ class Run:
         elif event.kind == 'recording_stopped':
             # The log may lie on the very disk that is full.
             complain(str(event.content.get('reason', '')))
+        elif event.kind == 'closed' and axis.plan.record and axis.made:
+            self._tell_unheard(event.content)
+
+    def _tell_unheard(self, closed: Mapping[str, object]) -> None:
+        """Say so where the bag holds what the controller made of y, but no y."""
+        recorded = closed.get('messages')
+        if not isinstance(recorded, dict) or closed.get('failure'):
+            return
+        for topic, count in recorded.items():
+            if topic.endswith(OUTPUTS) and count == 0:
+                self._say(
+                    f'the bag holds no message of {topic}, which the controller has heard: the '
+                    'recorder did not discover its publisher before the end of the run; let the '
+                    f'driver wait until {topic} has two subscribers, or run longer'
+                )
 
     def _missing(self) -> list[Child]:
         return [
