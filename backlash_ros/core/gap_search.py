@@ -141,6 +141,8 @@ class GapSearch:
             self._begin()
         else:
             self._step_coarse(value, v)
+        if y is None:
+            return  # after lost samples v is late already
         if self._replay is not None:
             self._advance_replay()
         else:
