@@ -7,6 +7,7 @@ At the end, SIGINT, it tells how many periods it was too late for: the machine d
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 
@@ -15,6 +16,8 @@ from backlash_ros.nodes.plant import LATEST
 
 def main() -> None:
     """Count until interrupted."""
+    # A shell ignores it for what it runs in the background.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     period_s = float(sys.argv[1])
     due = time.monotonic()
     ticks = missed = 0

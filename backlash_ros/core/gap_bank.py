@@ -116,7 +116,7 @@ class GapBank:
         self.doubt = np.zeros((3, 3))  # covariance of theta that comes from not knowing the gap
         self.innovation = nan  # of the leader
         self.innovation_var = self.noise_var
-        self.nis = 1.0  # running mean of the leader's normalised innovation squared
+        self._nis = np.ones(count)  # running means of the normalised innovations squared
         self._transition = np.tile(np.eye(n + 3), (count, 1, 1))
         self._transition[:, :n, :n] = model.a
         self._reach = np.zeros(count)  # q of the play operator: clamped between v and v + g
@@ -138,6 +138,15 @@ class GapBank:
             self._process_var[:n, :n] = noise.input_std**2 * np.outer(b, b)
             if noise.drift_var is not None:
                 self._process_var[n:, n:] = noise.drift_var
+
+    @property
+    def nis(self) -> float:
+        """Running mean of the leader's normalised innovation squared, 1 for a true model."""
+        return float(self._nis[self.leader])
+
+    def forgive(self) -> None:
+        """Begin to judge the innovations anew."""
+        self._nis[:] = 1.0
 
     @property
     def swing(self) -> float:
@@ -191,6 +200,7 @@ class GapBank:
         """Take hypotheses out that contradict the data so much that rounding has taken over."""
         self.mean[rows], self.cov[rows] = 0.0, 0.0
         self.log_likelihood[rows] = self._paid[rows] = IMPOSSIBLE
+        self._nis[rows] = NIS_CAP
 
     def found(self) -> Crossings | None:
         """Estimate of the leader, the doubt about the gap included; None unless m > 0."""
@@ -206,7 +216,7 @@ class GapBank:
         rows = slice(first, last)
         for name in (
             'gaps', 'mean', 'cov', 'log_likelihood', '_plausible', '_transition', '_reach',
-            '_left', '_phi', '_paid',
+            '_left', '_phi', '_paid', '_nis',
         ):
             setattr(part, name, getattr(self, name)[rows].copy())
         part.active, part._first = last - first, 0
@@ -309,9 +319,10 @@ class GapBank:
         e = y - c * mean[:, 0]
         leader = self.leader
         self.innovation, self.innovation_var = float(e[leader]), float(variance[leader])
-        square = self.innovation * self.innovation / self.innovation_var
-        self.nis += NIS_MEMORY * (min(square, NIS_CAP) - self.nis)
-        if square > gate * gate:
+        squares = e * e / variance
+        nis = self._nis[:count]
+        nis += NIS_MEMORY * (np.minimum(squares, NIS_CAP) - nis)
+        if squares[leader] > gate * gate:
             return False
         scaled = cross / variance[:, None]
         if learn:
@@ -326,7 +337,7 @@ class GapBank:
         if self._corrections % SYMMETRISE_EVERY == 0:
             cov[:] = 0.5 * (cov + cov.transpose(0, 2, 1))
         spread = np.log(variance)
-        self.log_likelihood[:count] -= 0.5 * (e * e / variance + spread)
+        self.log_likelihood[:count] -= 0.5 * (squares + spread)
         self._paid[:count] += 0.5 * (spread - log(self.noise_var))
         if self._corrections % ELECT_EVERY == 0:
             self.elect()

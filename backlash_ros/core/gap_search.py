@@ -27,10 +27,14 @@ SMALLEST_GAP = 5e-4  # of the widest gap the bounds allow
 FINE = 7  # hypotheses of a fine bank
 REACH = 2.0  # standard deviations of the gap that a fine bank reaches to either side
 LARGEST_SPREAD = 0.3  # of the gap: the standard deviation is not to be trusted beyond
+NARROW = 0.04  # width of a fine bank, as a share of the gap, that needs no better decision
+# Gaps tried beyond the first or last one of a fine bank, if that one is the most likely, in terms
+# of it.
+OUTWARD, INWARD = 1.9, 0.9
 LOST = 3.0  # standard deviations between read and estimated gap from which both are tried
 CAPACITY = 16384  # samples kept for replays
 REPLAY_SPEED = 5  # recorded samples per new one
-FIRST_REPLAY_SPEED = 8  # while no estimate is known at all
+FIRST_REPLAY_SPEED = 8  # while no estimate is known, or none that may be used
 LAST_REPLAY = CAPACITY * (REPLAY_SPEED - 1) // REPLAY_SPEED  # later ones would not catch up
 GROWTH_EARLY, GROWTH_LATE = 1.3, 4.0  # of the record between two replays
 EARLY = 400  # samples during which a misread record still shows in the estimate
@@ -125,6 +129,18 @@ class GapSearch:
         likelihood = coarse.log_likelihood
         return bool(likelihood[coarse.leader] - likelihood[0] > NULL_MARGIN)
 
+    @property
+    def undecided(self) -> bool:
+        """Whether the gap may well be none of those that the fine bank tells apart.
+
+        Then its first or its last hypothesis is the most likely one: it fits the newest samples
+        with crossings that are wrong, and is sure of them.
+        """
+        fine = self.fine
+        if fine is None or self._settled or 0 < fine.leader < fine.active - 1:
+            return False
+        return bool(fine.gaps[-1] - fine.gaps[0] > NARROW * fine.gaps[-1])
+
     def forget_record(self) -> None:
         """Go on with what the banks know; nothing is read again."""
         self.samples, self._replay = max(self.samples, CAPACITY), None
@@ -198,7 +214,8 @@ class GapSearch:
 
     def _plan_replay(self) -> None:
         """Start a fine bank around the best estimate there is, when it is worth it."""
-        if self.samples < self._earliest or not self.excited:
+        due = self.samples >= self._earliest
+        if not (due or (self.undecided and self.samples % PAUSE == 0)) or not self.excited:
             return
         if self.fine is not None and self.samples >= LAST_REPLAY:
             return
@@ -212,7 +229,8 @@ class GapSearch:
             self._inherited = None
         bank.elect()
         best = bank.leader
-        self._earliest = self.samples + PAUSE
+        if due:
+            self._earliest = self.samples + PAUSE
         found = bank.found()
         if found is None or not self.precise(found, REPLAY_PRECISION):
             return
@@ -228,14 +246,17 @@ class GapSearch:
         growth = GROWTH_EARLY if early else GROWTH_LATE
         self._earliest = int(growth * self.samples)
         gaps = fine_gaps(found, FINE)
-        if abs(found.gap - read_with[best]) > LOST * found.std_gap:
+        if bank is self.fine and self.undecided:
+            gaps = np.union1d(gaps, beyond(read_with, best))
+        elif abs(found.gap - read_with[best]) > LOST * found.std_gap:
             gaps = np.union1d(gaps, bracket(read_with, best))
         self._replay, self._replayed = self._bank(gaps, with_null=False, at=found), 0
 
     def _advance_replay(self) -> None:
         replay = self._replay
         assert replay is not None
-        speed = REPLAY_SPEED if self.fine is not None else FIRST_REPLAY_SPEED
+        hurry = self.fine is None or self.undecided
+        speed = FIRST_REPLAY_SPEED if hurry else REPLAY_SPEED
         end = min(self._replayed + speed, self.samples)
         for k in range(self._replayed, end):
             _advance(replay, float(self._y[k]), float(self._v[k]))
@@ -307,6 +328,12 @@ def bracket(gaps: Array, leader: int) -> Array:
     shares = np.array([-0.7, -0.35, 0.0, 0.35, 0.7])
     reach = np.where(shares < 0.0, gaps[leader] - low, high - gaps[leader])
     return np.asarray(gaps[leader] + shares * reach)
+
+
+def beyond(gaps: Array, leader: int) -> Array:
+    """Gaps on the far side of a leader that is the first or the last one."""
+    reach = (1.0 / OUTWARD, 1.0 / INWARD) if leader == 0 else (INWARD, OUTWARD)
+    return np.asarray(gaps[leader] * np.geomspace(*reach, FINE))
 
 
 def fine_gaps(found: Crossings, count: int) -> Array:

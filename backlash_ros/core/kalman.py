@@ -197,7 +197,7 @@ class KalmanEstimator:
         found = watched.found
         if found is None or found.std_m > PRECISE_SLOPE * found.m:
             return None
-        if not watched.search.precise(found, PRECISE_GAP):
+        if not watched.search.precise(found, PRECISE_GAP) or watched.search.undecided:
             return None
         values = (found.m, found.c_r, found.c_l)
         slack = (found.std_m, found.std_c_r, found.std_c_l)
@@ -318,7 +318,8 @@ class _Watched:
         self._calm.append(fine.innovation**2 / fine.innovation_var)
         if len(self._calm) == PROVEN:
             if sum(self._calm) < NIS_TRUSTED * PROVEN:
-                self.contradicted, fine.nis = False, 1.0
+                self.contradicted = False
+                fine.forgive()
             self._calm.clear()
 
     def _count(self, consistent: bool) -> None:
