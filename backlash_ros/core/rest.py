@@ -29,6 +29,9 @@ Array = NDArray[np.float64]
 # scales x so that |x| is the energy of the free response of y over some 50 samples: 7 stands for
 # an error of the size of the noise).
 TOLERANCE = 21.0
+# The same for the first samples of a rest, in which y is brought as close as the noise allows.
+# Later only a drift is worth a step.
+CLOSE, SETTLING = 7.0, 200
 DOUBT = 2.0  # the same in standard deviations of x, where that is more
 SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
 ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
@@ -65,6 +68,7 @@ class Rest:
         self._model, self._gain, self._noise_std = model, gain, noise_std
         self._reach = 0.0  # largest |x*| so far
         self._limit = 0.0  # tolerance in use
+        self._rested = 0  # samples for which the trajectory has rested
         self._pull = 0.0  # u - u* with which leading back began
         self._push = float(np.linalg.norm(_response_to_step(model, HORIZON)))
 
@@ -72,6 +76,7 @@ class Rest:
         """Take over where another one of the same model rests."""
         self.mode, self.u_d, self.caution = other.mode, other.u_d, other.caution
         self._reach, self._limit, self._pull = other._reach, other._limit, other._pull
+        self._rested = other._rested
 
     def decide(
         self, situation: Situation, window: Sequence[float], x: Array, ideal: float,
@@ -82,20 +87,24 @@ class Rest:
         window: r from now on. x, ideal: x* and u*. deviation: x_hat - x*.
         """
         self._reach = max(self._reach, sqrt(float(x @ x)))
-        tolerance = max(TOLERANCE * self._noise_std, SHARE * self._reach)
+        least = SHARE * self._reach
+        tolerance = max(TOLERANCE * self._noise_std, least)
         motion = self._model.a @ x + self._model.b * ideal - x
         before = self.mode
         if (
             max(window) - min(window) > self._noise_std
             or sqrt(float(motion @ motion)) > STEADY * tolerance
         ):
-            self.mode = Mode.FOLLOW
+            self.mode, self._rested = Mode.FOLLOW, 0
         elif situation.x_cov is None:
             off = abs(situation.y - window[0]) > OFF * self._noise_std
             self.mode = Mode.FOLLOW if off else Mode.HOLD
             if before is Mode.FOLLOW:
                 self.u_d, self.caution = ideal, 0.0
         else:
+            self._rested += 1
+            if self._rested < SETTLING:
+                tolerance = max(CLOSE * self._noise_std, least)
             doubt = DOUBT * sqrt(max(float(np.trace(situation.x_cov)), 0.0))
             self._limit = max(tolerance, doubt)
             self.mode = self._mode_for(deviation)
