@@ -136,7 +136,7 @@ def estimator_constants() -> str:
          'gap_search.py'),
         ('record: longest, in samples', f'{s.CAPACITY}', 'gap_search.py'),
         ('recorded samples read again with each new one', f'{s.REPLAY_SPEED}', 'gap_search.py'),
-        ('... while there is none that may be published', f'{s.FIRST_REPLAY_SPEED}', 'gap_search.py'),
+        ('... while none may be published', f'{s.FIRST_REPLAY_SPEED}', 'gap_search.py'),
         ('outlier: innovation beyond, in standard deviations', f'{k.GATE:g}', 'kalman.py'),
         ('contradiction: outliers in a row', f'{k.REFUSED_IN_A_ROW}', 'kalman.py'),
         ('contradiction: mean normalised innovation squared above', f'{k.NIS_LIMIT:g}',

@@ -234,10 +234,13 @@ class GapBank:
         before = self.active
         if before < len(self.gaps):
             self._start(v)
-            self.log_likelihood[self.active:] -= 0.5 * (1.0 + log(self.noise_var))
         if before:
             self._play(before, v)
             self._propagate(before)
+
+    def _charge_late_starters(self) -> None:
+        """Let hypotheses that have not started pay for a sample what a true model would."""
+        self.log_likelihood[self.active:] -= 0.5 * (1.0 + log(self.noise_var))
 
     def _start(self, v: float) -> None:
         """Start the hypotheses whose whole gap v has swung over with this sample."""
@@ -310,6 +313,7 @@ class GapBank:
         self._y = y
         count, n = self.active, self._n
         if not count:
+            self._charge_late_starters()
             return True
         mean, cov = self.mean[:count], self.cov[:count]
         c = self._model.c
@@ -324,6 +328,7 @@ class GapBank:
         nis += NIS_MEMORY * (np.minimum(squares, NIS_CAP) - nis)
         if squares[leader] > gate * gate:
             return False
+        self._charge_late_starters()
         scaled = cross / variance[:, None]
         if learn:
             mean += scaled * e[:, None]

@@ -288,7 +288,9 @@ class _Watched:
         elif search.coarse is not None:
             self._count(search.coarse.nis < NIS_TRUSTED)
         if adapting:
-            self._waiting = (y, v, accepted)
+            # A bank that is contradicted before it has settled must not blind the others.
+            heard = accepted or (self.contradicted and not search.settled)
+            self._waiting = (y, v, heard)
         return accepted
 
     def refine(self) -> None:
