@@ -21,9 +21,10 @@ Array = NDArray[np.float64]
 HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
 WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
-# wrong is contradicted by then. Where nothing was fed back before, feedback hardens step by step
-# until then: y must not go on the way it went.
+# wrong is contradicted by then. Until then feedback hardens step by step.
 TRUSTED_AFTER = 40
+# An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
+SHARP, SHARP_COUNTS = 0.01, 8
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.
@@ -39,10 +40,10 @@ class Tracking:
     which is y_m delayed by the preview window: the delay is what the preview costs. Before the
     first reference has passed the window r is the output at the start, so that nothing jumps.
     While the backlash is unknown, `careful` replaces K, or nothing where it is None: the trajectory
-    itself excites the backlash. Nothing gives way to softer gains with the first estimate.
+    itself excites the backlash. With the first estimate it gives way to softer gains, then to K.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
     softer: gains to replace K with, step by step, while v meets its limits, where full feedback
-    would cycle between them, and while the estimate is new, if `careful` is None.
+    would cycle between them, and while the estimate is new.
     rest: what v does while the trajectory rests. noise_std: of y.
     """
 
@@ -84,7 +85,7 @@ class Tracking:
         ideal -= float(gains.preview @ window)
         deviation = np.zeros(len(self._x)) if first else situation.x_hat - self._x
         trusted = self._is_trusted(situation.estimate, first)
-        if trusted or (self._careful is None and self._trusted_for > 0):
+        if self._trusted_for > 0:
             u_d = ideal - float(self._gain(inverse.limited) @ deviation)
         else:
             u_d = ideal - self._careful_feedback(situation.estimate, deviation, ideal)
@@ -146,7 +147,8 @@ class Tracking:
 
     def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
         # Constants that are given, not learned, are trusted from the start.
-        known = TRUSTED_AFTER if first else self._trusted_for + 1
+        known = TRUSTED_AFTER if first else self._trusted_for
+        known += SHARP_COUNTS if _is_sharp(estimate) else 1
         self._trusted_for = known if _trusted(estimate) else 0
         return self._trusted_for >= TRUSTED_AFTER
 
@@ -174,6 +176,11 @@ class Tracking:
 def _trusted(estimate: Estimate) -> bool:
     # What was learned before a restart says nothing yet about the state of G.
     return estimate.learned and estimate.status not in (Status.ACQUIRING, Status.INCONSISTENT)
+
+
+def _is_sharp(estimate: Estimate) -> bool:
+    gap = estimate.c_r - estimate.c_l
+    return estimate.std_m < SHARP * estimate.m and estimate.std_c_r + estimate.std_c_l < SHARP * gap
 
 
 def cautious_crossings(estimate: Estimate, deviations: float) -> tuple[float, float]:
