@@ -156,7 +156,7 @@ class Rest:
 
 
 def _response_to_step(model: StateModel, samples: int) -> Array:
-    x = np.zeros(model.order)
+    x: Array = np.zeros(model.order)
     for _ in range(samples):
         x = model.a @ x + model.b
     return x
