@@ -127,8 +127,9 @@ def assert_mcap_reader_agrees(
 
 
 def test_stalled_controller_steps_over_what_it_missed_and_still_learns(tmp_path: Path) -> None:
+    # Long enough for the probe, for which nobody waits, to be discovered well before the end.
     parameters = {
-        'samples': 300, 'output_loss': 0.05, 'estimator.use_applied_control': True,
+        'samples': 1000, 'output_loss': 0.05, 'estimator.use_applied_control': True,
     }
     with ros_world(tmp_path) as world:
         probe = world.probe()
