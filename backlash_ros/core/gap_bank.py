@@ -182,8 +182,8 @@ class GapBank:
         weights[:, 0], weights[:, 1], weights[:, 2] = -gaps, 1.0, -1.0
         mismatch = (weights * theta).sum(axis=1)
         variance = ((weights[:, None, :] @ cov)[:, 0, :] * weights).sum(axis=1)
-        variance = np.maximum(variance, 0.0) + (self.tolerance * gaps * theta[:, 0]) ** 2
-        variance = np.maximum(variance, TINY)  # 0 for those that are out
+        # Rounding may leave it below 0, and it is 0 for those that are out.
+        variance = np.maximum(variance, TINY) + (self.tolerance * gaps * theta[:, 0]) ** 2
         score = self.log_likelihood[:self.active].copy()
         score[rows] -= 0.5 * (mismatch**2 / variance + np.log(variance))
         paid = self._paid[rows]

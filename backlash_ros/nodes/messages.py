@@ -23,7 +23,7 @@ KEPT = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 def without_events() -> PublisherEventCallbacks:
     """For publishers that the loop does not depend on: nobody is told of unfit subscribers."""
-    # In every pass the executor looks at every event of every publisher; that delays the command.
+    # At every look at what is not urgent the executor goes through every event of every publisher.
     return PublisherEventCallbacks(use_default_callbacks=False)
 
 

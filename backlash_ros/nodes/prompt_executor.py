@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.guard_condition import GuardCondition
@@ -16,13 +16,6 @@ from rclpy.subscription import Subscription
 # Services and events may wait so long; timers are looked after when they are due.
 LOOK_NS = 20_000_000
 S_TO_NS = 1e9
-
-
-class _Served(NamedTuple):
-    """A subscription, and whether its callback wants to know time stamp and number as well."""
-
-    subscription: Subscription
-    with_info: bool
 
 
 class PromptExecutor(SingleThreadedExecutor):
@@ -37,9 +30,9 @@ class PromptExecutor(SingleThreadedExecutor):
     def __init__(self, node: Node) -> None:
         super().__init__(context=node.context)
         self._served_node = node
-        self._subscriptions: list[Subscription] = []
+        # Whether the callback wants to know time stamp and number as well.
+        self._subscriptions: dict[Subscription, bool] = {}
         self._guards: list[GuardCondition] = []
-        self._served: list[_Served] = []
         self._wait_set: Any = None
         self._look_at_ns = 0
         self.add_node(node)
@@ -80,7 +73,7 @@ class PromptExecutor(SingleThreadedExecutor):
             if guard.handle.pointer in ready:
                 guard.callback()
         ready = wait_set.get_ready_entities('subscription')
-        for subscription, with_info in self._served:
+        for subscription, with_info in self._subscriptions.items():
             if subscription.handle.pointer in ready:
                 taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
                 if taken is not None:
@@ -90,10 +83,10 @@ class PromptExecutor(SingleThreadedExecutor):
         """Make a wait set for what the node has now."""
         subscriptions = list(self._served_node.subscriptions)
         guards = list(self._served_node.guards)
-        if subscriptions == self._subscriptions and guards == self._guards:
+        if subscriptions == list(self._subscriptions) and guards == self._guards:
             return
-        self._subscriptions, self._guards = subscriptions, guards
-        self._served = [_Served(each, _wants_info(each.callback)) for each in subscriptions]
+        self._subscriptions = {each: _wants_info(each.callback) for each in subscriptions}
+        self._guards = guards
         self._wait_set = rclpy_implementation.WaitSet(
             len(subscriptions), len(guards), 0, 0, 0, 0, self._served_node.context.handle
         )
