@@ -20,13 +20,16 @@ class Loop:
         self.plant, self._reference = build_plant(p), build_reference(p)
         self._period = p.real('sample_period')
 
-    def run(self, controller: AdaptiveController, samples: int) -> list[Estimate]:
+    def run(
+        self, controller: AdaptiveController, samples: int, deaf: int = 0,
+    ) -> list[Estimate]:
+        """deaf: samples during which no v reaches the plant."""
         estimates = []
-        for _ in range(samples):
+        for k in range(samples):
             y_m = self._reference(self.plant.sample * self._period)
             step = controller.step(self.plant.measure(), y_m)
             controller.refine()
-            self.plant.step(step.v)
+            self.plant.step(step.v if k >= deaf else 0.0)
             estimates.append(step.estimate)
         return estimates
 
@@ -82,3 +85,24 @@ def test_estimator_that_is_held_before_it_knows_anything_learns_afterwards() -> 
     assert {e.m for e in loop.run(controller, 100)} == {0.696}
     controller.estimator.adapting = True
     assert errors(loop.run(controller, 400)[-1:])[0] < 0.02
+
+
+@pytest.mark.parametrize('structure', ['proportional', 'tracking'])
+@pytest.mark.parametrize('deaf', [5, 25, 150])
+def test_driver_that_does_not_hear_v_at_first_spoils_nothing(structure: str, deaf: int) -> None:
+    p = Parameters({'structure': structure, 'output_noise_std': 1e-3})
+    learned = Loop(p).run(build_controller(p), 400)[-1]
+    loop = Loop(p.replaced({'seed': 3, 'backlash.initial_u': 1.0}))
+    controller = build_controller(p, learned)
+    after = loop.run(controller, 500, deaf)
+    assert errors(after).max() < 0.06
+    assert after[-1].status == Status.TRACKING
+    assert errors(after[-1:])[0] < 0.01
+
+
+def test_what_was_learned_is_held_while_the_data_contradict_it() -> None:
+    p = Parameters({'output_noise_std': 1e-3})
+    learned = Loop(p).run(build_controller(p), 400)[-1]
+    after = Loop(p).run(build_controller(p, learned), 300, deaf=300)
+    assert after[-1].status == Status.INCONSISTENT
+    assert {(e.m, e.c_r, e.c_l) for e in after} == {(learned.m, learned.c_r, learned.c_l)}

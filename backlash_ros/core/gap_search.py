@@ -82,6 +82,8 @@ class GapSearch:
         self.fine: GapBank | None = None
         self.coarse: GapBank | None = None
         self.samples = 0
+        # What was learned before is neither improved nor replaced until the data agree with it.
+        self.on_trial = inherited is not None
         self._settings = settings
         self._widest = settings.bounds.c_r[1] - settings.bounds.c_l[0]
         self._inherited = None if inherited is None else _aged(inherited)
@@ -141,6 +143,11 @@ class GapSearch:
             return False
         return bool(fine.gaps[-1] - fine.gaps[0] > NARROW * fine.gaps[-1])
 
+    @property
+    def belied(self) -> bool:
+        """Whether some other gap explains the data better than what was learned before."""
+        return self.on_trial and self.fine is not None and self._behind(self.fine)
+
     def forget_record(self) -> None:
         """Go on with what the banks know; nothing is read again."""
         self.samples, self._replay = max(self.samples, CAPACITY), None
@@ -161,7 +168,7 @@ class GapSearch:
             return  # after lost samples v is late already
         if self._replay is not None:
             self._advance_replay()
-        else:
+        elif not self.on_trial:
             self._plan_replay()
 
     def _begin(self) -> None:

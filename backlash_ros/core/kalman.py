@@ -110,6 +110,13 @@ class KalmanEstimator:
             self.outliers += 1
         if not self._adapting:
             self._challenger = None
+        elif watched.failed_trial:
+            self._challenge(y, interval.v)
+            if self._search is watched:
+                # The driver may not have heard v yet, which says nothing of the backlash.
+                self._search, self._confirmed = self._new_search(self.estimate), 0
+        elif watched.search.on_trial and self._challenger is not None:
+            self._challenger.add(y, interval.v, adapting=True)
         elif not (self._confirmed or (self._known and watched.contradicted)):
             self._restart_in_vain(watched)
         elif watched.contradicted:
@@ -226,6 +233,9 @@ class KalmanEstimator:
             return
         self._known = True
         self._confirmed += 1
+        if watched.search.on_trial:
+            self.estimate = replace(self.estimate, status=Status.TRACKING)
+            return
         m, c_r, c_l = self._bounds.project(found.m, found.c_r, found.c_l)
         self.estimate = Estimate(
             m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
@@ -236,7 +246,8 @@ class KalmanEstimator:
         watched = self._search
         if self._lost_in_a_row >= NO_DATA_AFTER:
             return Status.NO_DATA
-        if self._known and watched.contradicted:
+        tried_again = watched.search.on_trial and self._challenger is not None
+        if self._known and (watched.contradicted or tried_again):
             return Status.INCONSISTENT
         fine = watched.search.fine
         if fine is None:
@@ -272,6 +283,11 @@ class _Watched:
             return None
         return fine.found()
 
+    @property
+    def failed_trial(self) -> bool:
+        """Whether the data contradict what was learned before from the first sample on."""
+        return self.search.on_trial and (self.contradicted or self.search.belied)
+
     def add(self, y: float | None, v: float, adapting: bool) -> bool:
         """Take in a sample; return False if y was refused as an outlier."""
         self.refine()
@@ -280,7 +296,9 @@ class _Watched:
         if fine is not None:
             fine.predict(v)
             if y is not None:
-                learn = fine.since_motion <= search.memory and not self.contradicted and adapting
+                learn = adapting and not (
+                    search.on_trial or self.contradicted or fine.since_motion > search.memory
+                )
                 accepted = fine.correct(y, GATE if self._proven else inf, learn)
                 self._judge(fine, accepted)
             if search.settled and fine.turned and adapting:
@@ -300,6 +318,8 @@ class _Watched:
             self._waiting = None
 
     def _judge(self, fine: GapBank, accepted: bool) -> None:
+        if not fine.active:
+            return
         self._refused = 0 if accepted else self._refused + 1
         if self.contradicted:
             self._recover(fine, accepted)
@@ -311,6 +331,8 @@ class _Watched:
             self.contradicted = True
             self._calm.clear()
         self._count(not self.contradicted and accepted and fine.nis < NIS_TRUSTED)
+        if self.search.excited and self.consistent_for >= PROVEN:
+            self.search.on_trial = False
 
     def _recover(self, fine: GapBank, accepted: bool) -> None:
         """End a contradiction when a run of samples fits again: the bad data are over."""
