@@ -379,19 +379,14 @@ def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     options = parse_options(remove_ros_args(['', *arguments])[1:])
-    nodes: list[CheckDriverNode] = []
-
-    def make_node() -> CheckDriverNode:
-        nodes.append(CheckDriverNode(options))
-        return nodes[-1]
-
     with tempfile.TemporaryDirectory() as folder:
         files = [] if options.config is None else parameter_files(options.config, Path(folder))
         given = ['--ros-args'] if files else []
         for file in files:
             given += ['--params-file', file]
-        code = run(EXECUTABLE, make_node, [*given, *ros_arguments(arguments)])
-    return nodes[-1].exit_code if nodes else code
+        return run(
+            EXECUTABLE, lambda: CheckDriverNode(options), [*given, *ros_arguments(arguments)]
+        )
 
 
 if __name__ == '__main__':

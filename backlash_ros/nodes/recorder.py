@@ -32,7 +32,7 @@ from backlash_ros.nodes.driver_io import STYLES, output_qos
 from backlash_ros.nodes.events import ENABLED, emit
 from backlash_ros.nodes.messages import DiagnosticsPublisher, stamp_ns_of
 from backlash_ros.nodes.sample_counter import UNNUMBERED
-from backlash_ros.nodes.spin import BAD_INPUT, ProcessNode, run
+from backlash_ros.nodes.spin import BAD_INPUT, FAILED, ProcessNode, run
 
 DEPTH = 10_000  # messages that may wait while the disk is slow
 PROGRESS_PERIOD_S = 0.2
@@ -41,7 +41,6 @@ DIAGNOSTICS_PERIOD_S = 1.0
 # Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
 DRAIN_S = 0.3
 IDLE_SPINS = 5  # without a message, timers being served in between
-FAILED = 1
 
 # All but those of the driver; y comes last of all: it starts the loop.
 OF_THE_LOOP: dict[str, type[Any]] = {
@@ -207,6 +206,7 @@ class RecorderNode(ProcessNode):
                 f'recording to {bag.path} stopped: {error}; saved are {bag.saved} messages of '
                 f'{bag.saved_ns * 1e-9:.1f} s; all else goes on. Make room, then: {CURE} {bag.path}'
             )
+            self.exit_code = FAILED
             self.log.error(self.failure)
             emit('recording_stopped', reason=self.failure)
             self._diagnose()
@@ -298,14 +298,7 @@ def main(args: list[str] | None = None) -> int:
         return repair_command(options.repair)
     if {'-h', '--help'} & set(others):
         print(f'{RECORDER} --repair BAG: make a bag readable that was never closed, or is damaged')
-    nodes: list[RecorderNode] = []
-
-    def make_node() -> RecorderNode:
-        nodes.append(RecorderNode())
-        return nodes[0]
-
-    code = run(RECORDER, make_node, args)
-    return FAILED if nodes and nodes[0].failure else code
+    return run(RECORDER, RecorderNode, args)
 
 
 if __name__ == '__main__':

@@ -28,11 +28,13 @@ from rclpy.utilities import remove_ros_args
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import PARAMETERS
 from backlash_ros.nodes.declare import declare_parameters
+from backlash_ros.nodes.goodbye import exit_at_the_latest
 from backlash_ros.nodes.prompt_executor import PromptExecutor
 
-DONE, BAD_INPUT = 0, 2
+DONE, FAILED, BAD_INPUT = 0, 1, 2
 LOOK_S = 0.01  # between two looks at a condition of start-up
 AGAIN_S = 0.1  # between two requests to stop, until the node has heard one
+GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node in a second
 REMIND_S = 5.0  # between two lines that say what start-up waits for
 # A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
 NAP_NS = 3_000_000
@@ -54,6 +56,7 @@ class ProcessNode(Node):
         self.settings = declare_parameters(self, parameters_of or executable)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.stopping = False
+        self.exit_code = DONE
         self.stop_request = self.create_guard_condition(self._stop)
 
     def listen(
@@ -126,9 +129,9 @@ def spin_paced(
 
 
 def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
-    """Run a node until SIGINT or SIGTERM; return the exit code.
+    """Run a node until its work ends, by itself or by SIGINT or SIGTERM; return the exit code.
 
-    0 after a signal, 2 for bad input, told in one line on stderr. Any other exception passes.
+    That of the node, or 2 for bad input, told in one line on stderr. Any other exception passes.
     """
     signals = _SignalPipe()
     reason = _initialise(args)
@@ -141,6 +144,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
         except (ParameterError, NameValidationException) as error:
             return _refuse(executable, str(error))
         signals.stop_at_arrival(node)
+        code = FAILED  # unless the work comes to its end
         try:
             executor = PromptExecutor(node)
             # A full collection would look through all of numpy and scipy and cost many samples.
@@ -148,13 +152,17 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
             gc.freeze()
             with contextlib.suppress(ExternalShutdownException):
                 node.work(executor)
+            code = DONE
         finally:
             node.finish()
-            executor.shutdown()
-            Node.destroy_node(node)
+            code = node.exit_code or code
+            with exit_at_the_latest(GOODBYE_S, code):
+                executor.shutdown()
+                Node.destroy_node(node)
+                rclpy.try_shutdown()
     finally:
         rclpy.try_shutdown()
-    return DONE
+    return code
 
 
 class _SignalPipe:
