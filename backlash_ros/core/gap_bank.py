@@ -37,6 +37,7 @@ IMPOSSIBLE = -1e12  # log-likelihood of a hypothesis that is out
 TINY = 1e-300  # keeps a division finite
 ELECT_EVERY = 4  # corrections between two looks for the most likely hypothesis
 NIS_MEMORY = 1.0 / 40.0  # the mean of a true hypothesis is 1, its standard deviation then 0.16
+LATE_CAP = 9.0  # largest normalised innovation squared that late starters pay for
 NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
 
 
@@ -238,9 +239,14 @@ class GapBank:
             self._play(before, v)
             self._propagate(before)
 
-    def _charge_late_starters(self) -> None:
-        """Let hypotheses that have not started pay for a sample what a true model would."""
-        self.log_likelihood[self.active:] -= 0.5 * (1.0 + log(self.noise_var))
+    def _charge_late_starters(self, square: float) -> None:
+        """Let hypotheses that have not started pay for a sample what a true model would.
+
+        square: normalised innovation squared of the leader, which is taken for true: so they
+        share its luck.
+        """
+        square = min(square, LATE_CAP)
+        self.log_likelihood[self.active:] -= 0.5 * (square + log(self.noise_var))
 
     def _start(self, v: float) -> None:
         """Start the hypotheses whose whole gap v has swung over with this sample."""
@@ -313,7 +319,7 @@ class GapBank:
         self._y = y
         count, n = self.active, self._n
         if not count:
-            self._charge_late_starters()
+            self._charge_late_starters(1.0)
             return True
         mean, cov = self.mean[:count], self.cov[:count]
         c = self._model.c
@@ -328,7 +334,7 @@ class GapBank:
         nis += NIS_MEMORY * (np.minimum(squares, NIS_CAP) - nis)
         if squares[leader] > gate * gate:
             return False
-        self._charge_late_starters()
+        self._charge_late_starters(float(squares[leader]))
         scaled = cross / variance[:, None]
         if learn:
             mean += scaled * e[:, None]

@@ -45,6 +45,7 @@ START_GATE = 8.0  # standard deviations; before the fine bank stands only gross 
 PATIENCE = 2  # outliers in a row that the coarse bank refuses before it believes them
 NULL_MARGIN = 15.0  # log-likelihood by which a gap must beat "v never engaged"
 COARSE_MARGIN = 10.0  # log-likelihood by which the fine bank may not fall behind the coarse one
+DOUBT_MARGIN = 3.0  # the same for an estimate that may be used; a refined one is ahead by some 5
 REPLAY_PRECISION = 0.5  # of the gap: known better, it is worth a fine bank
 NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
 REPLAY_MARGIN = 5.0  # log-likelihood by which a bank that read the record afresh may be worse
@@ -92,6 +93,7 @@ class GapSearch:
         self._replayed = 0
         self._read_with: Array = np.empty(0)  # gaps with which the fine bank read the record
         self._fine_since = 0
+        self._behind_by = -inf  # log-likelihood by which the coarse bank leads over the fine one
         self._earliest = 0
         self._noise_floor = 0.0
         self._refused = 0
@@ -118,9 +120,12 @@ class GapSearch:
         return self.samples >= LAST_REPLAY and self.fine is None and not self.excited
 
     def precise(self, found: Crossings, share: float) -> bool:
-        """Whether the gap is known to a share of itself, or is as good as none against v."""
-        known = found.std_gap < share * found.gap
-        return known or (self.coarse is not None and found.std_gap < NO_GAP * self.coarse.swing)
+        """Whether the gap is known to a share of itself, or well enough for this v."""
+        return found.std_gap < share * found.gap or self.negligible(found)
+
+    def negligible(self, found: Crossings) -> bool:
+        """Whether what is not known of the gap is as good as nothing against the swing of v."""
+        return self.coarse is not None and found.std_gap < NO_GAP * self.coarse.swing
 
     @property
     def excited(self) -> bool:
@@ -138,10 +143,20 @@ class GapSearch:
         Then its first or its last hypothesis is the most likely one: it fits the newest samples
         with crossings that are wrong, and is sure of them.
         """
-        fine = self.fine
-        if fine is None or self._settled or 0 < fine.leader < fine.active - 1:
+        return self.fine is not None and not self._settled and self._is_undecided(self.fine)
+
+    def _is_undecided(self, bank: GapBank) -> bool:
+        if 0 < bank.leader < bank.active - 1:
             return False
-        return bool(fine.gaps[-1] - fine.gaps[0] > NARROW * fine.gaps[-1])
+        found = bank.found()
+        if found is not None and self.negligible(found):
+            return False
+        return bool(bank.gaps[-1] - bank.gaps[0] > NARROW * bank.gaps[-1])
+
+    @property
+    def doubted(self) -> bool:
+        """Whether other gaps explain the data about as well as the fine bank, or better."""
+        return self._behind_by > DOUBT_MARGIN and not self._settled
 
     @property
     def belied(self) -> bool:
@@ -209,15 +224,18 @@ class GapSearch:
         else:
             coarse.correct(y)
         fine = self.fine
-        if fine is not None and fine.nis < NIS_SETTLED and not self._behind(fine):
+        if fine is not None and not self._behind(fine) and fine.nis < NIS_SETTLED:
             self._settled = self.samples - self._fine_since > SETTLED
 
     def _behind(self, fine: GapBank) -> bool:
-        """Whether the coarse bank explains the data better than the fine one."""
+        """Whether the coarse bank explains the data better than this one."""
         coarse = self.coarse
         if self._settled or coarse is None or not fine.active:
             return False
-        return coarse.elect() - fine.elect() > COARSE_MARGIN
+        by = coarse.elect() - fine.elect()
+        if fine is self.fine:
+            self._behind_by = by
+        return by > COARSE_MARGIN
 
     def _plan_replay(self) -> None:
         """Start a fine bank around the best estimate there is, when it is worth it."""
@@ -278,10 +296,12 @@ class GapSearch:
             self._earliest = self.samples  # refuted while it was read: no reason to wait
         if fine is None or self._behind(fine):
             self._fine_since = self.samples
+        elif self._is_undecided(replay) and not self._is_undecided(fine):
+            return  # it would only raise doubts
         elif replay.elect() < fine.elect() - REPLAY_MARGIN or fine.nis < NIS_SETTLED < replay.nis:
             return  # reading the record afresh explained it worse
-        replay.elect()
         self.fine, self._read_with = replay, replay.gaps
+        self._behind(replay)
 
     def _bank(self, gaps: Array, with_null: bool, at: Crossings | None = None) -> GapBank:
         s, known = self._settings, None if with_null else self._inherited

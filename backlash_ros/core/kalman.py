@@ -29,6 +29,7 @@ RESTART_AFTER = 150  # inconsistent samples after which a search begins afresh
 RESTART_IN_VAIN = 50  # the same while no estimate is known, so that nothing good can be lost
 NO_DATA_AFTER = 20  # lost samples in a row that are worth a status
 UNDECIDED_AFTER = 100  # samples after which a search says that nothing usable comes out
+LONGEST_DOUBT = 40  # samples for which a first estimate may be held back
 PRECISE_SLOPE, PRECISE_GAP = 0.2, 0.3  # relative deviations below which an estimate is published
 ADOPTED_SLOPE, ADOPTED_GAP = 0.008, 0.05  # those below which it replaces an older one at once
 ADOPTED_AFTER = 300  # consistent samples after which it does so in any case
@@ -227,12 +228,15 @@ class KalmanEstimator:
             found = self._adoptable(watched)  # it contradicts what was learned before
         else:
             found = self._usable(watched)
+            if found is not None and not self._confirmed and watched.hesitates(found):
+                found = None
         if found is None:
             if self.estimate.status != status:
                 self.estimate = replace(self.estimate, status=status)
             return
         self._known = True
         self._confirmed += 1
+        watched.proven = True  # whoever is relied upon may be contradicted
         if watched.search.on_trial:
             self.estimate = replace(self.estimate, status=Status.TRACKING)
             return
@@ -268,10 +272,11 @@ class _Watched:
         self.search = search
         self.consistent_for = 0  # samples
         self.inconsistent_for = 0  # samples
+        self.hesitated = 0  # samples for which there was an estimate that was not used
         self.outside_for = 0  # samples for which a precise estimate lay outside the bounds
         self.contradicted = False
         self._waiting: tuple[float | None, float, bool] | None = None
-        self._proven = search.inherits  # what was learned before is believed until contradicted
+        self.proven = search.inherits  # what was learned before is believed until contradicted
         self._refused = 0  # in a row
         self._calm: list[float] = []  # normalised innovations squared since a contradiction
 
@@ -282,6 +287,14 @@ class _Watched:
         if fine is None or not fine.active or fine.nis > NIS_TRUSTED:
             return None
         return fine.found()
+
+    def hesitates(self, found: Crossings) -> bool:
+        """Whether a first estimate had better wait, as it may be far off: not for ever."""
+        search, fine = self.search, self.search.fine
+        if self.hesitated >= LONGEST_DOUBT or search.negligible(found) or fine is None:
+            return False
+        self.hesitated += 1
+        return search.doubted or fine.innovation**2 > GATE**2 * fine.innovation_var
 
     @property
     def failed_trial(self) -> bool:
@@ -299,7 +312,7 @@ class _Watched:
                 learn = adapting and not (
                     search.on_trial or self.contradicted or fine.since_motion > search.memory
                 )
-                accepted = fine.correct(y, GATE if self._proven else inf, learn)
+                accepted = fine.correct(y, GATE if self.proven else inf, learn)
                 self._judge(fine, accepted)
             if search.settled and fine.turned and adapting:
                 self._follow(fine)
@@ -313,9 +326,15 @@ class _Watched:
 
     def refine(self) -> None:
         """Let the search take in the newest sample."""
-        if self._waiting is not None:
-            self.search.add(*self._waiting)
-            self._waiting = None
+        if self._waiting is None:
+            return
+        before = self.search.fine
+        self.search.add(*self._waiting)
+        self._waiting = None
+        fine = self.search.fine
+        if fine is not None and fine is not before and fine.nis < NIS_TRUSTED:
+            # What was held against the bank before says nothing of this one.
+            self.contradicted, self.inconsistent_for, self._refused = False, 0, 0
 
     def _judge(self, fine: GapBank, accepted: bool) -> None:
         if not fine.active:
@@ -324,7 +343,7 @@ class _Watched:
         if self.contradicted:
             self._recover(fine, accepted)
         elif (
-            self._refused >= REFUSED_IN_A_ROW or (self._proven and fine.nis > NIS_LIMIT)
+            self._refused >= REFUSED_IN_A_ROW or (self.proven and fine.nis > NIS_LIMIT)
             # An estimate that never was consistent with the data is not to be called so.
             or self.inconsistent_for >= RESTART_AFTER
         ):
@@ -349,7 +368,7 @@ class _Watched:
     def _count(self, consistent: bool) -> None:
         self.consistent_for = self.consistent_for + 1 if consistent else 0
         self.inconsistent_for = 0 if consistent else self.inconsistent_for + 1
-        self._proven = self._proven or (
+        self.proven = self.proven or (
             self.search.fine is not None and self.consistent_for >= PROVEN
         )
 

@@ -19,7 +19,7 @@ from backlash_ros.core.structure import Command, Situation
 Array = NDArray[np.float64]
 
 HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
-WIDENING = 1.01  # per sample, of the bound on feedback while the backlash is unknown
+WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is unknown
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
 # wrong is contradicted by then. Until then feedback hardens step by step.
 TRUSTED_AFTER = 40
