@@ -161,7 +161,7 @@ class GapSearch:
     @property
     def belied(self) -> bool:
         """Whether some other gap explains the data better than what was learned before."""
-        return self.on_trial and self.fine is not None and self._behind(self.fine)
+        return self.on_trial and self._behind_by > COARSE_MARGIN
 
     def forget_record(self) -> None:
         """Go on with what the banks know; nothing is read again."""

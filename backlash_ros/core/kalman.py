@@ -272,7 +272,7 @@ class _Watched:
         self.search = search
         self.consistent_for = 0  # samples
         self.inconsistent_for = 0  # samples
-        self.hesitated = 0  # samples for which there was an estimate that was not used
+        self._hesitated = 0  # samples for which there was an estimate that was not used
         self.outside_for = 0  # samples for which a precise estimate lay outside the bounds
         self.contradicted = False
         self._waiting: tuple[float | None, float, bool] | None = None
@@ -291,9 +291,9 @@ class _Watched:
     def hesitates(self, found: Crossings) -> bool:
         """Whether a first estimate had better wait, as it may be far off: not for ever."""
         search, fine = self.search, self.search.fine
-        if self.hesitated >= LONGEST_DOUBT or search.negligible(found) or fine is None:
+        if self._hesitated >= LONGEST_DOUBT or search.negligible(found) or fine is None:
             return False
-        self.hesitated += 1
+        self._hesitated += 1
         return search.doubted or fine.innovation**2 > GATE**2 * fine.innovation_var
 
     @property
