@@ -22,6 +22,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from backlash_ros.stale_ports import remove_stale_ports
 from backlash_ros.tools.processes import child_environment, free_domain
 
 DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
@@ -97,6 +98,7 @@ class Probe:
     """A node of the test: it publishes, and keeps what it hears."""
 
     def __init__(self, domain: int) -> None:
+        remove_stale_ports()  # what tests that kill processes leave
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=domain)
         self.node = Node('probe', context=self._context)

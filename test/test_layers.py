@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = 'backlash_ros'
-SHARED = {PACKAGE, f'{PACKAGE}.topics', f'{PACKAGE}.files'}
+SHARED = {PACKAGE, *(f'{PACKAGE}.{name}' for name in ('files', 'stale_ports', 'topics'))}
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
