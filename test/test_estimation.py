@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from math import sqrt
 from pathlib import Path
 
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.estimator import Status
+from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.gap_search import CAPACITY
 from backlash_ros.core.parameters import Parameters
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
@@ -60,6 +63,30 @@ def test_random_plants_gaps_and_first_guesses_end_within_two_per_cent() -> None:
     kept = [r for r in results if r.bound.max() <= 0.005]
     assert len(kept) >= 6
     assert [r for r in kept if r.error.max() > 0.02] == []
+
+
+def run_with_search_at(search_at: Callable[[int], bool], samples: int) -> Estimate:
+    """The estimate of a controller that has the time to search on at these samples alone."""
+    p = Parameters({'output_noise_std': 1e-3, 'seed': 3})
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    for k in range(samples):
+        step = controller.step(plant.measure(), reference(k * p.real('sample_period')))
+        if search_at(k):
+            controller.refine()
+        plant.step(step.v)
+    return controller.estimator.estimate
+
+
+def test_search_that_has_to_wait_again_and_again_finds_the_gap() -> None:
+    estimate = run_with_search_at(lambda k: k % 5 == 0, 600)
+    assert estimate.status == Status.TRACKING
+    assert (estimate.m, estimate.c_r, estimate.c_l) == pytest.approx(TRUTH, rel=5e-3)
+
+
+def test_record_that_ends_before_it_was_read_is_left_alone() -> None:
+    # A second reading has begun by sample 60; all of the record would take 4000 samples.
+    estimate = run_with_search_at(lambda k: k < 60 or k > CAPACITY, CAPACITY + 4200)
+    assert (estimate.m, estimate.c_r, estimate.c_l) == pytest.approx(TRUTH, rel=5e-3)
 
 
 def test_losing_a_fifth_of_y_costs_no_more_than_its_information() -> None:

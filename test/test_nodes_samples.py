@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -88,6 +89,23 @@ def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
     # y(1) was answered one and a half periods later; y(2) and y(3) are lost, y(4) arrives.
     assert commands.over(3, START_NS + 4 * PERIOD_NS) == [1.0, 2.0, 2.0]
     assert commands.late == 1
+
+
+@pytest.mark.parametrize(('passed_ns', 'late'), [
+    (0, False), (PERIOD_NS // 10, True), (-PERIOD_NS, False), (100 * PERIOD_NS, True),
+])
+def test_command_that_was_under_way_when_its_interval_ended_came_too_late(
+    passed_ns: int, late: bool,
+) -> None:
+    commands = CommandHistory(PERIOD_S)
+    for _ in range(1000):
+        commands.note_transit(passed_ns)
+    commands.publish(1.0, START_NS)
+    commands.publish(2.0, START_NS + PERIOD_NS - PERIOD_NS // 20)
+    assert commands.over(1, START_NS + PERIOD_NS) == ([1.0] if late else [])
+    # However long messages seem to be under way, what leaves early in an interval is there in time.
+    commands.publish(3.0, START_NS + PERIOD_NS + PERIOD_NS // 2)
+    assert commands.over(1, START_NS + 2 * PERIOD_NS) == []
 
 
 def reported(end: int, *reports: tuple[float, float]) -> list[list[float]]:

@@ -121,7 +121,11 @@ class AdaptiveController:
         self.inverse.start_from(v)
 
     def refine(self) -> None:
-        """Do what the command did not have to wait for; if left out, the next step does it."""
+        """Do what the command did not have to wait for.
+
+        Who has no time for it leaves it out: the next step learns what it has to, and a search
+        for the gap pauses.
+        """
         if self._lesson is not None:
             self._learn()
         self.estimator.refine()

@@ -179,8 +179,11 @@ class GapSearch:
             self._begin()
         else:
             self._step_coarse(value, v)
-        if y is None:
-            return  # after lost samples v is late already
+        if self.samples > CAPACITY:
+            self._replay = None  # it was put off for too long: there is nothing left to read
+
+    def search_on(self) -> None:
+        """Read some more of the record again, or look for a reason to; this may wait."""
         if self._replay is not None:
             self._advance_replay()
         elif not self.on_trial:

@@ -303,7 +303,7 @@ class _Watched:
 
     def add(self, y: float | None, v: float, adapting: bool) -> bool:
         """Take in a sample; return False if y was refused as an outlier."""
-        self.refine()
+        self._pass_on()
         search = self.search
         fine, accepted = search.fine, True
         if fine is not None:
@@ -325,16 +325,24 @@ class _Watched:
         return accepted
 
     def refine(self) -> None:
-        """Let the search take in the newest sample."""
-        if self._waiting is None:
+        """Let the search take in the newest sample and go on."""
+        waiting, before = self._waiting, self.search.fine
+        if waiting is None:
             return
-        before = self.search.fine
-        self.search.add(*self._waiting)
-        self._waiting = None
+        self._pass_on()
+        if waiting[0] is None:
+            return  # after lost samples v is late already
+        self.search.search_on()
         fine = self.search.fine
         if fine is not None and fine is not before and fine.nis < NIS_TRUSTED:
             # What was held against the bank before says nothing of this one.
             self.contradicted, self.inconsistent_for, self._refused = False, 0, 0
+
+    def _pass_on(self) -> None:
+        """Let the search take in the newest sample, unless it has done so."""
+        if self._waiting is not None:
+            self.search.add(*self._waiting)
+            self._waiting = None
 
     def _judge(self, fine: GapBank, accepted: bool) -> None:
         if not fine.active:

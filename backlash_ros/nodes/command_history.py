@@ -7,14 +7,16 @@ from math import nan
 
 # Commands that may be under way: more than a stall of the controller can leave behind.
 REMEMBERED = 256
+LONGEST_TRANSIT = 0.25  # of a period: what is taken into account
+TRANSIT_STEP = 1e-3  # of a period: by which its median follows with every output
 
 
 class CommandHistory:
     """Published commands by time, and applied ones where the driver reports them.
 
     The driver applies over an interval the newest v it has when the interval ends with the next
-    sample. So a v published after that sample was taken came too late, and the one before it
-    was in use. Times are those of one clock [ns].
+    sample. So a v that cannot have been there when that sample was taken came too late, and the one
+    before it was in use: v is as long under way as y is. Times are those of one clock [ns].
     """
 
     def __init__(self, sample_period_s: float) -> None:
@@ -22,8 +24,16 @@ class CommandHistory:
         self.unreported = 0  # outputs without a matching report of the applied v
         self._period_ns = sample_period_s * 1e9
         self._output_ns = 0  # stamp of the newest output
+        self._transit_ns = 0.0  # median time from one node to the other
         self._published: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._reported: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
+
+    def note_transit(self, passed_ns: float) -> None:
+        """Note how long an output was under way until it was answered."""
+        # Clocks of two hosts may differ by more than any message takes.
+        longest, step = LONGEST_TRANSIT * self._period_ns, TRANSIT_STEP * self._period_ns
+        median = self._transit_ns + (step if passed_ns > self._transit_ns else -step)
+        self._transit_ns = min(max(median, 0.0), longest)
 
     def publish(self, v: float, stamp_ns: int) -> None:
         """Note a command and when it left."""
@@ -38,11 +48,11 @@ class CommandHistory:
 
         Empty if it was the newest command in all of them, as usual.
         """
-        first_end = end_ns - (intervals - 1) * self._period_ns
-        if self._published[-1][0] < first_end:
+        left_ns = end_ns - self._transit_ns  # what left later was not there
+        if self._published[-1][0] < left_ns - (intervals - 1) * self._period_ns:
             return []
         self.late += 1
-        return [self._at(end_ns - i * self._period_ns) for i in reversed(range(intervals))]
+        return [self._at(left_ns - i * self._period_ns) for i in reversed(range(intervals))]
 
     def begin(self, end_ns: int) -> None:
         """Note the first output: reports up to here belong to nothing."""

@@ -43,10 +43,12 @@ from backlash_ros.nodes.spin import run
 DIAGNOSTICS_PERIOD_S = 1.0
 # A controller that was held up for a few samples still learns from them; after a longer stall it
 # goes on with the newest ones.
-KEPT_OUTPUTS = 10
+KEPT_OUTPUTS = 20
 # After the command the controller gives way for this share of a period: a busy processor is where
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
+PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
+S_TO_NS = 1e9
 LOOK_S = 0.05  # between two looks for a silent plant_output or reference
 SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
 LAST_WORD_S = 0.1  # longest wait for the driver to confirm the last command
@@ -70,7 +72,9 @@ class ControllerNode(ManagedNode):
             self.log.warning(warning)
         self.loop: ControlLoop | None = None  # None while unconfigured
         self._lockstep = p.flag('lockstep')
-        self._give_way = 0.0 if self._lockstep else GIVE_WAY * p.real('sample_period')
+        self._give_way = GIVE_WAY * p.real('sample_period')
+        self._period_ns = p.real('sample_period') * S_TO_NS
+        self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
         self._saver = EstimateSaver(p.word('estimates.file'))
         self._saved_at = time.monotonic()
@@ -221,8 +225,16 @@ class ControllerNode(ManagedNode):
         step = loop.answer(output)
         if was_silent and not loop.silent:
             self._end_ramp()
-        if step is not None:
-            self._follow_up(loop, step, was_silent)
+        if step is None:
+            return
+        # Where the next output is waiting already, there is no time for what may be put off.
+        behind = time.time_ns() > output.received_ns + self._period_ns
+        self._behind = self._behind + 1 if behind else 0
+        if not behind:
+            time.sleep(self._give_way)
+        if self._behind % PUT_OFF == 0:
+            loop.core.refine()
+        self._follow_up(loop, step, was_silent)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
@@ -231,13 +243,11 @@ class ControllerNode(ManagedNode):
             y_m = self._references.popleft()
             step = self.loop.step(self._outputs.popleft(), arrival, y_m)
             if step is not None:
+                self.loop.core.refine()
                 self._follow_up(self.loop, step, was_silent=False)
 
     def _follow_up(self, loop: ControlLoop, step: ControlStep, was_silent: bool) -> None:
-        """Do what the command did not have to wait for."""
-        if self._give_way:
-            time.sleep(self._give_way)
-        loop.core.refine()
+        """Tell of a step."""
         self._publish_rows(loop, step)
         if was_silent:
             self.log.info(f'{self._io.topics.output} is back')

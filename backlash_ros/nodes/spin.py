@@ -39,7 +39,6 @@ GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node
 REMIND_S = 5.0  # between two lines that say what start-up waits for
 # A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
 NAP_NS = 3_000_000
-LONGEST_BLINDNESS_NS = 20_000_000  # without a look at callbacks, be the period ever so short
 
 
 class ProcessNode(Node):
@@ -109,16 +108,14 @@ def spin_paced(
     served. idle: says that none is expected before the next tick.
     """
     period_ns = period_s * 1e9
-    start = looked = time.monotonic_ns()
+    start = time.monotonic_ns()
     n = -1
     while not node.stopping:
         now = time.monotonic_ns()
         remaining = start + (n + 1) * period_ns - now
         if remaining <= 0:
             # What has arrived in time counts, even if nobody has looked at it yet.
-            if not idle() or now > looked + LONGEST_BLINDNESS_NS:
-                executor.spin_once(timeout_sec=0.0)
-                looked = now
+            executor.spin_once(timeout_sec=0.0)
             n = max(n + 1, int((time.monotonic_ns() - start) / period_ns))
             if not tick(n, start + int(n * period_ns)):
                 return
@@ -126,7 +123,6 @@ def spin_paced(
             time.sleep(remaining * 1e-9)
         else:
             executor.spin_once(timeout_sec=remaining * 1e-9)
-            looked = now
 
 
 def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
