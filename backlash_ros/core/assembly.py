@@ -45,7 +45,7 @@ SOFTER = (1e1, 1e2, 1e3, 1e4)
 # Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
 # are led astray by any feedback that would help, and learn faster than they go astray without.
 WRONG_SLOPE = 1.35
-AT_REST = 1.0 / 80.0  # rad per sample, up to which y is corrected while the reference rests
+REST_BANDWIDTH = 1.0 / 80.0  # rad per sample, up to which y is corrected while the reference rests
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -240,7 +240,7 @@ def _tracking(p: Parameters) -> Structure:
     careful = softer[-1] if tolerates(state, softer[-1], WRONG_SLOPE) else None
     noise_std = p.real('estimator.output_noise_std')
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
-    gentle = preview_gains(state, _power_gain(model, AT_REST), 0.0, 0).state
+    gentle = preview_gains(state, _power_gain(model, REST_BANDWIDTH), 0.0, 0).state
     return Tracking(
         state, gains, careful, p.real('inverse.caution'), Rest(state, gentle, noise_std),
         noise_std, softer,

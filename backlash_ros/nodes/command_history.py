@@ -29,7 +29,7 @@ class CommandHistory:
         self._reported: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
 
     def note_transit(self, passed_ns: float) -> None:
-        """Note how long an output was under way until it was answered."""
+        """Note how long an output was under way."""
         # Clocks of two hosts may differ by more than any message takes.
         longest, step = LONGEST_TRANSIT * self._period_ns, TRANSIT_STEP * self._period_ns
         median = self._transit_ns + (step if passed_ns > self._transit_ns else -step)

@@ -228,7 +228,7 @@ class ControllerNode(ManagedNode):
         if step is None:
             return
         # Where the next output is waiting already, there is no time for what may be put off.
-        behind = time.time_ns() > output.received_ns + self._period_ns
+        behind = 0 < output.received_ns < time.time_ns() - self._period_ns
         self._behind = self._behind + 1 if behind else 0
         if not behind:
             time.sleep(self._give_way)
