@@ -89,10 +89,10 @@ def test_the_loop_through_ros2_control_is_recorded_and_reported(tmp_path: Path) 
     with ros_world(tmp_path) as world:
         controller = world.start('controller', style)
         recorder = world.start('recorder', {
-            'io.style': 'ros2_control', 'bag': str(tmp_path / 'bag'),
+            'io.style': 'ros2_control', 'bag': str(tmp_path / 'bag'), 'wait_for_publishers': True,
         })
-        recorder.wait_for('ready')
         stand_in = StandIn(world, 'position', ['axle'], best_effort=False)
+        recorder.wait_for('ready')
         stand_in.meet()
         stand_in.driver.run_until_known(0.02)
         assert controller.stop() == 0
