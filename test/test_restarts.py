@@ -59,6 +59,7 @@ def test_killed_controller_goes_on_with_the_saved_estimates(tmp_path: Path) -> N
         driver.learn()
         driver.run_until(lambda: saved_error(file) < 0.02, 'saved estimates within 2 %')
         controller.kill()
+        driver.run(0.2)  # what the killed one had still said
         rows = len(driver.estimates)
         again = world.start('controller', keep)
         driver.run_until(lambda: len(driver.estimates) > rows, 'the first new row')
