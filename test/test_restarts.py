@@ -62,7 +62,9 @@ def test_killed_controller_goes_on_with_the_saved_estimates(tmp_path: Path) -> N
         driver.run(0.2)  # what the killed one had still said
         rows = len(driver.estimates)
         again = world.start('controller', keep)
-        driver.run_until(lambda: len(driver.estimates) > rows, 'the first new row')
+        driver.run_until(
+            lambda: len(driver.estimates) > rows and again.events('ready'), 'the first new row'
+        )
         saved = json.loads(file.read_text())['estimate']
         m, c_r, c_l = driver.estimates[rows].data[:3]
         assert (m, c_r, c_l) == pytest.approx((1.3, 3.0, -3.0), rel=0.05)

@@ -37,6 +37,7 @@ IMPOSSIBLE = -1e12  # log-likelihood of a hypothesis that is out
 TINY = 1e-300  # keeps a division finite
 ELECT_EVERY = 4  # corrections between two looks for the most likely hypothesis
 NIS_MEMORY = 1.0 / 40.0  # the mean of a true hypothesis is 1, its standard deviation then 0.16
+SIGN_MARGIN = 10.0  # log-likelihood by which a hypothesis with m > 0 may be behind one without
 LATE_CAP = 9.0  # largest normalised innovation squared that late starters pay for
 NIS_CAP = 36.0  # a wild sample counts as one of six standard deviations
 
@@ -189,7 +190,11 @@ class GapBank:
         score[rows] -= 0.5 * (mismatch**2 / variance + np.log(variance))
         paid = self._paid[rows]
         score[rows] += paid - paid.max(initial=-inf)
-        score[rows][theta[:, 0] <= 0.0] = -inf
+        # A slope below 0 is wrong; a hypothesis that is far less likely is no better for it.
+        hopeful = score.copy()
+        hopeful[rows][theta[:, 0] <= 0.0] = -inf
+        if hopeful.max() > score.max() - SIGN_MARGIN:
+            score = hopeful
         self.leader = leader = int(score.argmax())
         if leader >= self._first and score[leader] > -inf:
             share = np.exp(score[rows] - score[leader])

@@ -295,16 +295,26 @@ class GapSearch:
         if not replay.active:
             return  # gaps that v has not even swung over yet
         fine = self.fine
-        if self._behind(replay):
-            self._earliest = self.samples  # refuted while it was read: no reason to wait
-        if fine is None or self._behind(fine):
+        refuted = self._behind(replay)
+        if refuted:
+            self._earliest = self.samples  # while it was read: no reason to wait
+        if fine is None or (self._behind(fine) and not refuted):
             self._fine_since = self.samples
         elif self._is_undecided(replay) and not self._is_undecided(fine):
             return  # it would only raise doubts
-        elif replay.elect() < fine.elect() - REPLAY_MARGIN or fine.nis < NIS_SETTLED < replay.nis:
+        elif self._worse(replay, fine) or fine.nis < NIS_SETTLED < replay.nis:
             return  # reading the record afresh explained it worse
         self.fine, self._read_with = replay, replay.gaps
         self._behind(replay)
+
+    def _worse(self, replay: GapBank, fine: GapBank) -> bool:
+        """Whether a bank that read the record afresh explains it worse than the present one."""
+        by, i = fine.elect() - replay.elect(), fine.leader
+        inside = 0 < i < fine.active - 1
+        # Between two hypotheses a likely gap may look unlikely: one far from it has to be better.
+        if inside and not fine.gaps[i - 1] <= replay.gaps[replay.leader] <= fine.gaps[i + 1]:
+            return by > -COARSE_MARGIN
+        return by > REPLAY_MARGIN
 
     def _bank(self, gaps: Array, with_null: bool, at: Crossings | None = None) -> GapBank:
         s, known = self._settings, None if with_null else self._inherited
