@@ -54,7 +54,8 @@ class PlantNode(ProcessNode):
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.integer('seed'), 1])
         self._started = False
-        self._v = 0.0
+        self._v = self._v_before = 0.0
+        self._arrived_ns = 0  # of v, on the monotonic clock
         self._heard = False  # a first v has come
         self._expecting = False  # no v has come since the newest output
         self._tick = 0
@@ -108,17 +109,19 @@ class PlantNode(ProcessNode):
         if not isfinite(v):
             self._counts['non-finite controls dropped'] += 1
             return
-        self._v, self._heard = v, True
+        self._v_before, self._v, self._heard = self._v, v, True
+        age_ns = max(time.time_ns() - info['received_timestamp'], 0)
+        self._arrived_ns = time.monotonic_ns() - age_ns
         if self._expecting:
             self._expecting = False
             if self._lockstep:
-                self._advance()
+                self._advance(self._v)
                 self._offer()
 
     def _offer(self) -> None:
         """Lockstep: go on to the next output that is not lost on purpose."""
         while not self._complete and not self._publish_output():
-            self._advance()
+            self._advance(self._v)
         self._publish_truth()
         self._report_completion()
 
@@ -130,23 +133,27 @@ class PlantNode(ProcessNode):
         self._counts['missed outputs'] += max(passed - 1, 0)
         self._tick = tick
         self._latest_ns = due_ns + int(LATEST * self._sample_period * 1e9)
-        for _ in range(passed):
-            self._advance()
+        # Of the intervals that ended while the process was held up, some were over before v came.
+        for missed in reversed(range(1, passed)):
+            over_ns = due_ns - missed * self._sample_period * 1e9
+            self._advance(self._v if self._arrived_ns < over_ns else self._v_before)
+        if passed > 0:
+            self._advance(self._v)
         if not self._complete:
             self._publish_output()
         self._publish_truth()
         self._report_completion()
         return not self._complete
 
-    def _advance(self) -> None:
+    def _advance(self, v: float) -> None:
         """Apply v over one sample period."""
         if self._complete:
             return
         sample = self._plant.sample
-        u = self._plant.step(self._v)
+        u = self._plant.step(v)
         truth = self._plant.backlash
-        self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, self._v, float(sample)))
-        self._applied_message.data = self._v
+        self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
+        self._applied_message.data = v
         self._applied.publish(self._applied_message)
 
     def _publish_output(self) -> bool:
