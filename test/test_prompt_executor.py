@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import rclpy
@@ -17,7 +17,7 @@ from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from backlash_ros.nodes.prompt_executor import PromptExecutor
-from backlash_ros.nodes.spin import ProcessNode, spin_paced
+from backlash_ros.nodes.spin import spin_paced
 from backlash_ros.tools.processes import free_domain
 
 
@@ -138,7 +138,7 @@ def test_what_arrived_before_a_tick_counts_though_none_was_expected(loop: Loop) 
         loop.publisher.publish(Float64(data=1.0))
         return len(unheard) < 100
 
-    loop.node.__dict__['stopping'] = False
-    spin_paced(cast(ProcessNode, loop.node), loop.executor, 2e-3, tick, idle=lambda: True)
+    loop.node.stopping = False
+    spin_paced(loop.node, loop.executor, 2e-3, tick, idle=lambda: True)
     # A message may be on its way still; ten would be twenty milliseconds.
     assert sorted(unheard)[-10] <= 3

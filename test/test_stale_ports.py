@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from ros_processes import RosWorld, ros_world
+from ros_processes import ros_world
 
 from backlash_ros.stale_ports import MAKING_TAKES_S, SHARED_MEMORY, remove_stale_ports
 from backlash_ros.tools.processes import DOMAIN_0_PORT, PORTS_PER_DOMAIN
@@ -50,20 +48,14 @@ def test_folder_that_is_not_there_holds_none(tmp_path: Path) -> None:
     assert remove_stale_ports(tmp_path / 'none') == []
 
 
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[RosWorld]:
-    with ros_world(tmp_path) as world:
-        yield world
-
-
 @pytest.mark.skipif(not SHARED_MEMORY.is_dir(), reason='no shared memory as on Linux')
-def test_node_starts_where_a_killed_one_has_left_its_port_half_made(world: RosWorld) -> None:
-    number = DOMAIN_0_PORT + PORTS_PER_DOMAIN * world.domain + FIRST_USER_PORT
-    port = SHARED_MEMORY / f'fastrtps_port{number}'
-    with suppress(FileNotFoundError):
-        port.unlink()
-    leave(port, HALF_MADE)
-    reference = world.start('reference', {'wait_for_subscribers': 0})
-    reference.wait_for('ready')
-    assert reference.stop() == 0
+def test_node_starts_where_a_killed_one_has_left_its_port_half_made(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        number = DOMAIN_0_PORT + PORTS_PER_DOMAIN * world.domain + FIRST_USER_PORT
+        port = SHARED_MEMORY / f'fastrtps_port{number}'
+        port.unlink(missing_ok=True)
+        leave(port, HALF_MADE)
+        reference = world.start('reference', {'wait_for_subscribers': 0})
+        reference.wait_for('ready')
+        assert reference.stop() == 0
     assert f'{port}: removed' in reference.stderr

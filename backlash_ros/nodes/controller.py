@@ -48,7 +48,6 @@ KEPT_OUTPUTS = 20
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
-S_TO_NS = 1e9
 LOOK_S = 0.05  # between two looks for a silent plant_output or reference
 SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
 LAST_WORD_S = 0.1  # longest wait for the driver to confirm the last command
@@ -73,7 +72,7 @@ class ControllerNode(ManagedNode):
         self.loop: ControlLoop | None = None  # None while unconfigured
         self._lockstep = p.flag('lockstep')
         self._give_way = GIVE_WAY * p.real('sample_period')
-        self._period_ns = p.real('sample_period') * S_TO_NS
+        self._period_ns = p.real('sample_period') * 1e9
         self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
         self._saver = EstimateSaver(p.word('estimates.file'))

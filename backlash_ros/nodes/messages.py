@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from array import array
 from collections.abc import Mapping, Sequence
 
@@ -81,3 +82,9 @@ def clock_message(stamp_ns: int) -> Clock:
 def stamp_ns_of(message: Clock) -> int:
     """The time that a tick of /clock tells."""
     return int(message.clock.sec * 10**9 + message.clock.nanosec)
+
+
+def arrival_ns(received_ns: int) -> int:
+    """When a message arrived, on the monotonic clock, from what the middleware says of it."""
+    # A clock that was set back since must not put it into the future.
+    return time.monotonic_ns() - max(time.time_ns() - received_ns, 0)

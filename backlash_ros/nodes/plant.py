@@ -22,6 +22,7 @@ from backlash_ros.nodes.messages import (
     KEPT,
     DiagnosticsPublisher,
     LabelledArrayPublisher,
+    arrival_ns,
     clock_message,
 )
 from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
@@ -110,8 +111,7 @@ class PlantNode(ProcessNode):
             self._counts['non-finite controls dropped'] += 1
             return
         self._v_before, self._v, self._heard = self._v, v, True
-        age_ns = max(time.time_ns() - info['received_timestamp'], 0)
-        self._arrived_ns = time.monotonic_ns() - age_ns
+        self._arrived_ns = arrival_ns(info['received_timestamp'])
         if self._expecting:
             self._expecting = False
             if self._lockstep:
@@ -134,11 +134,10 @@ class PlantNode(ProcessNode):
         self._tick = tick
         self._latest_ns = due_ns + int(LATEST * self._sample_period * 1e9)
         # Of the intervals that ended while the process was held up, some were over before v came.
-        for missed in reversed(range(1, passed)):
+        for missed in reversed(range(passed)):
             over_ns = due_ns - missed * self._sample_period * 1e9
-            self._advance(self._v if self._arrived_ns < over_ns else self._v_before)
-        if passed > 0:
-            self._advance(self._v)
+            in_time = missed == 0 or self._arrived_ns < over_ns
+            self._advance(self._v if in_time else self._v_before)
         if not self._complete:
             self._publish_output()
         self._publish_truth()

@@ -15,7 +15,7 @@ from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.parameter_table import REFERENCE
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.events import emit
-from backlash_ros.nodes.messages import DEPTH, KEPT, stamp_ns_of
+from backlash_ros.nodes.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
 from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import ProcessNode, run
 
@@ -106,8 +106,7 @@ class ReferenceNode(ProcessNode):
             self._sample = self._counter.index + 1
         else:
             self._sample += self._counter.index - before if before >= 0 else 1
-        age_s = (time.time_ns() - output.received_ns) * 1e-9
-        self._heard_at = time.monotonic() - max(age_s, 0.0)
+        self._heard_at = arrival_ns(output.received_ns) * 1e-9
 
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.
