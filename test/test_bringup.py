@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -55,6 +56,26 @@ def test_no_record_leaves_no_bag_and_still_shows_progress(start: Callable[..., S
     assert '/100  m ' in session.stderr
     assert 'no bag' in session.stdout
     assert sorted(path.name for path in session.out.iterdir()) == ['logs', 'parameters.yaml']
+
+
+def test_recorder_that_was_held_up_gets_all_that_it_has_missed(
+    start: Callable[..., Session],
+) -> None:
+    session = start('--lockstep', '--duration', '8')
+    session.wait_for_samples()
+    recorder = session.node('recorder')
+    os.kill(recorder, signal.SIGSTOP)
+    # Far more messages than the middleware keeps on the way to a process.
+    time.sleep(0.8)
+    os.kill(recorder, signal.SIGCONT)
+    assert session.wait() == 0, session.stderr
+    summary = json.loads((session.out / 'summary.json').read_text())
+    assert (summary['samples'], summary['lost_samples']) == (800, 0)
+    counts = bag_counts(session.out / 'bag')
+    for topic in (
+        topics.PLANT_OUTPUT, topics.APPLIED_CONTROL, topics.TRUTH, topics.SIGNALS, topics.ESTIMATES,
+    ):
+        assert counts[topic] == 800
 
 
 def test_ctrl_c_leaves_a_readable_bag_and_a_report_and_no_process(
@@ -167,6 +188,11 @@ READY = (
     'print(\'{"event": "ready"}\', flush=True)'
 )
 WAIT = 'signal.sigwait([signal.SIGINT])'
+DONE = 'print(\'{"event": "done", "published": 100}\', flush=True)'
+
+
+def progress(sample: int) -> str:
+    return f'print(\'{{"event": "progress", "sample": {sample}}}\', flush=True)'
 
 
 @dataclass
@@ -226,10 +252,16 @@ def test_standstill_is_an_error_that_names_the_last_sample(
     watch: Callable[..., Watched], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(supervision, 'STALL_DEADLINE_S', 0.5)
-    progress = 'print(\'{"event": "progress", "sample": 41}\', flush=True)'
-    run = watch(recorder=f'{READY}; {progress}; {WAIT}')
+    run = watch(recorder=f'{READY}; {progress(41)}; {WAIT}')
     assert 'no new sample for' in run.failure
     assert 'after sample 41' in run.failure
+
+
+def test_samples_of_which_nothing_was_heard_are_told(watch: Callable[..., Watched]) -> None:
+    again = '\n'.join([progress(41)] * (supervision.STANDS_STILL + 2))
+    run = watch(plant=f'{READY}; {DONE}; {WAIT}', recorder=f'{READY}\n{again}\n{WAIT}')
+    assert not run.failure
+    assert 'made 100 samples, but nothing was heard of the last 58' in run.complaint
 
 
 def test_process_that_ends_by_itself_is_named_with_its_exit_code(
@@ -241,8 +273,7 @@ def test_process_that_ends_by_itself_is_named_with_its_exit_code(
 
 
 def test_unclean_end_after_a_whole_run_is_an_error(watch: Callable[..., Watched]) -> None:
-    done = 'print(\'{"event": "done"}\\n{"event": "progress", "sample": 99}\', flush=True)'
-    run = watch(plant=f'{READY}; {done}; {WAIT}; raise SystemExit(7)')
+    run = watch(plant=f'{READY}; {DONE}; {progress(99)}; {WAIT}; raise SystemExit(7)')
     assert run.failure.startswith('plant did not stop cleanly (exit code 7)')
 
 

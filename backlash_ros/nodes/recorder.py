@@ -106,7 +106,8 @@ class Progress:
         truth = _row(self._truth, topics.TRUTH_LABELS) if self._truth else {}
         same = [row for row in signals if row['sample'] == truth.get('sample')]
         return {
-            'sample': int(newest['sample']), 'status': int(newest['status']),
+            'sample': int(min(newest['sample'], estimates['sample'])),
+            'status': int(newest['status']),
             **{name: estimates[name] for name in (
                 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
             )},

@@ -18,7 +18,9 @@ from backlash_ros.tools.run_plan import AxisPlan, RunPlan
 
 READY_DEADLINE_S = 30.0
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
-STANDS_STILL = 5  # reports without a newer sample after which none is to come
+# Reports without a newer sample after which none is to come. The middleware sends again what got
+# lost on the way to a recorder that was held up, but only every 3 s.
+STANDS_STILL = 20
 STALL_DEADLINE_S = 10.0  # without a new sample
 LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
 
@@ -67,7 +69,8 @@ class AxisProgress:
     """How far an axis has come.
 
     made: samples so far. first: number of the sample that counts as the first one. moved: when
-    the newest sample was heard of, on the monotonic clock [s].
+    the newest sample was heard of, on the monotonic clock [s]. published: samples that a simulated
+    plant which is done has made, up to the last one of which it told anybody.
     """
 
     plan: AxisPlan
@@ -77,7 +80,7 @@ class AxisProgress:
     began: float = 0.0
     moved: float = 0.0
     repeats: int = 0  # times in a row that the recorder has told of no newer sample
-    plant_is_done: bool = False
+    published: int | None = None
     silence_told: bool = False
 
     @property
@@ -98,7 +101,12 @@ class AxisProgress:
         """Whether all samples were made; a driver does not say so, the recorder hears it."""
         if self.plan.has_driver:
             return 0 < self.plan.samples <= self.made
-        return self.plant_is_done
+        return self.published is not None
+
+    @property
+    def unheard(self) -> int:
+        """Samples at the end of a simulated run that the recorder has not told of yet."""
+        return max((self.published or 0) - self.made, 0)
 
     def begin(self) -> None:
         """The time starts to run."""
@@ -234,18 +242,23 @@ class Run:
 
     def _catch_up(self) -> None:
         """Wait until the recorder has told of the last sample."""
-        behind = [axis for axis in self._axes.values() if not axis.plan.has_driver]
-        for axis in behind:
+        for axis in self._axes.values():
             axis.repeats = 0
         deadline = time.monotonic() + STALL_DEADLINE_S
-        # The last outputs may have been lost on purpose: then the recorder says the same for a
-        # second. On a busy machine it may do so once or twice with samples still to come.
-        while not self._over and any(
-            axis.made < axis.plan.samples and axis.repeats < STANDS_STILL for axis in behind
-        ):
+        while not self._over:
+            behind = [axis for axis in self._axes.values() if axis.unheard]
+            if all(axis.repeats >= STANDS_STILL for axis in behind):
+                break
             self._listen()
             if time.monotonic() > deadline:
                 raise RunError('the recorder does not catch up')
+        else:
+            return
+        for axis in behind:
+            self._say(axis.plan.titled(
+                f'the plant made {axis.published} samples, but nothing was heard of the last '
+                f'{axis.unheard}'
+            ))
 
     def _listen(self) -> None:
         for event in self._supervisor.events(LISTEN_S):
@@ -265,7 +278,7 @@ class Run:
         if event.kind == 'ready':
             self._ready.add(event.plan.name)
         elif event.kind == 'done':
-            axis.plant_is_done = True
+            axis.published = int(number(event.content, 'published'))
         elif event.kind == 'progress':
             axis.take(event.content)
         elif event.kind == 'recording_stopped':
