@@ -188,7 +188,7 @@ READY = (
     'print(\'{"event": "ready"}\', flush=True)'
 )
 WAIT = 'signal.sigwait([signal.SIGINT])'
-DONE = 'print(\'{"event": "done", "published": 100}\', flush=True)'
+DONE = 'print(\'{"event": "done", "published": {"samples": 100}}\', flush=True)'
 
 
 def progress(sample: int) -> str:
@@ -261,7 +261,7 @@ def test_samples_of_which_nothing_was_heard_are_told(watch: Callable[..., Watche
     again = '\n'.join([progress(41)] * (supervision.STANDS_STILL + 2))
     run = watch(plant=f'{READY}; {DONE}; {WAIT}', recorder=f'{READY}\n{again}\n{WAIT}')
     assert not run.failure
-    assert 'made 100 samples, but nothing was heard of the last 58' in run.complaint
+    assert 'the plant has said more than the recorder heard: 58 samples' in run.complaint
 
 
 def test_process_that_ends_by_itself_is_named_with_its_exit_code(

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -43,11 +42,6 @@ class LabelledArrayPublisher:
     def listeners(self) -> int:
         """How many subscribers there are."""
         return self._publisher.get_subscription_count()
-
-    @property
-    def received(self) -> bool:
-        """Whether all of them have all rows."""
-        return bool(self._publisher.wait_for_all_acked(Duration()))
 
     def publish(self, row: Sequence[float]) -> None:
         """Publish one value per label, if anybody listens."""

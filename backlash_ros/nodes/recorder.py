@@ -251,7 +251,8 @@ class RecorderNode(ProcessNode):
     def _tell(self) -> None:
         content = self._progress.report()
         if content:
-            emit('progress', **content)
+            received = {channel.topic: channel.received for channel in self._channels}
+            emit('progress', **content, received=received)
 
     def _diagnose(self) -> None:
         if self._diagnostics is None:

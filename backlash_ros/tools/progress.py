@@ -90,3 +90,9 @@ def number(values: Mapping[str, object], name: str) -> float:
     """A number of an event, nan for null and for what is missing."""
     value = values.get(name)
     return float(value) if isinstance(value, (int, float)) else nan
+
+
+def counts(values: Mapping[str, object], name: str) -> dict[str, int]:
+    """The counts in an event by what was counted, empty where they are missing."""
+    value = values.get(name)
+    return value if isinstance(value, dict) else {}

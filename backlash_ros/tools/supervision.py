@@ -6,14 +6,14 @@ import signal
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf, isfinite
 from types import FrameType, TracebackType
 from typing import Any
 
 from backlash_ros import topics
 from backlash_ros.tools.processes import Child, Event, ProcessSupervisor, RunError
-from backlash_ros.tools.progress import ProgressDisplay, number
+from backlash_ros.tools.progress import ProgressDisplay, counts, number
 from backlash_ros.tools.run_plan import AxisPlan, RunPlan
 
 READY_DEADLINE_S = 30.0
@@ -69,8 +69,9 @@ class AxisProgress:
     """How far an axis has come.
 
     made: samples so far. first: number of the sample that counts as the first one. moved: when
-    the newest sample was heard of, on the monotonic clock [s]. published: samples that a simulated
-    plant which is done has made, up to the last one of which it told anybody.
+    the newest sample was heard of, on the monotonic clock [s]. published: samples and messages by
+    topic that can have been heard of a simulated plant, once it is done; heard: those that the
+    recorder has told of.
     """
 
     plan: AxisPlan
@@ -79,8 +80,9 @@ class AxisProgress:
     first: int = 0
     began: float = 0.0
     moved: float = 0.0
-    repeats: int = 0  # times in a row that the recorder has told of no newer sample
-    published: int | None = None
+    published: Mapping[str, int] | None = None
+    heard: dict[str, int] = field(default_factory=dict)
+    repeats: int = 0  # times in a row that the recorder has told of nothing new
     silence_told: bool = False
 
     @property
@@ -104,9 +106,12 @@ class AxisProgress:
         return self.published is not None
 
     @property
-    def unheard(self) -> int:
-        """Samples at the end of a simulated run that the recorder has not told of yet."""
-        return max((self.published or 0) - self.made, 0)
+    def unheard(self) -> dict[str, int]:
+        """What is missing of the published ones."""
+        missing = {
+            what: count - self.heard.get(what, 0) for what, count in (self.published or {}).items()
+        }
+        return {what: count for what, count in missing.items() if count > 0}
 
     def begin(self) -> None:
         """The time starts to run."""
@@ -122,8 +127,10 @@ class AxisProgress:
             # A driver may have been running before; a simulated plant begins with sample 0.
             self.first = int(sample) if self.plan.has_driver else 0
         made = int(sample) + 1 - self.first
-        self.repeats = self.repeats + 1 if made <= self.made else 0
-        if not self.repeats:
+        heard = {'samples': made, **counts(progress, 'received')}
+        self.repeats = self.repeats + 1 if heard == self.heard else 0
+        self.heard = heard
+        if made > self.made:
             self.made, self.moved, self.silence_told = made, time.monotonic(), False
             self.display.show(progress, made)
 
@@ -255,9 +262,9 @@ class Run:
         else:
             return
         for axis in behind:
+            missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
             self._say(axis.plan.titled(
-                f'the plant made {axis.published} samples, but nothing was heard of the last '
-                f'{axis.unheard}'
+                f'the plant has said more than the recorder heard: {missing}'
             ))
 
     def _listen(self) -> None:
@@ -278,7 +285,7 @@ class Run:
         if event.kind == 'ready':
             self._ready.add(event.plan.name)
         elif event.kind == 'done':
-            axis.published = int(number(event.content, 'published'))
+            axis.published = counts(event.content, 'published')
         elif event.kind == 'progress':
             axis.take(event.content)
         elif event.kind == 'recording_stopped':
@@ -289,10 +296,9 @@ class Run:
 
     def _tell_unheard(self, closed: Mapping[str, object]) -> None:
         """Say so where the bag holds what the controller made of y, but no y."""
-        recorded = closed.get('messages')
-        if not isinstance(recorded, dict) or closed.get('failure'):
+        if closed.get('failure'):
             return
-        for topic, count in recorded.items():
+        for topic, count in counts(closed, 'messages').items():
             if topic.endswith(OUTPUTS) and count == 0:
                 self._say(
                     f'the bag holds no message of {topic}, which the controller has heard: the '
