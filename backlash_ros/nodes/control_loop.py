@@ -101,10 +101,10 @@ class ControlLoop:
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """The same for a sample that was counted already, with the reference that belongs to it."""
         statistics = self.statistics
-        self.commands.note_transit(output.received_ns - output.sent_ns)
         if not arrival.is_sample:
             statistics.extra += 1
             return None
+        self.commands.note_transit(output.received_ns - output.sent_ns)
         self._note_missing(arrival)
         if not plausible(output.y):
             # A sensor that has nothing to say is as good as silent.
