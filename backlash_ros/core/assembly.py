@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from math import inf
 
 import numpy as np
@@ -19,7 +20,7 @@ from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.last_command import check_last_commands
 from backlash_ros.core.lms import NormalisedLms
-from backlash_ros.core.lq_preview import preview_gains
+from backlash_ros.core.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.model_check import check_model, model_warnings
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.pole_placement import FourBlocks, PolePlacement, place_poles
@@ -52,6 +53,12 @@ def build_model(p: Parameters) -> TransferFunction:
     """G(z), and the delay between control and its effect as poles at 0."""
     delay = (0.0,) * p.integer('control.delay_samples')
     return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator') + delay)
+
+
+def build_state_model(p: Parameters) -> StateModel:
+    """The state space of G(z), one and the same for the same G(z)."""
+    model = build_model(p)
+    return _state_model(tuple(model.numerator), tuple(model.denominator))
 
 
 def build_controller(p: Parameters, inherited: Estimate | None = None) -> AdaptiveController:
@@ -157,11 +164,11 @@ def _kalman(p: Parameters, initial: Estimate) -> Estimator:
     if p.word('structure') != 'proportional':
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
         observer = FixedBacklash(
-            given, StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+            given, build_state_model(p), p.real('estimator.output_noise_std'),
             DOUBT_OF_FIRST_GUESS,
         )
     return KalmanEstimator(
-        initial, _bounds(p), StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+        initial, _bounds(p), build_state_model(p), p.real('estimator.output_noise_std'),
         p.real('estimator.input_noise_std'), p.triple('estimator.drift_std'),
         p.real('sample_period'), observer,
     )
@@ -180,7 +187,7 @@ def _printed(p: Parameters, initial: Estimate) -> Estimator:
 
 def _fixed(p: Parameters, initial: Estimate) -> Estimator:
     return FixedBacklash(
-        initial, StateModel(build_model(p)), p.real('estimator.output_noise_std'),
+        initial, build_state_model(p), p.real('estimator.output_noise_std'),
         p.real('fixed.doubt'),
     )
 
@@ -222,29 +229,43 @@ def _pole_placement(p: Parameters) -> Structure:
 
 
 def _four_blocks(p: Parameters) -> FourBlocks:
-    model = build_model(p)
-    state = StateModel(model)
-    gains = preview_gains(state, _input_weight(p, model), 0.0, 0)
+    model, state = build_model(p), build_state_model(p)
+    gains = _gains(state, _input_weight(p, model))
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
     return place_poles(model, closed, p.real('pole_placement.filter_pole'))
 
 
 def _tracking(p: Parameters) -> Structure:
-    model = build_model(p)
-    state = StateModel(model)
+    model, state = build_model(p), build_state_model(p)
     weight = _input_weight(p, model)
-    gains = preview_gains(
-        state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview')
-    )
-    softer = [preview_gains(state, more * weight, 0.0, 0).state for more in SOFTER]
-    careful = softer[-1] if tolerates(state, softer[-1], WRONG_SLOPE) else None
+    gains = _gains(state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview'))
+    softer = [_gains(state, more * weight).state for more in SOFTER]
+    careful = softer[-1] if _bears_wrong_slope(state, SOFTER[-1] * weight) else None
     noise_std = p.real('estimator.output_noise_std')
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
-    gentle = preview_gains(state, _power_gain(model, REST_BANDWIDTH), 0.0, 0).state
+    gentle = _gains(state, _power_gain(model, REST_BANDWIDTH)).state
     return Tracking(
         state, gains, careful, p.real('inverse.caution'), Rest(state, gentle, noise_std),
         noise_std, softer,
     )
+
+
+# What follows is remembered: a controller that begins anew does so in the middle of a loop.
+@lru_cache(maxsize=16)
+def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> StateModel:
+    return StateModel(TransferFunction(numerator, denominator))
+
+
+@lru_cache(maxsize=64)
+def _gains(
+    model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,
+) -> PreviewGains:
+    return preview_gains(model, input_weight, integral_weight, window)
+
+
+@lru_cache(maxsize=16)
+def _bears_wrong_slope(model: StateModel, input_weight: float) -> bool:
+    return tolerates(model, _gains(model, input_weight).state, WRONG_SLOPE)
 
 
 ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Estimator]] = {
