@@ -179,3 +179,22 @@ def test_first_output_always_arrives() -> None:
     loop.lose = lambda: True
     run = loop.run(50)
     assert (run.samples, run.lost_samples) == (1, 49)
+
+
+@pytest.mark.parametrize(('law', 'structure'), [
+    ('kalman', 'proportional'), ('kalman', 'tracking'), ('lms', 'proportional'),
+    ('printed', 'proportional'), ('fixed', 'tracking'), ('gradient', 'pole_placement'),
+])
+@pytest.mark.parametrize('size', [5e-324, 1e-162, 1e-155, 1e-130, 1e-100])
+def test_commands_whose_square_is_hardly_a_number_are_harmless(
+    law: str, structure: str, size: float,
+) -> None:
+    parameters = Parameters({'estimator.law': law, 'structure': structure})
+    loop = build_closed_loop(parameters).controller
+    for k in range(200):
+        # The plant is moved by something else.
+        y, applied = np.sin(0.05 * k), [size * (k % 15 - 7)] if k else []
+        step = loop.step(y, size * (k % 20 - 10), 0, applied)
+        loop.refine()
+        estimate = loop.estimator.estimate
+        assert np.all(np.isfinite([step.v, estimate.m, estimate.c_r, estimate.c_l]))

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.errors import ParameterError
 
+# Of a signal: a smaller one rests. Its inverse times the square of any measurement is a number.
+LEAST_SQUARE = 1e-240
+
 
 class Status(IntEnum):
     """How much an estimate may be trusted; the code stands in `controller/signals`."""

@@ -26,7 +26,7 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimator import LEAST_SQUARE, Bounds, Estimate, Interval, Status
 from backlash_ros.core.pole_placement import FourBlocks
 from backlash_ros.core.transfer_function import TransferFunction
 
@@ -82,7 +82,7 @@ class GradientEstimator:
         zeta = filtered[:3]
         xi = float(theta @ zeta - filtered[3])
         eps = self.innovation = y - y_ref - xi
-        if self._v_square == 0.0 or self._u_square == 0.0:
+        if min(self._v_square, self._u_square) < LEAST_SQUARE:
             return
         scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
         size = float(zeta @ scaled)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimator import LEAST_SQUARE, Bounds, Estimate, Interval, Status
 from backlash_ros.core.input_reconstruction import InputReconstruction
 from backlash_ros.core.lagged_law import LaggedLaw
 
@@ -67,7 +67,7 @@ class NormalisedLms(LaggedLaw):
         v = past.v
         self._v_max = max(self._v_max, abs(v))
         e = u - m * (v - (c_r if rising else c_l))
-        weight = 1.0 / self._v_max**2 if self._v_max**2 > 0.0 else 0.0
+        weight = 1.0 / self._v_max**2 if self._v_max**2 > LEAST_SQUARE else 0.0
         gain = self.step * e / (weight * v * v + 1.0)
         # Products first: they enter the error linearly, the crossings follow by division.
         product_r = m * c_r - gain if rising else m * c_r
