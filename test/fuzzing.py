@@ -24,6 +24,7 @@ import numpy as np
 import rclpy
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 
 from backlash_ros.nodes.controller import ControllerNode
@@ -67,7 +68,8 @@ def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode
     for name, value in values.items():
         text = str(value).lower() if isinstance(value, bool) else str(value)
         arguments += ['-p', f'{name}:={text.replace("inf", ".inf")}']
-    rclpy.init(args=arguments, domain_id=domain)
+    # A failure elsewhere ends all processes by a signal, which must end them.
+    rclpy.init(args=arguments, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = ControllerNode()
         try:
