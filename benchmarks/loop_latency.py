@@ -86,7 +86,8 @@ class Driver:
         self._executor.add_node(self._node)
         self._plant, self._reference = build_plant(parameters), build_reference(parameters)
         self._period = parameters.real('sample_period')
-        self._v = 0.0
+        self._v = self._v_before = 0.0
+        self._v_came_at = 0.0
         self._answered_at: float | None = None
         node = self._node
         self._y_m = node.create_publisher(Float64, topics.REFERENCE, 1)
@@ -98,8 +99,8 @@ class Driver:
         ]
 
     def _on_control(self, message: Float64) -> None:
-        self._answered_at = time.perf_counter()
-        self._v = message.data
+        self._answered_at = self._v_came_at = time.perf_counter()
+        self._v_before, self._v = self._v, message.data
 
     def _on_echo(self, message: Float64) -> None:
         self._answered_at = time.perf_counter()
@@ -138,9 +139,11 @@ class Driver:
                 return result
             due = int(now / self._period) + 1
             time.sleep(max(due * self._period - now, 0.0))
-            for _ in range(due - tick):
-                self._plant.step(self._v)
-            tick = due
+            while tick < due:
+                tick += 1
+                # A sample that was skipped while an answer was late still ended without it.
+                in_time = tick == due or self._v_came_at < start + tick * self._period
+                self._plant.step(self._v if in_time else self._v_before)
             t = due * self._period
             warming_up = t < WARM_UP_S
             asks_controller = warming_up or due // BLOCK % 2 == 0
