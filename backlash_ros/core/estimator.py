@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.errors import ParameterError
 
-# Of a signal: a smaller one rests. Its inverse times the square of any measurement is a number.
+# Square of a signal below which it counts as none. Its inverse, times the square of any measurement,
+# still is a number.
 LEAST_SQUARE = 1e-240
 
 
