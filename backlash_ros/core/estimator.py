@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.errors import ParameterError
 
-# Square of a signal below which it counts as none. Its inverse, times the square of any measurement,
-# still is a number.
+# Square of a signal below which it counts as none. Its inverse, times the square of any
+# measurement, still is a number.
 LEAST_SQUARE = 1e-240
 
 
