@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from reporting import Check
 
-from backlash_ros.core.assembly import build_model
+from backlash_ros.core.assembly import build_state_model
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimator import Status
 from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
-from backlash_ros.core.state_model import StateModel
 
 try:
     from filterpy.kalman import KalmanFilter  # type: ignore[import-untyped]
@@ -213,7 +212,7 @@ def bank_timings() -> list[Timing]:
 
 
 def _bank_timer(parameters: Parameters, count: int, run: RunRecord) -> Timed:
-    model = StateModel(build_model(parameters))
+    model = build_state_model(parameters)
     prior = Prior(np.array([1.0, 1.0, -1.0]), 10.0)
     bank = GapBank(np.geomspace(0.1, 6.0, count + 1)[1:], model, prior, Noise(NOISE))
     v, y = run.column('v').tolist(), run.column('y').tolist()

@@ -258,7 +258,14 @@ def test_standstill_is_an_error_that_names_the_last_sample(
 
 
 def test_samples_of_which_nothing_was_heard_are_told(watch: Callable[..., Watched]) -> None:
-    again = f'while not signal.sigtimedwait([signal.SIGINT], 0.01): {progress(41)}'
+    # Diagnostics go on.
+    again = (
+        'import itertools, json\n'
+        'for n in itertools.count():\n'
+        '    if signal.sigtimedwait([signal.SIGINT], 0.01): break\n'
+        '    progress = dict(event="progress", sample=41, received=dict(diagnostics=n))\n'
+        '    print(json.dumps(progress), flush=True)'
+    )
     run = watch(plant=f'{READY}; {DONE}; {WAIT}', recorder=f'{READY}\n{again}')
     assert not run.failure
     assert 'the plant has said more than the recorder heard: 58 samples' in run.complaint

@@ -7,13 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from backlash_ros.core.assembly import build_model
+from backlash_ros.core.assembly import build_state_model
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimator import Status
 from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
-from backlash_ros.core.state_model import StateModel
 
 NOISE = 1e-3
 NAMES = ('m', 'c_r', 'c_l')
@@ -75,7 +74,7 @@ def test_plant_without_a_gap_is_recognised() -> None:
 
 
 def test_a_hypothesis_goes_on_when_its_gap_moves_beyond_the_swing_of_v() -> None:
-    model = StateModel(build_model(Parameters()))
+    model = build_state_model(Parameters())
     gaps = np.array([1.0, 2.0, 4.0])
     bank = GapBank(gaps, model, Prior(np.array([1.0, 1.0, -1.0]), 1.0), Noise(NOISE))
     for v in (0.0, 2.5):

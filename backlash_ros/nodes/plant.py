@@ -61,10 +61,8 @@ class PlantNode(ProcessNode):
         self._expecting = False  # no v has come since the newest output
         self._tick = 0
         self._latest_ns = 0
-        # What a recorder can have heard at the end of the run.
-        self._published = {
-            'samples': 0, topics.PLANT_OUTPUT: 0, topics.APPLIED_CONTROL: 0, topics.TRUTH: 0,
-        }
+        self._outputs = 0  # published
+        self._newest = 0  # samples up to the newest of these outputs
         self._counts = {'late controls': 0, 'missed outputs': 0, 'non-finite controls dropped': 0}
         self._truth_rows: list[tuple[float, ...]] = []
         self._output_message, self._applied_message = Float64(), Float64()
@@ -158,7 +156,6 @@ class PlantNode(ProcessNode):
         self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
         self._applied_message.data = v
         self._applied.publish(self._applied_message)
-        self._published[topics.APPLIED_CONTROL] += 1
 
     def _publish_output(self) -> bool:
         """Measure y and publish it unless it is lost on purpose."""
@@ -173,14 +170,12 @@ class PlantNode(ProcessNode):
             return False
         self._expecting = True
         self._output.publish(self._output_message)
-        self._published['samples'] = sample + 1
-        self._published[topics.PLANT_OUTPUT] += 1
+        self._outputs, self._newest = self._outputs + 1, sample + 1
         return True
 
     def _publish_truth(self) -> None:
         for row in self._truth_rows:
             self._truth.publish(row)
-            self._published[topics.TRUTH] += 1
         self._truth_rows.clear()
 
     @property
@@ -189,7 +184,11 @@ class PlantNode(ProcessNode):
 
     def _report_completion(self) -> None:
         if self._complete:
-            emit('done', published=self._published)
+            # What a recorder can have heard.
+            emit('done', published={
+                'samples': self._newest, topics.PLANT_OUTPUT: self._outputs,
+                topics.APPLIED_CONTROL: self._plant.sample, topics.TRUTH: self._plant.sample,
+            })
 
     def _diagnose(self) -> None:
         troubled = any(self._counts.values())

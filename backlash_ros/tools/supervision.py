@@ -18,8 +18,8 @@ from backlash_ros.tools.run_plan import AxisPlan, RunPlan
 
 READY_DEADLINE_S = 30.0
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
-# Reports without a newer sample after which none is to come. The middleware sends again what got
-# lost on the way to a recorder that was held up, but only every 3 s.
+# Reports without anything that was unheard, after which nothing is to come. The middleware sends
+# again what got lost on the way to a recorder that was held up, but only every 3 s.
 STANDS_STILL = 20
 STALL_DEADLINE_S = 10.0  # without a new sample
 LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
@@ -82,7 +82,7 @@ class AxisProgress:
     moved: float = 0.0
     published: Mapping[str, int] | None = None
     heard: dict[str, int] = field(default_factory=dict)
-    repeats: int = 0  # times in a row that the recorder has told of nothing new
+    repeats: int = 0  # times in a row that the recorder has told of nothing that was unheard
     silence_told: bool = False
 
     @property
@@ -127,9 +127,9 @@ class AxisProgress:
             # A driver may have been running before; a simulated plant begins with sample 0.
             self.first = int(sample) if self.plan.has_driver else 0
         made = int(sample) + 1 - self.first
-        heard = {'samples': made, **counts(progress, 'received')}
-        self.repeats = self.repeats + 1 if heard == self.heard else 0
-        self.heard = heard
+        before = self.unheard
+        self.heard = {'samples': made, **counts(progress, 'received')}
+        self.repeats = self.repeats + 1 if self.unheard == before else 0
         if made > self.made:
             self.made, self.moved, self.silence_told = made, time.monotonic(), False
             self.display.show(progress, made)
@@ -248,24 +248,22 @@ class Run:
                 axis.display.say(f'bringup: {silence}, waiting for the driver')
 
     def _catch_up(self) -> None:
-        """Wait until the recorder has told of the last sample."""
+        """Wait until the recorder has told of all that was published, and say what is missing."""
         for axis in self._axes.values():
             axis.repeats = 0
         deadline = time.monotonic() + STALL_DEADLINE_S
-        while not self._over:
-            behind = [axis for axis in self._axes.values() if axis.unheard]
-            if all(axis.repeats >= STANDS_STILL for axis in behind):
-                break
+        while not self._over and any(
+            axis.unheard and axis.repeats < STANDS_STILL for axis in self._axes.values()
+        ):
             self._listen()
             if time.monotonic() > deadline:
                 raise RunError('the recorder does not catch up')
-        else:
-            return
-        for axis in behind:
-            missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
-            self._say(axis.plan.titled(
-                f'the plant has said more than the recorder heard: {missing}'
-            ))
+        for axis in self._axes.values():
+            if axis.unheard:
+                missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
+                self._say(axis.plan.titled(
+                    f'the plant has said more than the recorder heard: {missing}'
+                ))
 
     def _listen(self) -> None:
         for event in self._supervisor.events(LISTEN_S):
