@@ -15,12 +15,13 @@ setup(
     maintainer_email='maintainers@backlash-ros.org',
     license='Apache-2.0',
     packages=find_packages(exclude=['test*']),
+    package_data={PACKAGE: ['loopback.xml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
     ],
-    zip_safe=True,
+    zip_safe=False,
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
     install_requires=['matplotlib', 'numpy', 'PyYAML', 'rosbags', 'scipy', 'tqdm'],

@@ -27,6 +27,7 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameter_table import CONTROLLER, PARAMETERS
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.loopback import prefer_loopback
 from backlash_ros.tools.processes import (
     ProcessPlan,
     ProcessSupervisor,
@@ -80,6 +81,7 @@ class Driver:
 
     def __init__(self, domain: int, parameters: Parameters) -> None:
         self._context = Context()
+        prefer_loopback(os.environ)
         rclpy.init(args=[], context=self._context, domain_id=domain)
         self._node = Node('driver', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)

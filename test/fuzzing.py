@@ -27,6 +27,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 
+from backlash_ros.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
 from backlash_ros.nodes.driver_io import Output
 from backlash_ros.nodes.sample_counter import UNNUMBERED
@@ -69,6 +70,7 @@ def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode
         text = str(value).lower() if isinstance(value, bool) else str(value)
         arguments += ['-p', f'{name}:={text.replace("inf", ".inf")}']
     # A failure elsewhere ends all processes by a signal, which must end them.
+    prefer_loopback(os.environ)
     rclpy.init(args=arguments, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = ControllerNode()

@@ -90,17 +90,6 @@ class PacedDriver:
         self.run(0.2)
         self.run_until_known(0.02)
 
-    def run_into_a_pause(self) -> None:
-        """Go on for a sample, and return when everybody has long said what there is to say on it.
-
-        Who is killed while it hands over a message leaves the shared memory of the middleware in
-        disorder for those it speaks with (docs/faults.md); no node can do anything about that.
-        """
-        self._tick()
-        until = time.monotonic() + 0.5 * self._period_s
-        while (left := until - time.monotonic()) > 0.0:
-            self.probe.spin(left)
-
     def run_until_known(self, error: float) -> None:
         """Go on until no estimate is off by more than a share."""
         self.run_until(lambda: self.error() < error, f'estimates within {error:.0%}')

@@ -22,8 +22,11 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from backlash_ros.loopback import prefer_loopback
 from backlash_ros.stale_ports import remove_stale_ports
 from backlash_ros.tools.processes import child_environment, free_domain
+
+prefer_loopback(os.environ)  # the nodes of the tests themselves
 
 DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
 

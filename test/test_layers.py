@@ -11,7 +11,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = 'backlash_ros'
-SHARED = {PACKAGE, *(f'{PACKAGE}.{name}' for name in ('files', 'stale_ports', 'topics'))}
+SHARED = {
+    PACKAGE,
+    *(f'{PACKAGE}.{name}' for name in ('files', 'loopback', 'stale_ports', 'topics')),
+}
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')

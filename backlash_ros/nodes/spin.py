@@ -27,6 +27,7 @@ from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import PARAMETERS
+from backlash_ros.loopback import prefer_loopback
 from backlash_ros.nodes.declare import declare_parameters
 from backlash_ros.nodes.goodbye import exit_at_the_latest
 from backlash_ros.nodes.prompt_executor import PromptExecutor
@@ -215,6 +216,7 @@ def _parse_plain_arguments(executable: str, args: list[str] | None) -> None:
 
 def _initialise(args: list[str] | None) -> str:
     """Initialise ROS; return why that failed, empty if it did not."""
+    prefer_loopback(os.environ)
     # rcl would add a line without content to the one that says what is wrong.
     set_logger_level('rcl', LoggingSeverity.FATAL)
     try:

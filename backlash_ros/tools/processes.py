@@ -25,6 +25,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
+from backlash_ros.loopback import prefer_loopback
+
 LOG_LINES = 10  # of a log that an error message quotes
 
 # UDP ports of RTPS: a domain has 250; participant n takes 10 + 2 n and 11 + 2 n of them, and
@@ -311,6 +313,7 @@ def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
     if domain is not None:
         environment['ROS_DOMAIN_ID'] = str(domain)
     environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    prefer_loopback(environment)  # for drivers; the nodes of this package do so themselves
     environment.setdefault('ROS_LOG_DIR', str(log_folder / 'ros'))
     # The matrices are tiny: more threads would only take the processors from each other.
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):

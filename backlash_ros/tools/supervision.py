@@ -19,7 +19,7 @@ from backlash_ros.tools.run_plan import AxisPlan, RunPlan
 READY_DEADLINE_S = 30.0
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
 # Reports without anything that was unheard, after which nothing is to come. The middleware sends
-# again what got lost on the way to a recorder that was held up, but only every 3 s.
+# again what got lost on the way to a recorder that was held up, with its own settings every 3 s.
 STANDS_STILL = 20
 STALL_DEADLINE_S = 10.0  # without a new sample
 LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
