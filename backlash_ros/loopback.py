@@ -3,7 +3,7 @@
 By itself Fast DDS 2.14 takes shared memory, which a process that is killed may leave in disorder:
 others do not hear its successor, or end with a segmentation fault. What a reader misses it sends
 again after 3 s only. With the profile beside this file messages go by UDP over the loopback
-device, which a killed process cannot damage, and are soon repeated. Both are equally fast.
+device, which a killed process cannot damage, and are soon repeated.
 """
 
 from __future__ import annotations
