@@ -15,7 +15,7 @@ from printed_law import (
 )
 from runs import simulate
 
-from backlash_ros.core import gap_search, kalman
+from backlash_ros.core import early_fits, gap_search, kalman
 from backlash_ros.core.metrics import control_error_rms, settling_time
 from backlash_ros.core.transfer_function import TransferFunction
 
@@ -136,7 +136,13 @@ def estimator_constants() -> str:
          'gap_search.py'),
         ('record: longest, in samples', f'{s.CAPACITY}', 'gap_search.py'),
         ('recorded samples read again with each new one', f'{s.REPLAY_SPEED}', 'gap_search.py'),
-        ('... while none may be published', f'{s.FIRST_REPLAY_SPEED}', 'gap_search.py'),
+        ('... while none may be published', f'{s.SLOWEST_FIRST} to {s.FASTEST_FIRST}',
+         'gap_search.py'),
+        ('record: samples up to which it is fitted as a whole', f'{early_fits.LONGEST}',
+         'early_fits.py'),
+        ('... bank once the relative deviation of the gap is below',
+         f'{early_fits.PRECISION_OF_GAP:g}', 'early_fits.py'),
+        ('... and that of m below', f'{early_fits.PRECISION_OF_M:g}', 'early_fits.py'),
         ('outlier: innovation beyond, in standard deviations', f'{k.GATE:g}', 'kalman.py'),
         ('contradiction: outliers in a row', f'{k.REFUSED_IN_A_ROW}', 'kalman.py'),
         ('contradiction: mean normalised innovation squared above', f'{k.NIS_LIMIT:g}',

@@ -165,18 +165,16 @@ def test_noise_that_speaks_for_a_wrong_gap_at_first_does_not_drive_y_away(seed: 
     assert np.abs(simulate(p, 400).column('y')).max() < 1.0
 
 
-@pytest.mark.parametrize('seed', [14, 328])
-def test_gap_that_is_far_less_likely_than_another_is_not_believed(seed: int) -> None:
-    # 14: the likely gaps have a slope below 0 for a moment; 328: a wide one lies between two
-    # that are tried, and a wrong one fits hardly better than its neighbours.
-    p = tracking(
-        waveform='chirp', frequency_start=0.2 * np.pi, frequency=6.0 * np.pi,
-        output_noise_std=1e-3, seed=seed,
-    )
-    run, delay = simulate(p, 400), p.integer('tracking.preview')
-    y, y_m = run.column('y'), run.column('y_m')
-    assert np.abs(y).max() < 0.3
-    assert np.sqrt(np.mean((y[200:] - y_m[200 - delay:-delay]) ** 2)) < 0.006
+@pytest.mark.parametrize('seed', [14, 87, 107, 136, 319, 328])
+def test_reference_that_begins_slowly_is_followed_from_two_seconds_on(seed: int) -> None:
+    # v meets the far side of the gap after 1.5 s. Filters that know nothing of x before that
+    # believe a wrong gap with these noises; the fit of all samples does not.
+    chirp = {
+        'waveform': 'chirp', 'frequency_start': 0.2 * np.pi, 'frequency': 6.0 * np.pi,
+        'output_noise_std': 1e-3, 'seed': seed,
+    }
+    p = tracking(**chirp)
+    assert error(p, 1200) <= 1.1 * error(p.replaced({**GAPLESS, **NO_GAP}), 1200)
 
 
 def test_y_is_led_back_as_soon_as_there_is_an_estimate() -> None:

@@ -78,6 +78,19 @@ class Noise:
     drift_var: Array | None = None
 
 
+@dataclass(frozen=True)
+class Start:
+    """What is known of a record before it is read.
+
+    reaches: of the play operators before the first sample, shape (H,). swing_of_y: highest less
+    lowest y. largest_v: largest |v|.
+    """
+
+    reaches: Array
+    swing_of_y: float
+    largest_v: float
+
+
 class GapBank:
     """Kalman filters for gap widths g (H,), ascending, stepped together.
 
@@ -87,12 +100,13 @@ class GapBank:
 
     noise: what is added per sample. tolerance: relative width of g that one hypothesis stands
     for. with_null: put the hypothesis "v never engaged: u is a constant" in front as row 0, for
-    which theta[0] is that constant.
+    which theta[0] is that constant. start: where it is given, no hypothesis waits for
+    anything.
     """
 
     def __init__(
         self, gaps: Array, model: StateModel, prior: Prior, noise: Noise,
-        tolerance: float = 0.0, with_null: bool = False,
+        tolerance: float = 0.0, with_null: bool = False, start: Start | None = None,
     ) -> None:
         if with_null:
             gaps = np.concatenate([[0.0], gaps])
@@ -121,7 +135,9 @@ class GapBank:
         self._nis = np.ones(count)  # running means of the normalised innovations squared
         self._transition = np.tile(np.eye(n + 3), (count, 1, 1))
         self._transition[:, :n, :n] = model.a
-        self._reach = np.zeros(count)  # q of the play operator: clamped between v and v + g
+        self._at_once = start
+        # q of the play operator: clamped between v and v + g.
+        self._reach = np.zeros(count) if start is None else start.reaches.copy()
         self._left = np.zeros(count)  # 1 where the left side was engaged last
         self._phi = np.zeros((count, 3))
         self._phi[0, 0] = 1.0  # for good under the null hypothesis
@@ -140,6 +156,11 @@ class GapBank:
             self._process_var[:n, :n] = noise.input_std**2 * np.outer(b, b)
             if noise.drift_var is not None:
                 self._process_var[n:, n:] = noise.drift_var
+
+    @property
+    def begins_at_once(self) -> bool:
+        """Whether no hypothesis waits until v has swung over its gap."""
+        return self._at_once is not None
 
     @property
     def nis(self) -> float:
@@ -262,16 +283,26 @@ class GapBank:
         before = self.active
         # Who has started goes on, even if its gap has moved beyond the swing since.
         self.active = max(before, int(np.searchsorted(self.gaps, self.swing, side='right')))
+        if self._at_once is not None:
+            self.active = len(self.gaps)
         new = slice(before, self.active)
-        self._reach[new] = v if rising else v + self.gaps[new]
-        self._left[new] = 0.0 if rising else 1.0
+        upper = v + self.gaps[new]
+        if self._at_once is not None:
+            self._reach[new] = np.clip(self._reach[new], v, upper)
+            self._left[new] = self._reach[new] >= upper
+        else:
+            self._reach[new] = v if rising else upper
+            self._left[new] = 0.0 if rising else 1.0
         self._set_phi(new)
         self._set_state(new)
 
     def _set_state(self, new: slice) -> None:
         """Believe of x that it is near the equilibrium of the newest y, give or take a lot."""
-        n, largest = self._n, max(abs(self._v_low), abs(self._v_high))
+        n, start = self._n, self._at_once
+        largest = max(abs(self._v_low), abs(self._v_high))
         swing = max(self._y_high - self._y_low, 0.0)
+        if start is not None:
+            largest, swing = start.largest_v, start.swing_of_y
         std = STATE_REACH * (swing + self._kick * largest + sqrt(self.noise_var))
         # Covariances of doubles do not span more orders of magnitude than this.
         self._least_noise_var = (PRECISION * std) ** 2

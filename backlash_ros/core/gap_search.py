@@ -1,10 +1,12 @@
-"""Global search for the gap width: a coarse grid finds the basin, replays refine it.
+"""Global search for the gap width: fits or a coarse grid find the basin, replays refine it.
 
-The coarse bank covers every gap the bounds allow. Its winner names a narrow fine bank around its
-own estimate of c_r - c_l, which is run over the recorded samples from the first one on, several
-at a time, until it has caught up and takes over. As the estimate sharpens, this is repeated at
-growing intervals: samples that an earlier, wrong gap had put on the wrong side are read afresh,
-so that noise-free data lead to the exact parameters and not to a residue of the grid.
+While the record is short it is fitted as a whole (early_fits.py): a fit names the gaps of a fine
+bank, and where in them u was at the start. Where fits fail the coarse bank names them. It covers
+every gap the bounds allow, and its winner a narrow range around its own estimate of c_r - c_l.
+Either way the fine bank is run over the recorded samples from the first one on, several at a time,
+until it has caught up and takes over. As the estimate sharpens, this is repeated: samples that an
+earlier, wrong gap had put on the wrong side are read afresh, so that noise-free data lead to the
+exact parameters and not to a residue of the grid.
 """
 
 from __future__ import annotations
@@ -16,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.crossings import Crossings
+from backlash_ros.core.early_fits import EarlyFits
 from backlash_ros.core.estimator import Bounds, Estimate
-from backlash_ros.core.gap_bank import GapBank, Noise, Prior
+from backlash_ros.core.gap_bank import GapBank, Noise, Prior, Start
+from backlash_ros.core.record_search import RecordOptimum
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -34,12 +38,19 @@ OUTWARD, INWARD = 1.9, 0.9
 LOST = 3.0  # standard deviations between read and estimated gap from which both are tried
 CAPACITY = 16384  # samples kept for replays
 REPLAY_SPEED = 5  # recorded samples per new one
-FIRST_REPLAY_SPEED = 8  # while no estimate is known, or none that may be used
+# While no estimate is known, or none that may be used: as many as this share of the time allows,
+# a bank taking some time for each.
+FIRST_REPLAY_SHARE, BANK_STEP_S = 0.3, 60e-6
+SLOWEST_FIRST, FASTEST_FIRST = 8, 50
 LAST_REPLAY = CAPACITY * (REPLAY_SPEED - 1) // REPLAY_SPEED  # later ones would not catch up
 GROWTH_EARLY, GROWTH_LATE = 1.3, 4.0  # of the record between two replays
 EARLY = 400  # samples during which a misread record still shows in the estimate
 # Standard deviations between the gap a record was read with and its estimate that are too many.
 MISREAD_EARLY, MISREAD_LATE = 0.5, 2.0
+TINY_GAP = 0.02  # of the swing of v: fits do not look below
+# Standard deviations of the gap between two gaps of a fine bank: fewer call for a new fit, and with
+# even fewer the bank is of no use.
+COARSE, COARSEST = 0.7, 0.4
 PAUSE = 5  # samples between two looks for a reason to read the record again
 START_GATE = 8.0  # standard deviations; before the fine bank stands only gross outliers are told
 PATIENCE = 2  # outliers in a row that the coarse bank refuses before it believes them
@@ -73,6 +84,7 @@ class SearchSettings:
     noise_std: float  # of y
     input_noise_std: float  # of u
     drift_std: tuple[float, float, float]  # of m, c_r, c_l per square root of a sample
+    sample_period: float
 
 
 class GapSearch:
@@ -89,6 +101,9 @@ class GapSearch:
         self._widest = settings.bounds.c_r[1] - settings.bounds.c_l[0]
         self._inherited = None if inherited is None else _aged(inherited)
         self._y, self._v = np.empty(CAPACITY), np.empty(CAPACITY)
+        self._fits = EarlyFits(
+            settings.model.transfer_function, self._widest, settings.sample_period
+        )
         self._replay: GapBank | None = None
         self._replayed = 0
         self._read_with: Array = np.empty(0)  # gaps with which the fine bank read the record
@@ -96,6 +111,9 @@ class GapSearch:
         self._behind_by = -inf  # log-likelihood by which the coarse bank leads over the fine one
         self._earliest = 0
         self._noise_floor = 0.0
+        affordable = int(FIRST_REPLAY_SHARE * settings.sample_period / BANK_STEP_S)
+        self._first_speed = min(max(affordable, SLOWEST_FIRST), FASTEST_FIRST)
+        self._next_fit = 0  # sample
         self._refused = 0
         self._settled = False
 
@@ -166,6 +184,7 @@ class GapSearch:
     def forget_record(self) -> None:
         """Go on with what the banks know; nothing is read again."""
         self.samples, self._replay = max(self.samples, CAPACITY), None
+        self._fits.give_up()
 
     def add(self, y: float | None, v: float, accepted: bool = True) -> None:
         """Take in a sample; y is None if it was lost, not accepted if it is an outlier."""
@@ -186,6 +205,8 @@ class GapSearch:
         """Read some more of the record again, or look for a reason to; this may wait."""
         if self._replay is not None:
             self._advance_replay()
+        elif self._fits.running:
+            self._advance_fit()
         elif not self.on_trial:
             self._plan_replay()
 
@@ -242,8 +263,13 @@ class GapSearch:
 
     def _plan_replay(self) -> None:
         """Start a fine bank around the best estimate there is, when it is worth it."""
+        if not self.excited:
+            return
+        if self._may_fit:
+            self._plan_fit()
+            return
         due = self.samples >= self._earliest
-        if not (due or (self.undecided and self.samples % PAUSE == 0)) or not self.excited:
+        if not (due or (self.undecided and self.samples % PAUSE == 0)):
             return
         if self.fine is not None and self.samples >= LAST_REPLAY:
             return
@@ -280,11 +306,66 @@ class GapSearch:
             gaps = np.union1d(gaps, bracket(read_with, best))
         self._replay, self._replayed = self._bank(gaps, with_null=False, at=found), 0
 
+    @property
+    def _may_fit(self) -> bool:
+        """Whether the record as a whole may still be fitted."""
+        s = self._settings
+        noisy = s.noise_std > self._noise_floor and s.input_noise_std == 0.0
+        # What was inherited counts more than a short record.
+        if self.inherits or not (noisy and self._fits.possible(self.samples)):
+            return False
+        return self._fits.successful or not self._has_tiny_gap()
+
+    def _has_tiny_gap(self) -> bool:
+        """Whether the gap is too small for a fit, which tells gaps apart in terms of themselves."""
+        bank, coarse = self.fine or self.coarse, self.coarse
+        if bank is None or coarse is None or not bank.active:
+            return False
+        found = bank.found()
+        if found is None or found.gap >= TINY_GAP * coarse.swing:
+            return False
+        return self.negligible(found)
+
+    def _plan_fit(self) -> None:
+        """Begin a fit of all samples so far, unless the record was read with the right gaps."""
+        fine, count = self.fine, self.samples
+        # After an outlier it has to be seen first whether more follow.
+        if count < self._next_fit or isnan(self._y[count - 1]):
+            return
+        if fine is None or not self._well_read(fine):
+            self._next_fit = count + (1 if fine is None else PAUSE)
+            self._fits.begin(self._y[:count], self._v[:count], self._settings.noise_std)
+
+    def _well_read(self, fine: GapBank) -> bool:
+        i, gaps, found = fine.leader, self._read_with, fine.found()
+        surprised = fine.nis > NIS_SETTLED and not self._settled
+        if found is None or surprised or not 0 < i < len(gaps) - 1:
+            return False
+        close = abs(found.gap - gaps[i]) <= MISREAD_EARLY * found.std_gap
+        return bool(close and found.std_gap > COARSE * (gaps[i + 1] - gaps[i]))
+
+    def _advance_fit(self) -> None:
+        best = self._fits.advance(self.samples)
+        if best is not None:
+            self._earliest = int(GROWTH_EARLY * self.samples)
+            self._replay, self._replayed = self._bank_of(best), 0
+
+    def _bank_of(self, best: RecordOptimum) -> GapBank:
+        s, y, v = self._settings, self._y[:self.samples], self._v[:self.samples]
+        prior = Prior(
+            best.m * np.array([1.0, s.initial.c_r, s.initial.c_l]),
+            min(SLOPE_REACH * s.initial.m, s.bounds.m[1]),
+        )
+        start = Start(best.reaches, float(np.nanmax(y) - np.nanmin(y)), float(np.abs(v).max()))
+        return GapBank(
+            best.gaps, s.model, prior, self._noise(s.initial), FINE_TOLERANCE, start=start
+        )
+
     def _advance_replay(self) -> None:
         replay = self._replay
         assert replay is not None
         hurry = self.fine is None or self.undecided
-        speed = FIRST_REPLAY_SPEED if hurry else REPLAY_SPEED
+        speed = self._first_speed if hurry or replay.begins_at_once else REPLAY_SPEED
         end = min(self._replayed + speed, self.samples)
         for k in range(self._replayed, end):
             _advance(replay, float(self._y[k]), float(self._v[k]))
@@ -294,18 +375,32 @@ class GapSearch:
         self._replay = None
         if not replay.active:
             return  # gaps that v has not even swung over yet
+        if replay.begins_at_once and not self._holds(replay):
+            return
         fine = self.fine
         refuted = self._behind(replay)
         if refuted:
             self._earliest = self.samples  # while it was read: no reason to wait
         if fine is None or (self._behind(fine) and not refuted):
             self._fine_since = self.samples
-        elif self._is_undecided(replay) and not self._is_undecided(fine):
-            return  # it would only raise doubts
-        elif self._worse(replay, fine) or fine.nis < NIS_SETTLED < replay.nis:
-            return  # reading the record afresh explained it worse
+        elif not replay.begins_at_once and self._is_no_gain(replay, fine):
+            return
         self.fine, self._read_with = replay, replay.gaps
         self._behind(replay)
+
+    def _holds(self, replay: GapBank) -> bool:
+        """Whether a bank from a fit still is right: what has come since may tell much more."""
+        replay.elect()
+        i, gaps, found = replay.leader, replay.gaps, replay.found()
+        if found is None or not 0 < i < len(gaps) - 1 or replay.nis > NIS_SETTLED:
+            return False
+        return bool(found.std_gap > COARSEST * (gaps[i + 1] - gaps[i]))
+
+    def _is_no_gain(self, replay: GapBank, fine: GapBank) -> bool:
+        """Whether a replay would only raise doubts, or explains the record worse."""
+        if self._is_undecided(replay) and not self._is_undecided(fine):
+            return True
+        return self._worse(replay, fine) or fine.nis < NIS_SETTLED < replay.nis
 
     def _worse(self, replay: GapBank, fine: GapBank) -> bool:
         """Whether a bank that read the record afresh explains it worse than the present one."""

@@ -54,7 +54,8 @@ class KalmanEstimator:
         self.outliers = 0
         self._sample_period = sample_period
         self._settings = SearchSettings(
-            model, bounds, initial, noise_std, input_noise_std, self._per_sample(drift_std)
+            model, bounds, initial, noise_std, input_noise_std, self._per_sample(drift_std),
+            sample_period,
         )
         self._bounds = bounds
         self._observer, self._no_state = observer, np.zeros(model.order)

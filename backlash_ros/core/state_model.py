@@ -22,6 +22,7 @@ class StateModel:
     """
 
     def __init__(self, model: TransferFunction) -> None:
+        self.transfer_function = model
         a, b, c = model.state_space()
         self.order = model.order
         rows, row = [], c
