@@ -100,8 +100,8 @@ class GapBank:
 
     noise: what is added per sample. tolerance: relative width of g that one hypothesis stands
     for. with_null: put the hypothesis "v never engaged: u is a constant" in front as row 0, for
-    which theta[0] is that constant. start: where it is given, no hypothesis waits for
-    anything.
+    which theta[0] is that constant. start: with it no hypothesis waits, u is known from the first
+    sample on.
     """
 
     def __init__(
@@ -283,16 +283,15 @@ class GapBank:
         before = self.active
         # Who has started goes on, even if its gap has moved beyond the swing since.
         self.active = max(before, int(np.searchsorted(self.gaps, self.swing, side='right')))
-        if self._at_once is not None:
+        if self.begins_at_once:
             self.active = len(self.gaps)
         new = slice(before, self.active)
         upper = v + self.gaps[new]
-        if self._at_once is not None:
+        if self.begins_at_once:
             self._reach[new] = np.clip(self._reach[new], v, upper)
-            self._left[new] = self._reach[new] >= upper
         else:
             self._reach[new] = v if rising else upper
-            self._left[new] = 0.0 if rising else 1.0
+        self._left[new] = self._reach[new] >= upper
         self._set_phi(new)
         self._set_state(new)
 
