@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, output_of, plants
 
+from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.input_reconstruction import InputReconstruction
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.transfer_function import TransferFunction
 
 Array = np.ndarray
@@ -181,3 +183,12 @@ def test_it_is_ready_only_after_its_start_is_forgotten() -> None:
         reconstruction.update(0.0)
         ready.append(reconstruction.ready)
     assert ready == [False] * 10 + [True] * 2
+
+
+def test_noise_that_leaves_nothing_of_u_is_refused_by_its_name() -> None:
+    for noise in (10.0, 31622.776601683792):
+        with pytest.raises(ParameterError, match='so large that y says nothing of u') as refusal:
+            build_controller(Parameters({
+                'estimator.law': 'lms', 'estimator.output_noise_std': noise,
+            }))
+        assert str(refusal.value).startswith(f'estimator.output_noise_std={noise!r} ')

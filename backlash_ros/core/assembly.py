@@ -156,7 +156,13 @@ def _initial(p: Parameters) -> Estimate:
 
 def _reconstruction(p: Parameters) -> InputReconstruction:
     noise_std = p.real('estimator.output_noise_std') * LITTLE_SMOOTHING
-    return InputReconstruction(build_model(p), noise_std, p.integer('estimator.lag'))
+    try:
+        return InputReconstruction(build_model(p), noise_std, p.integer('estimator.lag'))
+    except ArithmeticError as error:
+        raise ParameterError(
+            'estimator.output_noise_std', p.real('estimator.output_noise_std'), str(error),
+            'give the standard deviation of the noise on y, in the unit of y',
+        ) from None
 
 
 def _kalman(p: Parameters, initial: Estimate) -> Estimator:

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 LONGEST = 400  # samples of a record that is fitted
 MOST_MISFITS = 3  # in a row: the record is not what a fit supposes
-PRECISION_OF_GAP, PRECISION_OF_M = 0.1, 0.2  # relative deviations below which a fit is of use
+PRECISION_OF_GAP, PRECISION_OF_M = 0.3, 0.2  # relative deviations below which a fit is of use
 # Share of the time that fits may take, the time of a grid per sample of the record, and the most
 # grids per new sample.
 SHARE, GRID_STEP_S, MOST_GRIDS = 0.4, 5e-6, 5

@@ -11,7 +11,7 @@ Reference: B. D. O. Anderson, J. B. Moore, Optimal Filtering, Prentice-Hall 1979
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import nan
+from math import inf, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 NOISE_FLOOR, WEAKEST = 1e-3, 1e-4
 # After a lost sample the covariances take this many lags to become stationary again.
 LAGS_TO_STEADY = 4
+TOO_NOISY = 'is so large that y says nothing of u'
 
 
 @dataclass
@@ -45,7 +46,8 @@ class InputReconstruction:
     """Fixed-lag smoother: u_hat(k - lag) from y(..k).
 
     model: G(z). noise_std: standard deviation of the noise on y. lag: samples, no less than the
-    delay of G. std: standard deviation of u_hat while no sample is lost. Raises ParameterError.
+    delay of G. std: standard deviation of u_hat while no sample is lost. Raises ParameterError, and
+    ArithmeticError where rounding is all that is left because of so much noise.
     """
 
     def __init__(self, model: TransferFunction, noise_std: float, lag: int) -> None:
@@ -64,7 +66,10 @@ class InputReconstruction:
         self._transition = np.eye(n + 1)
         self._transition[:n, :n], self._transition[:n, n] = state.a, state.b / self._scale
         self._noise = max(noise_std / self._scale, NOISE_FLOOR * weakest) ** 2
-        self._steady = self._stationary()
+        try:
+            self._steady = self._stationary()
+        except (linalg.LinAlgError, ValueError):
+            raise ArithmeticError(TOO_NOISY) from None
         self._step = np.zeros((n + 1 + lag, n + 1 + lag))  # from k-1 to k before y(k)
         self._step[:n + 1, :n + 1] = self._transition
         self._step[n + 1:, n:-1] = np.eye(lag)
@@ -73,7 +78,10 @@ class InputReconstruction:
         self._closed = self._step - np.outer(self._gain, self._c * self._step[0])
         self._seen = self._c * self._step[0]
         self._after_steady = self._covariance = self._measured(self._steady)
-        self.std = float(np.sqrt(self._after_steady.var[-1]))
+        variance = float(self._after_steady.var[-1])
+        if not 0.0 < variance < inf:  # rounding has taken over
+            raise ArithmeticError(TOO_NOISY)
+        self.std = sqrt(variance)
         self._z: Array = np.zeros(n + 1 + lag)  # x(k), u(k), u(k-1) .. u(k-lag) given y(..k)
         self._steady_after = self._since_loss = LAGS_TO_STEADY * lag
 

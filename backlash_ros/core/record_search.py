@@ -121,7 +121,7 @@ class RecordSearch:
         self._y = self._unknown_part(y[self._heard])
         self._lowest = float(v[0])
         self._top = min(widest, WIDEST * float(np.ptp(v)))
-        gaps = self._top * RATIO ** np.arange(1.0 - GAPS, 1.0)
+        gaps = np.asarray(self._top * RATIO ** np.arange(1.0 - GAPS, 1.0), dtype=np.float64)
         shares = np.linspace(0.0, 1.0, REACHES)
         self._grids = [
             _Grid(gaps, self._lowest + gaps[:, None] * shares, RATIO, float(shares[1]))
@@ -216,7 +216,7 @@ class RecordSearch:
         """A grid around a gap and a line of reaches through it."""
         ratio, width = min(max(ratio, 1.0 + FINEST), RATIO), min(width, LARGEST_WIDTH)
         steps = np.arange(-HALF, HALF + 1.0)
-        gaps = gap * ratio**steps
+        gaps = np.asarray(gap * ratio**steps, dtype=np.float64)
         gaps = gaps[gaps <= self._top]
         centre = reach + reach_per_gap * (gaps - gap)
         reaches = centre[:, None] + width * gaps[:, None] * steps
