@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 LONGEST = 400  # samples of a record that is fitted
 MOST_MISFITS = 3  # in a row: the record is not what a fit supposes
-PRECISION_OF_GAP, PRECISION_OF_M = 0.3, 0.2  # relative deviations below which a fit is of use
+PRECISION_OF_GAP, PRECISION_OF_M = 0.2, 0.2  # relative deviations below which a fit is of use
 # Share of the time that fits may take, the time of a grid per sample of the record, and the most
 # grids per new sample.
 SHARE, GRID_STEP_S, MOST_GRIDS = 0.4, 5e-6, 5
@@ -69,8 +69,14 @@ class EarlyFits:
             self._misfits += 1
             return None
         self._misfits, self._best = 0, found
-        precise = found.std_gap < PRECISION_OF_GAP * found.gap
-        if not (precise and found.std_m < PRECISION_OF_M * found.m):
+        precise = (
+            found.std_gap < PRECISION_OF_GAP * found.gap and found.std_m < PRECISION_OF_M * found.m
+        )
+        # A deviation beyond the last grid comes from another basin.
+        alone = found.gaps[0] < found.gap - found.std_gap and (
+            found.gap + found.std_gap < found.gaps[-1]
+        )
+        if not (precise and alone):
             return None
         self.successful = True
         return found

@@ -310,9 +310,11 @@ class GapSearch:
     def _may_fit(self) -> bool:
         """Whether the record as a whole may still be fitted."""
         s = self._settings
-        noisy = s.noise_std > self._noise_floor and s.input_noise_std == 0.0
+        supposed = s.noise_std > self._noise_floor and s.input_noise_std == 0.0
         # What was inherited counts more than a short record.
-        if self.inherits or not (noisy and self._fits.possible(self.samples)):
+        if self.inherits or any(s.drift_std) or not supposed:
+            return False
+        if not self._fits.possible(self.samples):
             return False
         return self._fits.successful or not self._has_tiny_gap()
 

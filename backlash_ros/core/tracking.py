@@ -24,7 +24,7 @@ WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is un
 # wrong is contradicted by then. Until then feedback hardens step by step.
 TRUSTED_AFTER = 40
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
-SHARP, SHARP_COUNTS = 0.01, 8
+SHARP, SHARP_COUNTS = 0.01, 20
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.
@@ -148,7 +148,7 @@ class Tracking:
     def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
         # Constants that are given, not learned, are trusted from the start.
         known = TRUSTED_AFTER if first else self._trusted_for
-        known += SHARP_COUNTS if _is_sharp(estimate) else 1
+        known += SHARP_COUNTS if _is_sharp(estimate, self._u_reach) else 1
         self._trusted_for = known if _trusted(estimate) else 0
         return self._trusted_for >= TRUSTED_AFTER
 
@@ -178,9 +178,11 @@ def _trusted(estimate: Estimate) -> bool:
     return estimate.learned and estimate.status not in (Status.ACQUIRING, Status.INCONSISTENT)
 
 
-def _is_sharp(estimate: Estimate) -> bool:
-    gap = estimate.c_r - estimate.c_l
-    return estimate.std_m < SHARP * estimate.m and estimate.std_c_r + estimate.std_c_l < SHARP * gap
+def _is_sharp(estimate: Estimate, u_reach: float) -> bool:
+    # Beside far larger u even a gap that is hardly known makes little difference.
+    large = max(estimate.c_r - estimate.c_l, u_reach / estimate.m)
+    std_gap = estimate.std_c_r + estimate.std_c_l
+    return estimate.std_m < SHARP * estimate.m and std_gap < SHARP * large
 
 
 def cautious_crossings(estimate: Estimate, deviations: float) -> tuple[float, float]:
