@@ -24,7 +24,7 @@ WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is un
 # wrong is contradicted by then. Until then feedback hardens step by step.
 TRUSTED_AFTER = 40
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
-SHARP, SHARP_COUNTS = 0.01, 20
+SHARP, SHARP_COUNTS = 0.01, 17
 
 # Standard deviations of u_d within which a turn counts as noise. Wider bands hold v for so long
 # that the feedback has to hurry afterwards, and cross the gap more often, not less.
