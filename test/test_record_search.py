@@ -137,7 +137,9 @@ def test_slower_loops_may_do_more_per_sample() -> None:
             count += 1
         return count
 
-    assert samples(0.01) < samples(0.001)
+    assert samples(0.01) < samples(0.005)
+    assert EarlyFits(MODEL, WIDEST, 0.005).possible(len(y))
+    assert not EarlyFits(MODEL, WIDEST, 0.001).possible(len(y))
 
 
 @pytest.mark.parametrize('reach', [2.0, 3.0, 4.0])

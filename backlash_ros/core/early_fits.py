@@ -37,8 +37,10 @@ class EarlyFits:
         return self._search is not None
 
     def possible(self, samples: int) -> bool:
-        """Whether a record of so many samples may be fitted."""
-        return samples <= LONGEST and self._misfits < MOST_MISFITS
+        """Whether a record of so many samples may be fitted; never in a loop without the time."""
+        # A grid of the longest record in one go must not hold up the next samples.
+        affordable = self._allowance_s >= GRID_STEP_S * LONGEST
+        return affordable and samples <= LONGEST and self._misfits < MOST_MISFITS
 
     def give_up(self) -> None:
         """End a search without a result."""
