@@ -15,7 +15,7 @@ from printed_law import (
 )
 from runs import simulate
 
-from backlash_ros.core import early_fits, gap_search, kalman
+from backlash_ros.core import early_fits, gap_choice, gap_search, kalman
 from backlash_ros.core.metrics import control_error_rms, settling_time
 from backlash_ros.core.transfer_function import TransferFunction
 
@@ -124,16 +124,16 @@ def disturbance() -> str:
 
 def estimator_constants() -> str:
     """The constants of the method, as they stand in the code."""
-    k, s = kalman, gap_search
-    count = int(np.ceil(-np.log(s.SMALLEST_GAP) / np.log(s.GRID_RATIO))) + 1
+    k, s, g = kalman, gap_search, gap_choice
+    count = int(np.ceil(-np.log(g.SMALLEST_GAP) / np.log(g.GRID_RATIO))) + 1
     rows = (
-        ('coarse bank: hypotheses, besides "v never engaged"', f'{count}', 'gap_search.py'),
-        ('ratio of neighbouring gaps', f'{s.GRID_RATIO:g}', 'gap_search.py'),
-        ('smallest gap, as a share of the widest one within the bounds', f'{s.SMALLEST_GAP:g}',
-         'gap_search.py'),
-        ('fine bank: hypotheses', f'{s.FINE}', 'gap_search.py'),
-        ('fine bank: reach to either side, in standard deviations of the gap', f'{s.REACH:g}',
-         'gap_search.py'),
+        ('coarse bank: hypotheses, besides "v never engaged"', f'{count}', 'gap_choice.py'),
+        ('ratio of neighbouring gaps', f'{g.GRID_RATIO:g}', 'gap_choice.py'),
+        ('smallest gap, as a share of the widest one within the bounds', f'{g.SMALLEST_GAP:g}',
+         'gap_choice.py'),
+        ('fine bank: hypotheses', f'{g.FINE}', 'gap_choice.py'),
+        ('fine bank: reach to either side, in standard deviations of the gap', f'{g.REACH:g}',
+         'gap_choice.py'),
         ('record: longest, in samples', f'{s.CAPACITY}', 'gap_search.py'),
         ('recorded samples read again with each new one', f'{s.REPLAY_SPEED}', 'gap_search.py'),
         ('... while none may be published', f'{s.SLOWEST_FIRST} to {s.FASTEST_FIRST}',

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from strategies import output_of
 
 from backlash_ros.core.assembly import build_model, build_state_model
 from backlash_ros.core.backlash import Backlash
@@ -23,21 +24,23 @@ MODEL = build_model(Parameters())
 
 
 def record(
-    v: np.ndarray, m: float, c_r: float, c_l: float, u: float, noise: float = NOISE, seed: int = 0,
+    v: np.ndarray, m: float, c_r: float, c_l: float, u: float, seed: int = 0,
+    model: TransferFunction = MODEL,
 ) -> np.ndarray:
-    """y (N,) of the example, at rest before; v acts before each y."""
+    """y (N,) of a model, the example's unless told, at rest before; v acts before each y."""
     backlash = Backlash(m, c_r, c_l, u)
-    a, b, c = MODEL.state_space()
-    x, y = np.zeros(MODEL.order), []
-    for value in v.tolist():
-        x = a @ x + b * backlash.step(value)
-        y.append(c @ x)
-    return np.array(y) + noise * np.random.default_rng(seed).standard_normal(len(v))
+    # The newest u does not show in y yet, so one more makes way for it.
+    held = [backlash.step(value) for value in v.tolist()]
+    y = output_of(model, np.array([*held, 0.0]))[1:]
+    return y + NOISE * np.random.default_rng(seed).standard_normal(len(v))
 
 
-def search(y: np.ndarray, v: np.ndarray, hint: RecordOptimum | None = None) -> RecordOptimum | None:
+def search(
+    y: np.ndarray, v: np.ndarray, hint: RecordOptimum | None = None,
+    model: TransferFunction = MODEL,
+) -> RecordOptimum | None:
     """The optimum of a finished search."""
-    running = RecordSearch(MODEL, y, v, NOISE, WIDEST, hint)
+    running = RecordSearch(model, y, v, NOISE, WIDEST, hint)
     while not running.advance():
         pass
     return running.optimum
@@ -185,17 +188,6 @@ def _least_squares(y: np.ndarray, v: np.ndarray, gap: float, reach: float) -> np
 def test_zero_in_front_of_the_numerator_is_a_delay() -> None:
     late = TransferFunction([1.0], [1.0, -0.9, 0.0])
     v = swing(200, 10.0)
-    backlash = Backlash(1.3, 3.0, -3.0)
-    u = [backlash.step(value) for value in v.tolist()]
-    y, state = [], 0.0
-    for value in [0.0, *u[:-1]]:
-        state = 0.9 * state + value
-        y.append(state)
-    running = RecordSearch(
-        late, np.array(y) + NOISE * np.random.default_rng(1).standard_normal(len(v)), v, NOISE,
-        WIDEST,
-    )
-    while not running.advance():
-        pass
-    assert running.optimum is not None
-    assert running.optimum.gap == pytest.approx(6.0, rel=1e-3)
+    found = search(record(v, 1.3, 3.0, -3.0, 0.0, model=late), v, model=late)
+    assert found is not None
+    assert found.gap == pytest.approx(6.0, rel=1e-3)

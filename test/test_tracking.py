@@ -174,6 +174,7 @@ def test_reference_that_begins_slowly_is_followed_from_two_seconds_on(seed: int)
         'output_noise_std': 1e-3, 'seed': seed,
     }
     p = tracking(**chirp)
+    assert np.abs(simulate(p, 400).column('y')).max() < 0.3
     assert error(p, 1200) <= 1.1 * error(p.replaced({**GAPLESS, **NO_GAP}), 1200)
 
 

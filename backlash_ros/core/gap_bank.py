@@ -298,10 +298,11 @@ class GapBank:
     def _set_state(self, new: slice) -> None:
         """Believe of x that it is near the equilibrium of the newest y, give or take a lot."""
         n, start = self._n, self._at_once
-        largest = max(abs(self._v_low), abs(self._v_high))
-        swing = max(self._y_high - self._y_low, 0.0)
         if start is not None:
             largest, swing = start.largest_v, start.swing_of_y
+        else:
+            largest = max(abs(self._v_low), abs(self._v_high))
+            swing = max(self._y_high - self._y_low, 0.0)
         std = STATE_REACH * (swing + self._kick * largest + sqrt(self.noise_var))
         # Covariances of doubles do not span more orders of magnitude than this.
         self._least_noise_var = (PRECISION * std) ** 2

@@ -11,30 +11,21 @@ exact parameters and not to a residue of the grid.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import ceil, hypot, inf, isnan, log, nan
+from math import hypot, inf, isnan, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.bank_making import BankMaker, SearchSettings
 from backlash_ros.core.crossings import Crossings
 from backlash_ros.core.early_fits import EarlyFits
-from backlash_ros.core.estimator import Bounds, Estimate
-from backlash_ros.core.gap_bank import GapBank, Noise, Prior, Start
-from backlash_ros.core.record_search import RecordOptimum
-from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.gap_bank import GapBank
+from backlash_ros.core.gap_choice import FINE, beyond, bracket, coarse_gaps, fine_gaps
 
 Array = NDArray[np.float64]
 
-GRID_RATIO = 1.2  # between neighbouring gaps of the coarse grid
-SMALLEST_GAP = 5e-4  # of the widest gap the bounds allow
-FINE = 7  # hypotheses of a fine bank
-REACH = 2.0  # standard deviations of the gap that a fine bank reaches to either side
-LARGEST_SPREAD = 0.3  # of the gap: the standard deviation is not to be trusted beyond
 NARROW = 0.04  # width of a fine bank, as a share of the gap, that needs no better decision
-# Gaps tried beyond the first or last one of a fine bank, if that one is the most likely, in terms
-# of it.
-OUTWARD, INWARD = 1.9, 0.9
 LOST = 3.0  # standard deviations between read and estimated gap from which both are tried
 CAPACITY = 16384  # samples kept for replays
 REPLAY_SPEED = 5  # recorded samples per new one
@@ -60,31 +51,13 @@ DOUBT_MARGIN = 3.0  # the same for an estimate that may be used; a refined one i
 REPLAY_PRECISION = 0.5  # of the gap: known better, it is worth a fine bank
 NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
 REPLAY_MARGIN = 5.0  # log-likelihood by which a bank that read the record afresh may be worse
-COARSE_TOLERANCE = 0.1  # half of GRID_RATIO - 1
-FINE_TOLERANCE = 1e-6  # keeps the comparison finite when the estimate is exact
 SETTLED = 100  # samples of the fine bank after which the coarse one may rest
 NIS_SETTLED = 1.6  # normalised innovation squared of a fine bank that may be trusted to go alone
-# Without noise the filter still needs some, this far below what one sample of u does to x.
-NOISE_FLOOR = 1e-6
 # Share of the widest gap within which v counts as at rest at the start. A trajectory with preview
 # begins with moves that are nothing but rounding, and say nothing of the scale of things.
 AT_REST = 1e-6
-SLOPE_REACH = 30.0  # standard deviation of the slope before the first sample, in first guesses
 # Share of the slope and of the gap that may have changed while nobody looked.
 CHANGED_MEANWHILE = 0.01
-
-
-@dataclass(frozen=True)
-class SearchSettings:
-    """What a search needs to know: the model, the bounds, the first guess and the noise."""
-
-    model: StateModel
-    bounds: Bounds
-    initial: Estimate
-    noise_std: float  # of y
-    input_noise_std: float  # of u
-    drift_std: tuple[float, float, float]  # of m, c_r, c_l per square root of a sample
-    sample_period: float
 
 
 class GapSearch:
@@ -97,7 +70,7 @@ class GapSearch:
         self.samples = 0
         # What was learned before is neither improved nor replaced until the data agree with it.
         self.on_trial = inherited is not None
-        self._settings = settings
+        self._maker = BankMaker(settings)
         self._widest = settings.bounds.c_r[1] - settings.bounds.c_l[0]
         self._inherited = None if inherited is None else _aged(inherited)
         self._y, self._v = np.empty(CAPACITY), np.empty(CAPACITY)
@@ -110,7 +83,6 @@ class GapSearch:
         self._fine_since = 0
         self._behind_by = -inf  # log-likelihood by which the coarse bank leads over the fine one
         self._earliest = 0
-        self._noise_floor = 0.0
         affordable = int(FIRST_REPLAY_SHARE * settings.sample_period / BANK_STEP_S)
         self._first_speed = min(max(affordable, SLOWEST_FIRST), FASTEST_FIRST)
         self._next_fit = 0  # sample
@@ -120,7 +92,7 @@ class GapSearch:
     @property
     def memory(self) -> int:
         """Samples after which the plant has forgotten its input."""
-        return self._settings.model.memory
+        return self._maker.settings.model.memory
 
     @property
     def settled(self) -> bool:
@@ -215,16 +187,12 @@ class GapSearch:
         count = self.samples
         if np.ptp(self._v[:count]) == 0.0:
             return
-        s = self._settings
-        motion = float(np.abs(self._v[:count]).max()) * s.initial.m
-        self._noise_floor = NOISE_FLOOR * float(np.linalg.norm(s.model.b)) * motion
-        steps = ceil(-log(SMALLEST_GAP) / log(GRID_RATIO))
-        grid = self._widest * SMALLEST_GAP ** np.linspace(1.0, 0.0, steps + 1)
-        banks = [self._bank(np.asarray(grid, dtype=np.float64), with_null=True)]
+        self._maker.see_motion(float(np.abs(self._v[:count]).max()))
+        banks = [self._maker.coarse(coarse_gaps(self._widest))]
         self.coarse = banks[0]
         if self._inherited is not None:
             self._read_with = fine_gaps(self._inherited, FINE)
-            self.fine = self._bank(self._read_with, with_null=False, at=self._inherited)
+            self.fine = self._maker.fine(self._read_with, self._inherited, self._inherited)
             self._fine_since = count
             banks.append(self.fine)
         for y, v in zip(self._y[:count], self._v[:count], strict=True):
@@ -263,13 +231,11 @@ class GapSearch:
 
     def _plan_replay(self) -> None:
         """Start a fine bank around the best estimate there is, when it is worth it."""
-        if not self.excited:
-            return
         if self._may_fit:
             self._plan_fit()
             return
         due = self.samples >= self._earliest
-        if not (due or (self.undecided and self.samples % PAUSE == 0)):
+        if not (due or (self.undecided and self.samples % PAUSE == 0)) or not self.excited:
             return
         if self.fine is not None and self.samples >= LAST_REPLAY:
             return
@@ -304,13 +270,13 @@ class GapSearch:
             gaps = np.union1d(gaps, beyond(read_with, best))
         elif abs(found.gap - read_with[best]) > LOST * found.std_gap:
             gaps = np.union1d(gaps, bracket(read_with, best))
-        self._replay, self._replayed = self._bank(gaps, with_null=False, at=found), 0
+        self._replay, self._replayed = self._maker.fine(gaps, found, self._inherited), 0
 
     @property
     def _may_fit(self) -> bool:
         """Whether the record as a whole may still be fitted."""
-        s = self._settings
-        supposed = s.noise_std > self._noise_floor and s.input_noise_std == 0.0
+        s = self._maker.settings
+        supposed = s.noise_std > self._maker.noise_floor and s.input_noise_std == 0.0
         # What was inherited counts more than a short record.
         if self.inherits or any(s.drift_std) or not supposed:
             return False
@@ -332,36 +298,25 @@ class GapSearch:
         """Begin a fit of all samples so far, unless the record was read with the right gaps."""
         fine, count = self.fine, self.samples
         # After an outlier it has to be seen first whether more follow.
-        if count < self._next_fit or isnan(self._y[count - 1]):
+        if count < self._next_fit or isnan(self._y[count - 1]) or not self.excited:
             return
         if fine is None or not self._well_read(fine):
             self._next_fit = count + (1 if fine is None else PAUSE)
-            self._fits.begin(self._y[:count], self._v[:count], self._settings.noise_std)
+            self._fits.begin(self._y[:count], self._v[:count], self._maker.settings.noise_std)
 
     def _well_read(self, fine: GapBank) -> bool:
-        i, gaps, found = fine.leader, self._read_with, fine.found()
-        surprised = fine.nis > NIS_SETTLED and not self._settled
-        if found is None or surprised or not 0 < i < len(gaps) - 1:
+        found = fine.found()
+        if found is None or (fine.nis > NIS_SETTLED and not self._settled):
             return False
-        close = abs(found.gap - gaps[i]) <= MISREAD_EARLY * found.std_gap
-        return bool(close and found.std_gap > COARSE * (gaps[i + 1] - gaps[i]))
+        misread = abs(found.gap - self._read_with[fine.leader]) > MISREAD_EARLY * found.std_gap
+        return not misread and _resolve(self._read_with, fine.leader, found, COARSE)
 
     def _advance_fit(self) -> None:
         best = self._fits.advance(self.samples)
         if best is not None:
             self._earliest = int(GROWTH_EARLY * self.samples)
-            self._replay, self._replayed = self._bank_of(best), 0
-
-    def _bank_of(self, best: RecordOptimum) -> GapBank:
-        s, y, v = self._settings, self._y[:self.samples], self._v[:self.samples]
-        prior = Prior(
-            best.m * np.array([1.0, s.initial.c_r, s.initial.c_l]),
-            min(SLOPE_REACH * s.initial.m, s.bounds.m[1]),
-        )
-        start = Start(best.reaches, float(np.nanmax(y) - np.nanmin(y)), float(np.abs(v).max()))
-        return GapBank(
-            best.gaps, s.model, prior, self._noise(s.initial), FINE_TOLERANCE, start=start
-        )
+            y, v = self._y[:self.samples], self._v[:self.samples]
+            self._replay, self._replayed = self._maker.fitted(best, y, v), 0
 
     def _advance_replay(self) -> None:
         replay = self._replay
@@ -393,10 +348,10 @@ class GapSearch:
     def _holds(self, replay: GapBank) -> bool:
         """Whether a bank from a fit still is right: what has come since may tell much more."""
         replay.elect()
-        i, gaps, found = replay.leader, replay.gaps, replay.found()
-        if found is None or not 0 < i < len(gaps) - 1 or replay.nis > NIS_SETTLED:
+        found = replay.found()
+        if found is None or replay.nis > NIS_SETTLED:
             return False
-        return bool(found.std_gap > COARSEST * (gaps[i + 1] - gaps[i]))
+        return _resolve(replay.gaps, replay.leader, found, COARSEST)
 
     def _is_no_gain(self, replay: GapBank, fine: GapBank) -> bool:
         """Whether a replay would only raise doubts, or explains the record worse."""
@@ -413,32 +368,12 @@ class GapSearch:
             return by > -COARSE_MARGIN
         return by > REPLAY_MARGIN
 
-    def _bank(self, gaps: Array, with_null: bool, at: Crossings | None = None) -> GapBank:
-        s, known = self._settings, None if with_null else self._inherited
-        i = known or s.initial
-        prior = Prior(
-            np.array([i.m, i.m * i.c_r, i.m * i.c_l]),
-            min(SLOPE_REACH * i.m, s.bounds.m[1]),
-            None if known is None else covariance_of_products(
-                known, (known.std_m, known.std_c_r, known.std_c_l)
-            ),
-        )
-        tolerance = COARSE_TOLERANCE if with_null else FINE_TOLERANCE
-        return GapBank(gaps, s.model, prior, self._noise(at or i), tolerance, with_null)
-
     def set_noise(self, settings: SearchSettings) -> None:
         """Expect the noise of these settings from now on; whatever was learned stays."""
-        self._settings = settings
+        self._maker.settings = settings
         for bank in (self.coarse, self.fine, self._replay):
             if bank is not None:
-                bank.set_noise(self._noise(bank.found() or settings.initial))
-
-    def _noise(self, at: Estimate | Crossings) -> Noise:
-        s = self._settings
-        return Noise(
-            max(s.noise_std, self._noise_floor), s.input_noise_std,
-            covariance_of_products(at, s.drift_std) if any(s.drift_std) else None,
-        )
+                bank.set_noise(self._maker.noise(bank.found() or settings.initial))
 
 
 def _aged(estimate: Estimate) -> Crossings:
@@ -458,30 +393,8 @@ def _advance(bank: GapBank, y: float, v: float) -> None:
         bank.correct(y)
 
 
-def bracket(gaps: Array, leader: int) -> Array:
-    """Gaps between the neighbours of the leader, should its estimate of the gap mislead."""
-    low = gaps[leader - 1] if leader > 0 and gaps[leader - 1] > 0.0 else 0.9 * gaps[leader]
-    high = gaps[leader + 1] if leader + 1 < len(gaps) else 1.1 * gaps[leader]
-    shares = np.array([-0.7, -0.35, 0.0, 0.35, 0.7])
-    reach = np.where(shares < 0.0, gaps[leader] - low, high - gaps[leader])
-    return np.asarray(gaps[leader] + shares * reach)
-
-
-def beyond(gaps: Array, leader: int) -> Array:
-    """Gaps on the far side of a leader that is the first or the last one."""
-    reach = (1.0 / OUTWARD, 1.0 / INWARD) if leader == 0 else (INWARD, OUTWARD)
-    return np.asarray(gaps[leader] * np.geomspace(*reach, FINE))
-
-
-def fine_gaps(found: Crossings, count: int) -> Array:
-    """Gaps of a fine bank around an estimate, ascending and > 0."""
-    least = 1e-3 * found.std_gap
-    gap = max(found.gap, least)
-    spread = min(REACH * found.std_gap, max(LARGEST_SPREAD * gap, found.std_gap))
-    return np.asarray(np.maximum(gap + spread * np.linspace(-1.0, 1.0, count), least))
-
-
-def covariance_of_products(at: Estimate | Crossings, std: tuple[float, float, float]) -> Array:
-    """Covariance (3, 3) of theta that follows from deviations of m, c_r, c_l, independent."""
-    jacobian = np.array([[1.0, 0.0, 0.0], [at.c_r, at.m, 0.0], [at.c_l, 0.0, at.m]])
-    return np.asarray(jacobian @ np.diag(np.square(std)) @ jacobian.T)
+def _resolve(gaps: Array, leader: int, found: Crossings, least: float) -> bool:
+    """Whether the leader has neighbours, no more than 1 / least deviations of the gap away."""
+    if not 0 < leader < len(gaps) - 1:
+        return False
+    return bool(found.std_gap > least * (gaps[leader + 1] - gaps[leader]))

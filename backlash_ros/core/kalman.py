@@ -13,11 +13,13 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.bank_making import SearchSettings
 from backlash_ros.core.crossings import Crossings
 from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
 from backlash_ros.core.fixed import FixedBacklash
 from backlash_ros.core.gap_bank import GapBank
-from backlash_ros.core.gap_search import GapSearch, SearchSettings, fine_gaps
+from backlash_ros.core.gap_choice import fine_gaps
+from backlash_ros.core.gap_search import GapSearch
 from backlash_ros.core.state_model import StateModel
 
 GATE = 6.0  # standard deviations of an innovation beyond which y is an outlier

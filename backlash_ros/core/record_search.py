@@ -78,7 +78,7 @@ class _Line:
     reaches: Array  # (G,)
     squares: Array  # (G,), sums of squared residuals
     m: Array  # (G,)
-    rise: float = inf  # of the squares from the best reach of the best gap to those beside it
+    rise: float  # of the squares from the best reach of the best gap to those beside it
 
     @property
     def best(self) -> int:
@@ -121,11 +121,7 @@ class RecordSearch:
         self._y = self._unknown_part(y[self._heard])
         self._lowest = float(v[0])
         self._top = min(widest, WIDEST * float(np.ptp(v)))
-        gaps = np.asarray(self._top * RATIO ** np.arange(1.0 - GAPS, 1.0), dtype=np.float64)
-        shares = np.linspace(0.0, 1.0, REACHES)
-        self._grids = [
-            _Grid(gaps, self._lowest + gaps[:, None] * shares, RATIO, float(shares[1]))
-        ]
+        self._grids: list[_Grid] = []
         self._tried: list[_Line] = []
         self._stages = 0
 
@@ -135,7 +131,7 @@ class RecordSearch:
             return True
         self._stages += 1
         if self._stages == 1:
-            self._grids = self._basins(self._grids[0])
+            self._grids = self._basins()
             return not self._grids
         lines = self._evaluate(self._grids)
         self._tried += lines
@@ -173,8 +169,11 @@ class RecordSearch:
             gaps=leader.grid.gaps, reaches=leader.reaches, misfit=self._misfit(leader),
         )
 
-    def _basins(self, grid: _Grid) -> list[_Grid]:
-        """Grids around the best local minima of the first one."""
+    def _basins(self) -> list[_Grid]:
+        """Grids around the best local minima of the first one, and around the hint."""
+        gaps = np.asarray(self._top * RATIO ** np.arange(1.0 - GAPS, 1.0), dtype=np.float64)
+        shares = np.linspace(0.0, 1.0, REACHES)
+        grid = _Grid(gaps, self._lowest + gaps[:, None] * shares, RATIO, float(shares[1]))
         squares, slopes = (
             values.reshape(grid.reaches.shape)
             for values in self._squares(grid.gaps.repeat(REACHES), grid.reaches.ravel())

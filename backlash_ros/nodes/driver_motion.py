@@ -11,10 +11,11 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.bank_making import COARSE_TOLERANCE, NOISE_FLOOR, SLOPE_REACH
 from backlash_ros.core.controller import plausible
 from backlash_ros.core.crossings import Crossings
 from backlash_ros.core.gap_bank import GapBank, Noise, Prior
-from backlash_ros.core.gap_search import COARSE_TOLERANCE, NO_GAP, NOISE_FLOOR, SLOPE_REACH
+from backlash_ros.core.gap_search import NO_GAP
 from backlash_ros.core.kalman import PRECISE_GAP, PRECISE_SLOPE
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.record_fit import MORE_DELAY, RecordFit, fit_record
