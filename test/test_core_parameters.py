@@ -117,6 +117,11 @@ def test_nan_is_never_a_value(parameter: Parameter) -> None:
     assert 'must be finite' in refusal_of(parameter.name, 'nan')
 
 
+@named([p for p in NUMBERS if p.high == inf])
+def test_number_whose_square_is_none_is_refused(parameter: Parameter) -> None:
+    assert 'must be within' in refusal_of(parameter.name, 1e160)
+
+
 @named([p for p in NUMBERS if not p.infinite])
 def test_infinity_is_refused_where_it_has_no_meaning(parameter: Parameter) -> None:
     for value in (inf, -inf, 'inf'):

@@ -65,7 +65,8 @@ class InputReconstruction:
         self._c = state.c
         self._transition = np.eye(n + 1)
         self._transition[:n, :n], self._transition[:n, n] = state.a, state.b / self._scale
-        self._noise = max(noise_std / self._scale, NOISE_FLOOR * weakest) ** 2
+        noise = max(noise_std / self._scale, NOISE_FLOOR * weakest)
+        self._noise = noise * noise  # inf where ** would raise
         try:
             self._steady = self._stationary()
         except (linalg.LinAlgError, ValueError):

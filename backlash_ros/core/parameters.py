@@ -12,6 +12,7 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter, Value
 
 NOISE = 'estimator.output_noise_std'
+LARGEST = 1e100  # squares, and products of two, still are numbers
 NAME = re.compile(r'[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # a namespace of ROS
 
 
@@ -182,6 +183,10 @@ def _real(parameter: Parameter, value: object) -> float:
         raise ParameterError(parameter.name, '...', 'is too large for a number') from None
     if isnan(number) or not (isfinite(number) or parameter.infinite):
         raise ParameterError(parameter.name, number, 'must be finite')
+    if isfinite(number) and abs(number) > LARGEST:
+        raise ParameterError(
+            parameter.name, number, f'must be within ±{LARGEST:g}', 'choose another unit'
+        )
     unit = f' {parameter.unit}' if parameter.unit else ''
     if number < parameter.low or (parameter.above and number == parameter.low):
         sign = '>' if parameter.above else '>='
