@@ -4,7 +4,7 @@
 
 G(z) of the paper's example, resampled to a period of 1 ms, on real nodes in real time. Beside them
 a bare clock, which does nothing but sleep until the next period, tells for how many periods the
-machine itself stood still.
+machine itself stood still. The plant misses them as well, and more: samples that were never sent.
 """
 
 from __future__ import annotations
@@ -88,10 +88,14 @@ def run_loop(seconds: float, minutes: float) -> list[Check]:
             for child in supervisor.children if child.plan.log.stat().st_size
         }
     counts = dict(re.findall(r'([a-z][a-z ]*): (\d+)', logs['controller']))
-    lost = int(counts.get('lost', 0))
-    checks.insert(0, Check(
-        f'samples lost of {counts["samples"]} at {1.0 / PERIOD_S:g} Hz', '0', str(lost), lost == 0
-    ))
+    lost, unsent = (int(counts.get(name, 0)) for name in ('lost', 'of these never sent'))
+    checks[:0] = [
+        Check(f'{what} of {counts["samples"]} at {1.0 / PERIOD_S:g} Hz', '0', str(count), not count)
+        for what, count in (
+            ('samples lost between plant and controller', lost - unsent),
+            ('samples for which the machine let the plant wake too late', unsent),
+        )
+    ]
     for name in ('plant', 'controller', 'bare clock'):
         print(f'{name}: {logs[name]}')
     return checks

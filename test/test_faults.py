@@ -111,6 +111,7 @@ def test_lost_outputs_leave_the_estimates_within_5_percent(tmp_path: Path, share
         driver.run(1.0)
         driver.run_until_known(0.05)
         driver.run_until(lambda: driver.value('lost') > 0, 'the count of the lost ones')
+        assert driver.value('of these never sent') > 0
         driver.check_sanity()
         assert controller.stop() == 0
 

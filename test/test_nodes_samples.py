@@ -41,7 +41,19 @@ def test_outputs_never_published_show_in_time_though_the_numbers_have_no_gap(
 ) -> None:
     counter = SampleCounter(PERIOD_S)
     stamps = stamps_of(gaps, delays)
-    assert [counter.count(stamp, 1 + i).missing for i, stamp in enumerate(stamps)] == [0, *gaps]
+    arrivals = [counter.count(stamp, 1 + i) for i, stamp in enumerate(stamps)]
+    assert [arrival.missing for arrival in arrivals] == [0, *gaps]
+    assert [arrival.unsent for arrival in arrivals] == [0, *gaps]
+
+
+@given(gaps, delays)
+def test_outputs_lost_on_their_way_were_sent(gaps: list[int], delays: list[float]) -> None:
+    counter, sequence, arrivals = SampleCounter(PERIOD_S), 1, []
+    for stamp, gap in zip(stamps_of(gaps, delays), [*gaps, 0], strict=True):
+        arrivals.append(counter.count(stamp, sequence))
+        sequence += 1 + gap
+    assert [arrival.missing for arrival in arrivals] == [0, *gaps]
+    assert not any(arrival.unsent for arrival in arrivals)
 
 
 @given(gaps)

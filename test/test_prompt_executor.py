@@ -142,3 +142,25 @@ def test_what_arrived_before_a_tick_counts_though_none_was_expected(loop: Loop) 
     spin_paced(loop.node, loop.executor, 2e-3, tick, idle=lambda: True)
     # A message may be on its way still; ten would be twenty milliseconds.
     assert sorted(unheard)[-10] <= 3
+
+
+def test_what_may_wait_is_served_after_a_tick_and_not_before_one(loop: Loop) -> None:
+    ticked, calls = False, []
+
+    def tick(number: int, due_ns: int) -> bool:
+        nonlocal ticked
+        ticked = True
+        return number < 100
+
+    def idle() -> bool:
+        nonlocal ticked
+        ticked = False
+        return True
+
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    loop.node.create_subscription(Float64, 'number', lambda message: None, 10)
+    loop.node.create_timer(0.01, lambda: calls.append(ticked), clock=steady)
+    loop.node.stopping = False
+    spin_paced(loop.node, loop.executor, 2e-3, tick, idle)
+    assert len(calls) > 10
+    assert all(calls)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import (
     QoSCompatibility,
     QoSProfile,
@@ -41,6 +40,7 @@ from backlash_ros.nodes.driver_motion import record_of
 from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
 from backlash_ros.nodes.gentle_drive import GentleDrive, drive_range
 from backlash_ros.nodes.messages import DEPTH
+from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
 
 EXECUTABLE = 'check_driver'
@@ -79,7 +79,7 @@ class CheckDriverNode(ProcessNode):
         }
         self.exit_code = UNFIT
 
-    def work(self, executor: SingleThreadedExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         """Wait for the driver, listen, come to rest, tell."""
         if self._await_driver(executor):
             self._listen()
@@ -96,7 +96,7 @@ class CheckDriverNode(ProcessNode):
         else:
             self._tell()
 
-    def _await_driver(self, executor: SingleThreadedExecutor) -> bool:
+    def _await_driver(self, executor: PromptExecutor) -> bool:
         deadline = time.monotonic() + self._options.wait
         remind = time.monotonic() + REMIND_S
         while not self.stopping:
@@ -183,7 +183,7 @@ class CheckDriverNode(ProcessNode):
         self._control.publish(Float64(data=v))
         self._heard.controls.append(Message(v, now, now, 0))
 
-    def _follow(self, executor: SingleThreadedExecutor) -> None:
+    def _follow(self, executor: PromptExecutor) -> None:
         """Listen for the duration, and drive."""
         begin = looked = time.monotonic()
         end = begin + self._options.duration + (0.0 if self._limits is None else SETTLE_S)
@@ -209,7 +209,7 @@ class CheckDriverNode(ProcessNode):
             and self._control.get_subscription_count() > 0
         )
 
-    def _come_to_rest(self, executor: SingleThreadedExecutor) -> None:
+    def _come_to_rest(self, executor: PromptExecutor) -> None:
         drive = self._drive
         if drive is None:
             return

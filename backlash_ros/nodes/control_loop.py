@@ -171,6 +171,7 @@ class ControlLoop:
         self._anew = self._anew or arrival.anew
         if not (self.silent or arrival.anew):
             self.statistics.lost += arrival.missing
+            self.statistics.unsent += arrival.unsent
 
     def _interrupt_if_long(self) -> None:
         """Begin with a new core where there is too much to step over."""

@@ -41,9 +41,9 @@ from backlash_ros.nodes.messages import (
 from backlash_ros.nodes.spin import run
 
 DIAGNOSTICS_PERIOD_S = 1.0
-# A controller that was held up for a few samples still learns from them; after a longer stall it
-# goes on with the newest ones.
-KEPT_OUTPUTS = 20
+# A controller that was held up for so long, or so many samples, still learns from them; after a
+# longer stall it goes on with the newest ones.
+KEPT_S, KEPT_OUTPUTS = 0.1, 20
 # After the command the controller gives way for this share of a period: a busy processor is where
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
@@ -191,7 +191,8 @@ class ControllerNode(ManagedNode):
     def _listen_to_driver(self) -> None:
         # Whoever is activated twice before everybody is there has two that wait.
         if self._driver is None:
-            self._driver = self._io.listen(self._on_output, KEPT_OUTPUTS)
+            kept = max(KEPT_S / self.settings.real('sample_period'), KEPT_OUTPUTS)
+            self._driver = self._io.listen(self._on_output, round(min(kept, DEPTH)))
             emit('ready')
 
     def _on_reference(self, message: Float64) -> None:

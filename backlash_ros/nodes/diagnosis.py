@@ -37,7 +37,8 @@ def counts_of(loop: ControlLoop) -> dict[str, int]:
     """Everything that was counted."""
     statistics, commands = loop.statistics, loop.commands
     return {
-        'samples': statistics.used, 'lost': statistics.lost, 'late': commands.late,
+        'samples': statistics.used, 'lost': statistics.lost,
+        'of these never sent': statistics.unsent, 'late': commands.late,
         'non-finite dropped': statistics.dropped,
         'repeated or from a second driver': statistics.extra,
         'interruptions': statistics.interruptions, 'limits hit': statistics.limited,

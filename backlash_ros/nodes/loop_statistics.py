@@ -16,6 +16,7 @@ class LoopStatistics:
 
     used: int = 0  # outputs that brought a command
     lost: int = 0  # outputs that never arrived
+    unsent: int = 0  # of these, the ones that the driver never published
     dropped: int = 0  # messages that held no finite number
     extra: int = 0  # outputs that were repeated, too early, old or of a second driver
     interruptions: int = 0  # times that the driver was silent or began anew

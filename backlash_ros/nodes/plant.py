@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
@@ -25,6 +24,7 @@ from backlash_ros.nodes.messages import (
     arrival_ns,
     clock_message,
 )
+from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
 
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -78,7 +78,7 @@ class PlantNode(ProcessNode):
             self._has_listeners, self._start, f'subscribers of {topics.PLANT_OUTPUT}'
         )
 
-    def work(self, executor: SingleThreadedExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         while not (self._started or self.stopping):
             executor.spin_once()
         if not self._lockstep:

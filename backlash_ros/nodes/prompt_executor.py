@@ -7,24 +7,25 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
-# Services and events may wait so long; timers are looked after when they are due.
-LOOK_NS = 20_000_000
+# Services and events may wait so long.
+LOOK_NS = 50_000_000
 S_TO_NS = 1e9
 
 
 class PromptExecutor(SingleThreadedExecutor):
-    """Serves the subscriptions and guard conditions of one node at once, all else now and then.
+    """Serves the subscriptions and guard conditions of one node at once, all else after them.
 
     The executor of rclpy makes a new wait set of every service, timer and event for each single
     message, which takes longer than to answer it. This one keeps a wait set of its own for what is
-    urgent and leaves the rest to rclpy, after the messages: timers when they are due, services
-    and events every LOOK_NS.
+    urgent, calls timers when they are due, and every LOOK_NS leaves the rest to rclpy.
     """
 
     def __init__(self, node: Node) -> None:
@@ -34,12 +35,13 @@ class PromptExecutor(SingleThreadedExecutor):
         self._subscriptions: dict[Subscription, bool] = {}
         self._guards: list[GuardCondition] = []
         self._wait_set: Any = None
-        self._look_at_ns = 0
+        self._look_at_ns = 0  # after the messages
+        self._rclpy_at_ns = 0  # leave the rest to rclpy
         self.add_node(node)
 
     def can_execute(self, entity: Any) -> bool:
         """Whether rclpy is to serve it."""
-        return not isinstance(entity, (Subscription, GuardCondition)) \
+        return not isinstance(entity, (Subscription, GuardCondition, Timer)) \
             and bool(super().can_execute(entity))
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
@@ -50,16 +52,28 @@ class PromptExecutor(SingleThreadedExecutor):
         wait_ns = self._look_at_ns - time.monotonic_ns()
         if timeout_sec is not None:
             wait_ns = min(wait_ns, int(timeout_sec * S_TO_NS))
-        self._serve_urgent(max(wait_ns, 0))
-        if time.monotonic_ns() >= self._look_at_ns:
-            self._look()
+        self.serve_urgent(max(wait_ns, 0))
+        self.look_if_due()
+
+    def look_if_due(self) -> None:
+        """Serve what is not urgent, if it is time for that."""
+        now = time.monotonic_ns()
+        if now < self._look_at_ns:
+            return
+        self._call_timers()
+        if now >= self._rclpy_at_ns:
+            self._rclpy_at_ns = now + (0 if self._serve_rest() else LOOK_NS)
+        due = [timer.time_until_next_call() for timer in self._served_node.timers]
+        wait_ns = min((ns for ns in due if ns is not None), default=LOOK_NS)
+        self._look_at_ns = min(now + max(wait_ns, 0), self._rclpy_at_ns)
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop serving."""
         self._wait_set = None
         return bool(super().shutdown(timeout_sec))
 
-    def _serve_urgent(self, wait_ns: int) -> None:
+    def serve_urgent(self, wait_ns: int) -> None:
+        """Serve one message of each topic, and wait for the first one so long at most."""
         self._prepare()
         wait_set = self._wait_set
         wait_set.clear_entities()
@@ -91,18 +105,25 @@ class PromptExecutor(SingleThreadedExecutor):
             len(subscriptions), len(guards), 0, 0, 0, 0, self._served_node.context.handle
         )
 
-    def _look(self) -> None:
-        """Let rclpy serve one thing that is ready, and say when to look again."""
-        now = time.monotonic_ns()
+    def _call_timers(self) -> None:
+        for timer in list(self._served_node.timers):
+            try:
+                if not timer.is_ready():
+                    continue
+                timer.handle.call_timer()
+            except InvalidHandle:  # the callback of another one has destroyed it
+                continue
+            timer.callback()
+
+    def _serve_rest(self) -> bool:
+        """Let rclpy serve one thing that is ready; return whether there was any."""
         try:
             handler, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
         except (ShutdownException, TimeoutException):
-            due = [timer.time_until_next_call() for timer in self._served_node.timers]
-            self._look_at_ns = now + max(min([LOOK_NS, *(ns for ns in due if ns is not None)]), 0)
-            return
+            return False
         handler()
         handler.result()  # raises what the callback has raised
-        self._look_at_ns = now  # there may be more
+        return True
 
 
 def _wants_info(callback: Callable[..., None]) -> bool:

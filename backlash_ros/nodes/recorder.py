@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Connection
@@ -31,6 +30,7 @@ from backlash_ros.nodes.bag import Bag, RecordingError
 from backlash_ros.nodes.driver_io import STYLES, output_qos
 from backlash_ros.nodes.events import ENABLED, emit
 from backlash_ros.nodes.messages import DiagnosticsPublisher, stamp_ns_of
+from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.sample_counter import UNNUMBERED
 from backlash_ros.nodes.spin import BAD_INPUT, FAILED, ProcessNode, run
 
@@ -154,7 +154,7 @@ class RecorderNode(ProcessNode):
             lambda: all(heard() for heard in needed), self._start, ', '.join(wanted)
         )
 
-    def work(self, executor: SingleThreadedExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         super().work(executor)
         # What has arrived belongs into the bag.
         deadline = time.monotonic() + DRAIN_S

@@ -6,7 +6,6 @@ import sys
 import time
 from math import inf
 
-from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
@@ -16,6 +15,7 @@ from backlash_ros.core.parameter_table import REFERENCE
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
+from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import ProcessNode, run
 
@@ -55,7 +55,7 @@ class ReferenceNode(ProcessNode):
             f'{listeners} subscribers of {topics.REFERENCE}',
         )
 
-    def work(self, executor: SingleThreadedExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         while not (self._started or self.stopping):
             executor.spin_once()
         if self._lockstep:
@@ -63,7 +63,7 @@ class ReferenceNode(ProcessNode):
         else:
             self._follow(executor)
 
-    def _follow(self, executor: SingleThreadedExecutor) -> None:
+    def _follow(self, executor: PromptExecutor) -> None:
         """Publish y_m half a period after each output, by the own clock where none comes.
 
         In between the process sleeps: woken by each output it would take the processor from the

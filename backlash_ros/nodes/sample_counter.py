@@ -28,13 +28,15 @@ class Arrival(NamedTuple):
     """What a message is.
 
     is_sample: False for repetitions, floods, old messages and second senders. missing: samples
-    that never came before this one. anew: sender or clock began anew, so nothing is known of what
-    the plant did in between.
+    that never came before this one. unsent: those of them that the sender cannot have published,
+    for it has not numbered them. anew: sender or clock began anew, so nothing is known of what the
+    plant did in between.
     """
 
     is_sample: bool
     missing: int = 0
     anew: bool = False
+    unsent: int = 0
 
 
 NO_SAMPLE = Arrival(is_sample=False)
@@ -91,7 +93,7 @@ class SampleCounter:
                 # A second sender, or a flood of which the middleware has dropped a part.
                 if late < PATIENCE:
                     return NO_SAMPLE
-                by_number = 0
+                by_number = by_time
         if keeps_time and late < -EARLY:
             if by_number == 0:
                 self._repeated = sequence
@@ -103,7 +105,8 @@ class SampleCounter:
         self._stamp_ns, self._strange = stamp_ns, 0
         self._due_ns = min(due + period * (missing + CLOCK_SLACK), float(stamp_ns))
         self.index += 1 + missing
-        return Arrival(is_sample=True, missing=missing)
+        unsent = missing - by_number if numbered else 0
+        return Arrival(is_sample=True, missing=missing, unsent=unsent)
 
     def _stranger(self, stamp_ns: int, sequence: int, missing: int = 0) -> Arrival:
         self._strange += 1

@@ -17,7 +17,7 @@ import rclpy
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidHandle, NameValidationException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -69,7 +69,7 @@ class ProcessNode(Node):
         plain = cast(Callable[[Any], None], callback)
         return self.create_subscription(message_type, topic, plain, qos, raw=raw)
 
-    def work(self, executor: SingleThreadedExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         """Do what the node is for until `stopping`."""
         while not self.stopping:
             executor.spin_once()
@@ -99,14 +99,14 @@ class ProcessNode(Node):
 
 
 def spin_paced(
-    node: ProcessNode, executor: SingleThreadedExecutor, period_s: float,
+    node: ProcessNode, executor: PromptExecutor, period_s: float,
     tick: Callable[[int, int], bool], idle: Callable[[], bool],
 ) -> None:
     """Call tick(n, due_ns) n periods after the start, until it returns False or the node stops.
 
     The deadlines are absolute, so that nothing drifts; where the process is held up past a
-    deadline, n jumps. due_ns: the deadline on the monotonic clock. In between callbacks are
-    served. idle: says that none is expected before the next tick.
+    deadline, n jumps. due_ns: the deadline on the monotonic clock. In between messages are
+    served, and all else after a tick. idle: says that none is expected before the next tick.
     """
     period_ns = period_s * 1e9
     start = time.monotonic_ns()
@@ -116,14 +116,17 @@ def spin_paced(
         remaining = start + (n + 1) * period_ns - now
         if remaining <= 0:
             # What has arrived in time counts, even if nobody has looked at it yet.
-            executor.spin_once(timeout_sec=0.0)
+            executor.serve_urgent(0)
             n = max(n + 1, int((time.monotonic_ns() - start) / period_ns))
             if not tick(n, start + int(n * period_ns)):
                 return
-        elif remaining < NAP_NS and idle():
+            executor.look_if_due()
+        elif remaining >= NAP_NS:
+            executor.spin_once(timeout_sec=remaining * 1e-9)
+        elif idle():
             time.sleep(remaining * 1e-9)
         else:
-            executor.spin_once(timeout_sec=remaining * 1e-9)
+            executor.serve_urgent(int(remaining))
 
 
 def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
