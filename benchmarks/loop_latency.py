@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 # Before rclpy reads it.
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
@@ -100,8 +101,11 @@ class Driver:
             node.create_subscription(Float64, 'echo/out', self._on_echo, 1),
         ]
 
-    def _on_control(self, message: Float64) -> None:
-        self._answered_at = self._v_came_at = time.perf_counter()
+    def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
+        self._answered_at = time.perf_counter()
+        # What arrives in time counts, even if nobody has looked at it yet.
+        waited_ns = time.time_ns() - info['received_timestamp']
+        self._v_came_at = self._answered_at - 1e-9 * max(waited_ns, 0)
         self._v_before, self._v = self._v, message.data
 
     def _on_echo(self, message: Float64) -> None:
@@ -141,6 +145,8 @@ class Driver:
                 return result
             due = int(now / self._period) + 1
             time.sleep(max(due * self._period - now, 0.0))
+            # Who has overslept goes on with the sample of now.
+            due = max(due, int((time.perf_counter() - start) / self._period))
             while tick < due:
                 tick += 1
                 # A sample that was skipped while an answer was late still ended without it.

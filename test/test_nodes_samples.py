@@ -87,10 +87,18 @@ def test_a_sender_that_was_started_anew_is_counted_by_time() -> None:
     assert counter.count(START_NS + 5 * PERIOD_NS, 1) == Arrival(True, 4, anew=True)
 
 
+def over(
+    commands: CommandHistory, intervals: int, end: float, due: float | None = None,
+) -> list[float]:
+    """v over intervals of which the last one ended at `end`, in time unless told [samples]."""
+    end_ns, due_ns = (START_NS + int(t * PERIOD_NS) for t in (end, end if due is None else due))
+    return commands.over(intervals, end_ns, due_ns)
+
+
 def test_a_command_in_time_needs_no_correction() -> None:
     commands = CommandHistory(PERIOD_S)
     commands.publish(1.0, START_NS + 1)
-    assert commands.over(3, START_NS + 3 * PERIOD_NS) == []
+    assert over(commands, 3, 3.0) == []
     assert commands.late == 0
 
 
@@ -99,8 +107,17 @@ def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
     commands.publish(1.0, START_NS + 1)
     commands.publish(2.0, START_NS + PERIOD_NS + int(1.5 * PERIOD_NS))
     # y(1) was answered one and a half periods later; y(2) and y(3) are lost, y(4) arrives.
-    assert commands.over(3, START_NS + 4 * PERIOD_NS) == [1.0, 2.0, 2.0]
+    assert over(commands, 3, 4.0) == [1.0, 2.0, 2.0]
     assert commands.late == 1
+
+
+def test_older_intervals_ended_in_time_though_the_newest_output_came_late() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.publish(1.0, START_NS + 1)
+    commands.publish(2.0, START_NS + int(1.1 * PERIOD_NS))
+    # y(1) was missed, y(2) is taken late: 2.0 came after the end of the first interval.
+    assert over(commands, 2, end=2.3, due=2.0) == [1.0, 2.0]
+    assert over(commands, 2, end=2.3, due=2.3) == []
 
 
 @pytest.mark.parametrize(('passed_ns', 'late'), [
@@ -114,10 +131,10 @@ def test_command_that_was_under_way_when_its_interval_ended_came_too_late(
         commands.note_transit(passed_ns)
     commands.publish(1.0, START_NS)
     commands.publish(2.0, START_NS + PERIOD_NS - PERIOD_NS // 20)
-    assert commands.over(1, START_NS + PERIOD_NS) == ([1.0] if late else [])
+    assert over(commands, 1, 1.0) == ([1.0] if late else [])
     # However long messages seem to be under way, what leaves early in an interval is there in time.
     commands.publish(3.0, START_NS + PERIOD_NS + PERIOD_NS // 2)
-    assert commands.over(1, START_NS + 2 * PERIOD_NS) == []
+    assert over(commands, 1, 2.0) == []
 
 
 def reported(end: int, *reports: tuple[float, float]) -> list[list[float]]:

@@ -43,16 +43,19 @@ class CommandHistory:
         """Note an applied v and when the driver said so, just before the output it led to."""
         self._reported.append((stamp_ns, v))
 
-    def over(self, intervals: int, end_ns: int) -> list[float]:
+    def over(self, intervals: int, end_ns: int, due_ns: float) -> list[float]:
         """v over each of the newest `intervals`, oldest first; the last one ended at end_ns.
 
+        due_ns: when it should have ended, and so a whole number of periods after the others.
         Empty if it was the newest command in all of them, as usual.
         """
-        left_ns = end_ns - self._transit_ns  # what left later was not there
-        if self._published[-1][0] < left_ns - (intervals - 1) * self._period_ns:
+        ends_ns = [due_ns - i * self._period_ns for i in range(intervals - 1, 0, -1)] + [end_ns]
+        # What left later than that was not there.
+        latest_ns = [each - self._transit_ns for each in ends_ns]
+        if self._published[-1][0] < latest_ns[0]:
             return []
         self.late += 1
-        return [self._at(left_ns - i * self._period_ns) for i in reversed(range(intervals))]
+        return [self._at(each) for each in latest_ns]
 
     def begin(self, end_ns: int) -> None:
         """Note the first output: reports up to here belong to nothing."""

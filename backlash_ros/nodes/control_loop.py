@@ -198,6 +198,6 @@ class ControlLoop:
         if self._use_applied:
             applied = commands.reported_over(lost + 1, stamp_ns)
         if not (applied or self._lockstep):
-            applied = commands.over(lost + 1, stamp_ns)
+            applied = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
         return core.step(y, y_m, lost, applied)
 

@@ -51,15 +51,14 @@ class SampleCounter:
     answers each control at once, is counted by number alone as long as it is not late.
 
     index: of the newest sample, -1 before the first. Where messages are numbered, it is the count
-    of the sender, which begins with 1.
+    of the sender, which begins with 1. due_ns: when that sample was due at the sender.
     """
 
     def __init__(self, sample_period_s: float) -> None:
-        self.index = -1
+        self.index, self.due_ns = -1, 0.0
         self._period_ns = sample_period_s * 1e9
         self._sequence = 0  # of the newest sample
         self._repeated = 0  # of the newest message that followed it too early to be a sample
-        self._due_ns = 0.0  # when the newest sample was due at the sender
         self._stamp_ns = 0  # of the newest sample
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
@@ -74,7 +73,7 @@ class SampleCounter:
         period = self._period_ns
         if stamp_ns < self._stamp_ns:
             return self._stranger(stamp_ns, sequence)
-        due = self._due_ns + period
+        due = self.due_ns + period
         late = (stamp_ns - due) / period  # may be negative
         keeps_time = self._on_time >= KEEPS_TIME_AFTER
         by_time = max(int(late + 1.0 - JITTER), 0)
@@ -103,7 +102,7 @@ class SampleCounter:
             self._on_time = max(self._on_time + (1 if late >= -EARLY else -OUTWEIGHED), 0)
         self._sequence = self._repeated = sequence
         self._stamp_ns, self._strange = stamp_ns, 0
-        self._due_ns = min(due + period * (missing + CLOCK_SLACK), float(stamp_ns))
+        self.due_ns = min(due + period * (missing + CLOCK_SLACK), float(stamp_ns))
         self.index += 1 + missing
         unsent = missing - by_number if numbered else 0
         return Arrival(is_sample=True, missing=missing, unsent=unsent)
@@ -121,5 +120,5 @@ class SampleCounter:
 
     def _begin(self, stamp_ns: int, sequence: int) -> None:
         self._sequence = self._repeated = sequence
-        self._due_ns, self._stamp_ns = float(stamp_ns), stamp_ns
+        self.due_ns, self._stamp_ns = float(stamp_ns), stamp_ns
         self._on_time = self._strange = 0
