@@ -161,6 +161,8 @@ class CheckDriverNode(ProcessNode):
         ))
 
     def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
+        if self._heard.end_ns:
+            return  # it may follow from a v on its way to rest, which is not on record
         self._heard_at = time.monotonic()
         self._heard.outputs.append(_message(message, info))
         if not self._driving or self._limits is None or self._range_left is not None:
