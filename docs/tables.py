@@ -125,9 +125,9 @@ def disturbance() -> str:
 def estimator_constants() -> str:
     """The constants of the method, as they stand in the code."""
     k, s, g = kalman, gap_search, gap_choice
-    count = int(np.ceil(-np.log(g.SMALLEST_GAP) / np.log(g.GRID_RATIO))) + 1
     rows = (
-        ('coarse bank: hypotheses, besides "v never engaged"', f'{count}', 'gap_choice.py'),
+        ('coarse bank: hypotheses, besides "v never engaged"', f'{len(g.coarse_gaps(1.0))}',
+         'gap_choice.py'),
         ('ratio of neighbouring gaps', f'{g.GRID_RATIO:g}', 'gap_choice.py'),
         ('smallest gap, as a share of the widest one within the bounds', f'{g.SMALLEST_GAP:g}',
          'gap_choice.py'),
