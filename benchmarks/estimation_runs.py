@@ -13,7 +13,7 @@ from random_cases import Case, random_case
 
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.controller import Limits
-from backlash_ros.core.estimator import Estimator, Status
+from backlash_ros.core.estimation.protocol import Estimator, Status
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord

@@ -13,7 +13,7 @@ from reporting import Check
 
 from backlash_ros.core.assembly import build_state_model
 from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.estimator import Status
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord

@@ -8,9 +8,9 @@ from math import isfinite, sin
 import numpy as np
 
 from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.estimator import Bounds, Estimate
+from backlash_ros.core.estimation.baselines.printed_law import printed_c, printed_f, printed_m
+from backlash_ros.core.estimation.protocol import Bounds, Estimate
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.printed_law import printed_c, printed_f, printed_m
 from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.structure import Situation
 

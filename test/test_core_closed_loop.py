@@ -11,7 +11,7 @@ from strategies import output_of, paper_example, plants
 
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.controller import AdaptiveController, ControlStep
-from backlash_ros.core.lms import NormalisedLms
+from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.metrics import control_error_rms, settling_time
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord

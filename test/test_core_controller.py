@@ -13,7 +13,7 @@ from strategies import signals
 
 from backlash_ros.core.controller import AdaptiveController, Limits
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimator import Bounds, Estimate, Interval
+from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.proportional import Proportional
 

@@ -11,9 +11,14 @@ from hypothesis import strategies as st
 from strategies import NO_STATE, KnownInput, Play, eighths, usual_plays
 
 from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimation.baselines.printed_law import (
+    PrintedLaw,
+    printed_c,
+    printed_f,
+    printed_m,
+)
+from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.printed_law import PrintedLaw, printed_c, printed_f, printed_m
 from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.reference_signal import ReferenceSignal
 from backlash_ros.core.structure import Command, Situation

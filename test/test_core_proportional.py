@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import NO_STATE, Play, signals, usual_plays
 
-from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.proportional import LARGEST_F_OVER_M, Proportional
 from backlash_ros.core.structure import Command, Situation

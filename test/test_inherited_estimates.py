@@ -7,7 +7,7 @@ import pytest
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.controller import AdaptiveController
-from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 
 TRUE = np.array([1.3, 3.0, -3.0])

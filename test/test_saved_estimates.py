@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimation.storage import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.saved_estimates import load_estimate, save_estimate, worth_saving
 
 LEARNED = Estimate(1.25, 2.5, -3.5, 0.2, 0.01, 0.02, 0.03, Status.TRACKING)
 

@@ -12,7 +12,7 @@ from scipy import signal
 
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.lq_preview import preview_gains
 from backlash_ros.core.metrics import (

@@ -12,19 +12,19 @@ import numpy as np
 from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.controller import AdaptiveController, Limits
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimator import Bounds, Estimate, Estimator
-from backlash_ros.core.fixed import FixedBacklash
-from backlash_ros.core.gradient import GradientEstimator
-from backlash_ros.core.input_reconstruction import InputReconstruction
+from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
+from backlash_ros.core.estimation.baselines.gradient import GradientEstimator
+from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
+from backlash_ros.core.estimation.baselines.lms import NormalisedLms
+from backlash_ros.core.estimation.baselines.printed_law import PrintedLaw
+from backlash_ros.core.estimation.protocol import Bounds, Estimate, Estimator
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.last_command import check_last_commands
-from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.model_check import check_model, model_warnings
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.pole_placement import FourBlocks, PolePlacement, place_poles
-from backlash_ros.core.printed_law import PrintedLaw
 from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.reference_file import read_reference_file
 from backlash_ros.core.reference_signal import ReferenceSignal

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.crossings import Crossings
-from backlash_ros.core.estimator import Bounds, Estimate
+from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.protocol import Bounds, Estimate
 from backlash_ros.core.gap_bank import GapBank, Noise, Prior, Start
 from backlash_ros.core.record_search import RecordOptimum
 from backlash_ros.core.state_model import StateModel

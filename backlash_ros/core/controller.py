@@ -8,7 +8,7 @@ from math import inf
 from typing import NamedTuple
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimator import Estimate, Estimator, Interval
+from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.structure import Situation, Structure
 

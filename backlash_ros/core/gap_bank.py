@@ -22,7 +22,7 @@ from math import inf, log, nan, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.crossings import Crossings, crossings_of
+from backlash_ros.core.estimation.crossings import Crossings, crossings_of
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from math import ceil, log
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.crossings import Crossings
+from backlash_ros.core.estimation.crossings import Crossings
 
 Array = NDArray[np.float64]
 

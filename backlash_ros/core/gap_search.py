@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.bank_making import BankMaker, SearchSettings
-from backlash_ros.core.crossings import Crossings
 from backlash_ros.core.early_fits import EarlyFits
-from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.gap_bank import GapBank
 from backlash_ros.core.gap_choice import FINE, beyond, bracket, coarse_gaps, fine_gaps
 

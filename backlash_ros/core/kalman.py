@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.bank_making import SearchSettings
-from backlash_ros.core.crossings import Crossings
-from backlash_ros.core.estimator import Bounds, Estimate, Interval, Status
-from backlash_ros.core.fixed import FixedBacklash
+from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
+from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
 from backlash_ros.core.gap_bank import GapBank
 from backlash_ros.core.gap_choice import fine_gaps
 from backlash_ros.core.gap_search import GapSearch

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import hypot, isnan
 
 from backlash_ros.core.backlash import Region
-from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.structure import Command, Situation
 

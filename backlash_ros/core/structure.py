@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimator import Estimate, StateSource
+from backlash_ros.core.estimation.protocol import Estimate, StateSource
 from backlash_ros.core.inverse import BacklashInverse
 
 

@@ -9,7 +9,7 @@ from math import isnan, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.lq_preview import PreviewGains
 from backlash_ros.core.rest import OFF, Mode, Rest

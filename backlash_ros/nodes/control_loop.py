@@ -8,10 +8,10 @@ from math import isfinite, nan
 
 from backlash_ros.core.assembly import build_controller, build_limits, build_structure
 from backlash_ros.core.controller import ControlStep, plausible
-from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.estimation.baselines.lms import NormalisedLms
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.last_command import last_commands
-from backlash_ros.core.lms import NormalisedLms
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.tracking import Tracking
 from backlash_ros.nodes.command_history import CommandHistory

@@ -19,10 +19,10 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, warnings_of
 from backlash_ros.core.controller import ControlStep
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimator import Status
+from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.saved_estimates import load_estimate, worth_saving
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
 from backlash_ros.nodes.declare import LiveParameters

@@ -9,7 +9,7 @@ from typing import Protocol
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros.core.saved_estimates import worth_saving
+from backlash_ros.core.estimation.storage import worth_saving
 from backlash_ros.nodes.control_loop import ControlLoop
 
 UNCONFIGURED = 'the controller is unconfigured: configure it first'

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from backlash_ros.core.estimator import Status
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.nodes.control_loop import ControlLoop
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.bank_making import COARSE_TOLERANCE, NOISE_FLOOR, SLOPE_REACH
 from backlash_ros.core.controller import plausible
-from backlash_ros.core.crossings import Crossings
+from backlash_ros.core.estimation.crossings import Crossings
 from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.gap_search import NO_GAP
 from backlash_ros.core.kalman import PRECISE_GAP, PRECISE_SLOPE

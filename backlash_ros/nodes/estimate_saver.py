@@ -5,9 +5,9 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from backlash_ros.core.estimator import Estimate
+from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimation.storage import save_estimate
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.saved_estimates import save_estimate
 
 
 class EstimateSaver:

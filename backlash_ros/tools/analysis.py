@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.assembly import ESTIMATORS, law_fits
 from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimator import Status
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.metrics import delayed_reference, delayed_tracking_error_rms
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord

@@ -8,7 +8,7 @@ from math import isfinite, isnan, nan
 from pathlib import Path
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimator import Estimate, Status
+from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.files import write_atomically
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.history import History
-from backlash_ros.core.input_reconstruction import InputReconstruction
+from backlash_ros.core.estimation.baselines.history import History
+from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
 
 
 class LaggedLaw:

@@ -15,9 +15,9 @@ from __future__ import annotations
 
 from collections import deque
 
-from backlash_ros.core.estimator import LEAST_SQUARE, Bounds, Estimate, Interval, Status
-from backlash_ros.core.input_reconstruction import InputReconstruction
-from backlash_ros.core.lagged_law import LaggedLaw
+from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
+from backlash_ros.core.estimation.baselines.lagged_law import LaggedLaw
+from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
 
 # A side is engaged when the reconstructed u moves on in one direction over this many samples to
 # either side, by more than so many standard deviations of its error: smoothing rounds the corners.

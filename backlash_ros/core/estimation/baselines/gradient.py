@@ -26,7 +26,7 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimator import LEAST_SQUARE, Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
 from backlash_ros.core.pole_placement import FourBlocks
 from backlash_ros.core.transfer_function import TransferFunction
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.estimator import Estimate, Interval, Status
+from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
