@@ -17,9 +17,9 @@ from backlash_ros.core.estimation.baselines.gradient import GradientEstimator
 from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.estimation.baselines.printed_law import PrintedLaw
+from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Estimator
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.last_command import check_last_commands
 from backlash_ros.core.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.model_check import check_model, model_warnings
@@ -165,7 +165,7 @@ def _reconstruction(p: Parameters) -> InputReconstruction:
         ) from None
 
 
-def _kalman(p: Parameters, initial: Estimate) -> Estimator:
+def _moving_horizon(p: Parameters, initial: Estimate) -> Estimator:
     observer = None
     if p.word('structure') != 'proportional':
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
@@ -173,10 +173,10 @@ def _kalman(p: Parameters, initial: Estimate) -> Estimator:
             given, build_state_model(p), p.real('estimator.output_noise_std'),
             DOUBT_OF_FIRST_GUESS,
         )
-    return KalmanEstimator(
+    return MovingHorizon(
         initial, _bounds(p), build_state_model(p), p.real('estimator.output_noise_std'),
-        p.real('estimator.input_noise_std'), p.triple('estimator.drift_std'),
-        p.real('sample_period'), observer,
+        p.triple('estimator.drift_std'), p.real('sample_period'), p.real('plant.uncertainty'),
+        observer,
     )
 
 
@@ -275,7 +275,7 @@ def _bears_wrong_slope(model: StateModel, input_weight: float) -> bool:
 
 
 ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Estimator]] = {
-    'kalman': _kalman, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
+    'moving_horizon': _moving_horizon, 'kalman': _moving_horizon, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
     'gradient': _gradient,
 }
 STRUCTURES: dict[str, Callable[[Parameters], Structure]] = {

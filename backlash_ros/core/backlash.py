@@ -14,6 +14,11 @@ class Region(IntEnum):
     RIGHT = 1  # upward active: u = m (v - c_r)
 
 
+def clamp(held: float, low: float, high: float) -> float:
+    """What a play holds: the value before, moved by the wall that it meets, (2.1)."""
+    return low if held <= low else high if held >= high else held
+
+
 def check_backlash(m: float, c_r: float, c_l: float, prefix: str = 'backlash') -> None:
     """Raise ParameterError unless m > 0 and c_l < c_r, all finite."""
     for name, value in (('m', m), ('c_r', c_r), ('c_l', c_l)):

@@ -50,6 +50,10 @@ PARAMETERS: tuple[Parameter, ...] = (
         'plant.denominator', (1.0, -2.88504, 2.77196, -0.88692),
         'denominator of G(z), descending powers of z', used_by=BOTH,
     ),
+    Parameter('plant.uncertainty', 0.2,
+              'relative spread of the time constants, damping and delay of G; 0: G is exact',
+              low=0.0, high=1.0),
+    Parameter('plant.adapt', True, 'redesign gains and preview for the G that was learned'),
     Parameter(
         'lockstep', False,
         'run as fast as the machine allows: each sample waits for its reference and its control',
@@ -60,7 +64,7 @@ PARAMETERS: tuple[Parameter, ...] = (
               used_by=(CONTROLLER, PLANT, REFERENCE)),
     Parameter(
         'estimator.law', 'kalman', 'law that learns m, c_r, c_l',
-        choices=('kalman', 'lms', 'printed', 'fixed', 'gradient'),
+        choices=('moving_horizon', 'kalman', 'lms', 'printed', 'fixed', 'gradient'),
     ),
     Parameter('estimator.initial.m', 0.696, 'first estimate of the slope', 'u/v',
               low=0.0, above=True),

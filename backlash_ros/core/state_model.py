@@ -33,10 +33,10 @@ class StateModel:
         r = linalg.qr(np.array(rows), mode='r')[0][: self.order]
         # A rotation keeps the Gramian and turns C onto the first axis.
         rotation, triangle = linalg.qr(linalg.solve(r.T, c)[:, None])
-        to_state = rotation.T @ r
-        self.to_observer: Array = linalg.inv(to_state)
-        self.a: Array = to_state @ a @ self.to_observer
-        self.b: Array = to_state @ b
+        self.to_state: Array = rotation.T @ r  # from the observer form, whose first state is y
+        self.to_observer: Array = linalg.inv(self.to_state)
+        self.a: Array = self.to_state @ a @ self.to_observer
+        self.b: Array = self.to_state @ b
         self.c = float(triangle[0, 0])
         self.memory = _memory(model)
         self.equilibrium = self._equilibrium()

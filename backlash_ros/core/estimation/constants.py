@@ -1,0 +1,35 @@
+"""Every constant of the default law, with its meaning; docs/estimation.md shows this table."""
+
+from __future__ import annotations
+
+# --- the record
+LONGEST = 1500  # samples of the record that is fitted; beyond it the oldest third is let go
+BLOCK = (8, 64)  # samples, fewest and most, that are taken in between two solutions
+BLOCK_SHARE = 16  # ... and in between: one block for so many samples of the record
+GROWTH = 1.4  # of the record, after which all of it is fitted anew
+MOVED = 0.5  # standard deviations of the gap after which all of it is fitted anew
+
+# --- the search
+FIRST_SEARCH = 20  # samples before the first search
+SEARCH_GROWTH = 1.25  # of the record between two searches, until there is an estimate
+SEARCHED = 400  # newest samples of the record that a search looks at
+GAPS = 32  # gaps that are compared, geometric between NO_GAP and 1 times the swing of v
+STARTS = 5  # places within each gap at which the play output may have begun
+ZOOM = (0.2, 17)  # second look: relative reach around the best gap, and gaps within it
+CANDIDATES = 3  # gaps of a search that are fitted
+
+# --- what is published
+PRECISE_SLOPE = 0.2  # relative deviation of m below which an estimate is published
+PRECISE_GAP = 0.3  # relative deviation of the gap below which it is
+NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
+REVERSALS = 2  # changes of the engaged side before the first estimate where G is uncertain
+
+# --- what does not fit
+GATE = 6.0  # standard deviations of an innovation beyond which y is an outlier
+OUTLIERS = 5  # outliers in a row that are none
+MISFIT = 3.0  # mean normalised square of the residuals of a block that contradicts the fit
+RECOVERED = 30  # samples that end a contradiction where they fit, or may explain one
+AS_GOOD = 1.5  # ratio of residuals up to which another fit explains the samples as well
+CORRELATED = 0.1  # correlation of the residual from which a part of the record may be let go
+UNDECIDED = 100  # samples after which it is said why there is no estimate yet
+NO_DATA = 20  # lost samples in a row that are worth a state

@@ -1,0 +1,573 @@
+"""The default law: a least-squares fit of the newest samples, with an error model of G.
+
+Moving-horizon estimation (C. V. Rao, J. B. Rawlings, D. Q. Mayne, Constrained state estimation for
+nonlinear discrete-time systems, IEEE Trans. Automatic Control 48 (2003) 246-258) of the gap, the
+slope, the crossings, the error of G, the noise and the state of G at once. Samples are taken in
+block by block; between the blocks only the play operator and an observer advance. All fits are made
+in `refine`, in pieces, after the command. docs/estimation.md explains the method and measures it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import replace
+from math import inf, nan
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.backlash import clamp
+from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
+from backlash_ros.core.estimation.constants import (
+    AS_GOOD,
+    BLOCK,
+    BLOCK_SHARE,
+    CORRELATED,
+    FIRST_SEARCH,
+    GATE,
+    GROWTH,
+    LONGEST,
+    MISFIT,
+    MOVED,
+    NO_DATA,
+    NO_GAP,
+    OUTLIERS,
+    PRECISE_GAP,
+    PRECISE_SLOPE,
+    RECOVERED,
+    REVERSALS,
+    SEARCH_GROWTH,
+    SEARCHED,
+    UNDECIDED,
+)
+from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.error_model import build_error_model
+from backlash_ros.core.estimation.observer import Observer
+from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimation.record import Record
+from backlash_ros.core.estimation.relabelling import (
+    Fitted,
+    fitted,
+    searched,
+    with_better_model,
+)
+from backlash_ros.core.estimation.window_fit import Around, Prior, Solution, Start, weights_of
+from backlash_ros.core.state_model import StateModel
+
+Array = NDArray[np.float64]
+Task = Generator[None, None, None]
+
+CAPACITY = 2 * LONGEST  # samples kept: those that are fitted, and those that come meanwhile
+SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
+
+
+class MovingHorizon:
+    """Learns (m, c_r, c_l) and the error of G from y alone.
+
+    initial: a first guess, or with its deviations what was learned before. model: G as told.
+    uncertainty: relative spread of its time constants, damping and delay, 0 where it is exact.
+    noise_std: of y, a first guess. drift_std: random walk of m, c_r, c_l per square root of a second.
+    observer: gives the state of G until the backlash is known, for structures that want it.
+    """
+
+    def __init__(
+        self, initial: Estimate, bounds: Bounds, model: StateModel, noise_std: float,
+        drift_std: tuple[float, float, float], sample_period: float, uncertainty: float,
+        observer: FixedBacklash | None = None,
+    ) -> None:
+        self.estimate = replace(initial, status=Status.ACQUIRING)
+        self.model = model
+        self.outliers = 0
+        self.innovation = nan
+        self._adapting = True
+        self._bounds, self._uncertainty = bounds, uncertainty
+        self._drift = np.array(drift_std) * sample_period**0.5
+        self._told = model
+        self._around = Around(
+            model, build_error_model(model, uncertainty), max(noise_std, SMALLEST_NOISE)
+        )
+        self._before = observer
+        self._observer: Observer | None = None
+        self._no_state = [0.0] * model.order
+        self._known = initial.learned
+        self._inherited = initial if initial.learned else None
+        self._record = Record(CAPACITY)
+        self._current: Fitted | None = None
+        self._task: Task | None = None
+        self._begin_acquisition()
+        # Of the play operator, once it is known.
+        self._p = self._u = nan
+        self._lost_in_a_row = self._refused = 0
+        self._since_motion = 0
+        self._v = nan
+        self._reason = Status.ACQUIRING  # why there is no estimate
+        self._contradicted_from: int | None = None  # sample from which the fit does not hold
+        self._consistent = 0  # samples that do fit since then
+        self._next_try = 0  # sample at which to try again
+
+    def _begin_acquisition(self) -> None:
+        self._search_at = self._record.end + FIRST_SEARCH
+        self._refit_at = 0.0
+        self._contradicted_from = None
+
+    # --- what it tells -------------------------------------------------------------------------
+
+    @property
+    def u_hat(self) -> float:
+        """u that acted before the newest y; nan before a backlash is known."""
+        return self._u
+
+    @property
+    def x_hat(self) -> list[float]:
+        """State of G in the coordinates of `model`, n values."""
+        if self._observer is not None:
+            return self._observer.state
+        return self._before.x_hat if self._before is not None else self._no_state
+
+    @property
+    def x_cov(self) -> Array | None:
+        """Covariance of x_hat, shape (n, n); None while no fit gives it."""
+        return self._observer.cov if self._observer is not None else None
+
+    @property
+    def proposal(self) -> StateModel | None:
+        """The G that was learned where it is another one than `model`."""
+        around = self._around
+        return around.model if self._current is not None and around.model is not self.model else None
+
+    @property
+    def noise_ratio(self) -> float:
+        """Deviation of the noise as learned over the one that was told; nan before."""
+        if self._current is None:
+            return nan
+        return self._current.solution.posterior.noise_std / self._around.told_std
+
+    @property
+    def unexplained(self) -> float:
+        """Motion of u that no backlash and no G explains, over m times the gap; nan before."""
+        return self._current.fit.unexplained(self._current.solution) if self._current else nan
+
+    @property
+    def adapting(self) -> bool:
+        """Whether it learns; otherwise it goes on following the state of G alone."""
+        return self._adapting
+
+    @adapting.setter
+    def adapting(self, adapting: bool) -> None:
+        if adapting and not self._adapting:
+            self._restart_record()
+        self._adapting = adapting
+
+    def adopt(self, model: StateModel) -> None:
+        """Give x_hat for this G from now on."""
+        self.model = model
+        self._no_state = [0.0] * model.order
+        if self._observer is not None:
+            self._observer = None
+            self._follow_state()
+
+    def set_noise(self, noise_std: float, drift_std: Array) -> None:
+        """Take another first guess of the noise; whatever was learned stays."""
+        self._around = self._around._replace(told_std=max(noise_std, SMALLEST_NOISE))
+        self._drift = drift_std
+
+    # --- at every sample ------------------------------------------------------------------------
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k), None if it was lost, and v of the interval before it."""
+        v = interval.v
+        self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
+        observer = self._observer
+        accepted = y
+        if observer is not None:
+            estimate = self.estimate
+            p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
+            self._since_motion = self._since_motion + 1 if p == self._p else 0
+            self._p = p
+            self._u = u = estimate.m * (p - estimate.c_r)
+            expected = observer.predict(u)
+            if y is None:
+                self.innovation = nan
+            else:
+                self.innovation = innovation = y - expected
+                if innovation * innovation <= GATE**2 * observer.variance:
+                    self._refused = 0
+                    observer.correct(innovation)
+                elif self._refused < OUTLIERS:
+                    self._refused += 1
+                    self.outliers += 1
+                    accepted = None
+                else:
+                    observer.correct(innovation)
+        else:
+            self._since_motion = self._since_motion + 1 if v == self._v else 0
+            if self._before is not None:
+                self._before.update(y, interval)
+        self._v = v
+        if self._adapting and len(self._record) < CAPACITY:
+            self._note(v, nan if accepted is None else accepted)
+        self._set_status()
+
+    def _note(self, v: float, y: float) -> None:
+        if self._since_motion > self.model.memory:
+            self._paused = True
+            return
+        if self._paused:
+            self._paused = False
+            self._restart_record()
+        self._record.append(v, y)
+
+    _paused = False
+
+    def _set_status(self) -> None:
+        if self._lost_in_a_row >= NO_DATA:
+            status = Status.NO_DATA
+        elif self._observer is None:
+            status = self._reason
+        elif self._reason is Status.INCONSISTENT:
+            status = Status.INCONSISTENT
+        elif self._since_motion > self.model.memory:
+            status = Status.NOT_EXCITED
+        else:
+            status = Status.TRACKING
+        if status is not self.estimate.status:
+            self.estimate = replace(self.estimate, status=status)
+
+    # --- after the command -----------------------------------------------------------------------
+
+    def refine(self, budget_s: float = inf) -> None:
+        """Go on with the fit, in pieces, until nothing is left to do or the time is over."""
+        begun = perf_counter() if budget_s < inf else 0.0
+        while True:
+            if self._task is None:
+                self._task = self._next_task()
+                if self._task is None:
+                    return
+            try:
+                next(self._task)
+            except StopIteration:
+                self._task = None
+            if budget_s < inf and perf_counter() - begun > budget_s:
+                return
+
+    def _next_task(self) -> Task | None:
+        if not self._adapting:
+            return None
+        record, current = self._record, self._current
+        if current is None:
+            return self._acquire() if record.end >= self._search_at else None
+        length = current.fit.length
+        waiting = len(record) - length
+        if waiting >= min(max(length // BLOCK_SHARE, BLOCK[0]), BLOCK[1]):
+            return self._take_block()
+        if self._contradicted_from is not None:
+            return self._reconsider() if record.end >= self._next_try else None
+        solution = current.solution
+        if length >= self._refit_at:
+            return self._refit()
+        if abs(solution.gap - current.fit.start.gap) > MOVED * solution.std_gap \
+                and length >= self._moved_at:
+            return self._refit()
+        if solution.correlation > CORRELATED and record.end >= self._next_try:
+            return self._halve()
+        return None
+
+    _moved_at = 0
+
+    def _acquire(self) -> Task:
+        """Look for the backlash in the newest samples."""
+        record = self._record
+        end = record.end
+        self._search_at = end + max(int(len(record) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
+        first = max(record.first, end - SEARCHED)
+        v, y = record.since(first)
+        around = self._around._replace(prior=None)
+        found = yield from searched(v, y, around, self._widest, CAPACITY, self._uncertainty)
+        inherited = self._inherited
+        if inherited is not None:
+            prior = _prior_of(inherited)
+            gap = inherited.c_r - inherited.c_l
+            start = Start(gap, float(v[0]) + 0.5 * gap)
+            kept = yield from fitted(
+                v, y, around._replace(prior=prior), start, inherited.m, CAPACITY
+            )
+            usable = found is not None and self._usable(found[0]) is not None
+            if not (usable and found is not None and _contradicts(found[0].solution, prior)):
+                self._install(kept, around._replace(prior=prior), first)
+                return
+        if found is None:
+            self._explain(None, v)
+        elif self._usable(found[0]) is None:
+            self._explain(found[0], v)
+        else:
+            self._install(*found, first)
+
+    def _take_block(self) -> Task:
+        """Take in the samples that have come since the last block."""
+        current = self._current
+        assert current is not None
+        fit, solution = current
+        number = self._record.first + fit.length
+        v, y = self._record.since(number)
+        v, y = v[:4 * BLOCK[1]], y[:4 * BLOCK[1]]
+        rows = fit.columns(v)
+        squares, outliers = fit.contradiction(rows, y, solution)
+        valid = np.isfinite(y)
+        if np.count_nonzero(outliers) <= FEW * np.count_nonzero(valid):
+            valid &= ~outliers
+        misfit = float(squares[valid].mean()) if valid.any() else 0.0
+        fits = misfit <= MISFIT
+        fit.take(rows, np.where(valid & fits, y, nan), weights_of(y))
+        yield
+        self._judge(fits, number, len(v), misfit)
+        solution = fit.solve()
+        self._current = Fitted(fit, solution)
+        if fits:
+            self._publish()
+
+    def _judge(self, fits: bool, number: int, count: int, misfit: float) -> None:
+        """Note from when on the samples contradict the fit, or that they fit again."""
+        if fits:
+            self._consistent += count
+            if self._contradicted_from is not None and self._consistent >= RECOVERED:
+                self._contradicted_from = None
+                self._reason = Status.TRACKING
+            return
+        self._consistent = 0
+        if self._contradicted_from is None:
+            self._contradicted_from = self._next_try = number
+
+    def _refit(self) -> Task:
+        """Fit the whole record anew; a long one loses its oldest third first."""
+        current = self._current
+        assert current is not None
+        record, around = self._record, self._around
+        fit, solution = current
+        start, first = fit.start, record.first
+        if fit.length >= LONGEST:
+            gone = LONGEST // 3
+            first += gone
+            v, y = record.since(record.first)
+            start = fit.start_after(v[:gone])
+            prior = None
+            if around.error.count == 0 and solution.correlation == 0.0:
+                part = yield from fitted(
+                    v[:gone], y[:gone], around, fit.start, solution.m, CAPACITY
+                )
+                prior = Prior(part.solution.theta, self._drifted(part.solution.theta, part.solution.theta_cov, len(v) - gone))
+            around = around._replace(prior=prior)
+        v, y = record.since(first)
+        result = yield from fitted(
+            v, y, around, start.with_gap(solution.gap, v), solution.m, CAPACITY
+        )
+        result, around = yield from with_better_model(
+            v, y, around, result, CAPACITY, self._uncertainty
+        )
+        self._install(result, around, first)
+
+    def _halve(self) -> Task:
+        """Let the older half of the record go where the newer one alone fits far better."""
+        current = self._current
+        assert current is not None
+        record = self._record
+        fit, solution = current
+        self._next_try = record.end + max(fit.length // 4, BLOCK[1])
+        half = fit.length // 2
+        if half < RECOVERED:
+            return
+        v, y = record.since(record.first)
+        around = self._around._replace(prior=None)
+        start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
+        newer = yield from fitted(v[half:], y[half:], around, start, solution.m, CAPACITY)
+        if newer.solution.rms**2 <= 0.5 * solution.rms**2 and self._usable(newer) is not None:
+            self._install(newer, around, record.first + half)
+
+    def _reconsider(self) -> Task:
+        """Explain samples that contradict the fit: by all of them, or by a change of the plant."""
+        current, since = self._current, self._contradicted_from
+        assert current is not None and since is not None
+        record, around = self._record, self._around._replace(prior=None)
+        bound = AS_GOOD * current.solution.posterior.noise_std
+        end = record.end
+        self._next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
+        v, y = record.since(record.first)
+        if len(v) <= SEARCHED:
+            found = yield from searched(v, y, around, self._widest, CAPACITY, self._uncertainty)
+        else:
+            start = current.fit.start.with_gap(current.solution.gap, v)
+            result = yield from fitted(v, y, around, start, current.solution.m, CAPACITY)
+            found = result, around
+        if found is not None and self._usable(found[0]) and found[0].solution.rms <= bound:
+            self._install(*found, record.first)
+            return
+        whole = found
+        if end - since >= RECOVERED:
+            v, y = record.since(since)
+            found = yield from searched(
+                v[-SEARCHED:], y[-SEARCHED:], around, self._widest, CAPACITY, self._uncertainty
+            )
+            if found is not None and self._usable(found[0]) and found[0].solution.rms <= bound:
+                self._install(*found, max(since, since + len(v) - SEARCHED))
+                return
+            self._reason = Status.INCONSISTENT
+        if end - since > SEARCHED and whole is not None:
+            # This is how the plant is now: what cannot be explained widens the deviations.
+            self._install(*whole, record.first)
+
+    # --- what comes out --------------------------------------------------------------------------
+
+    @property
+    def _widest(self) -> float:
+        return self._bounds.c_r[1] - self._bounds.c_l[0]
+
+    def _install(self, result: Fitted, around: Around, first: int) -> None:
+        """Go on from this fit of the record from sample `first` on."""
+        self._current, self._around = result, around
+        self._record.forget_before(first)
+        self._refit_at = min(GROWTH * result.fit.length, LONGEST)
+        if result.fit.length >= LONGEST:
+            self._refit_at = LONGEST
+        self._moved_at = result.fit.length + BLOCK[1]
+        self._contradicted_from = None
+        self._reason = Status.TRACKING
+        self._publish()
+
+    def _usable(self, result: Fitted) -> Crossings | None:
+        """The crossings of a fit if they are precise and within the bounds by their deviations."""
+        solution = result.solution
+        found = solution.crossings
+        if found is None or not found.std_m <= PRECISE_SLOPE * found.m:
+            return None
+        if not found.std_gap <= max(PRECISE_GAP * found.gap, NO_GAP * result.fit.swing):
+            return None
+        wanted = REVERSALS if self._around.error.count else 1
+        if self._current is None and result.fit.reversals < wanted:
+            return None
+        values = (found.m, found.c_r, found.c_l)
+        slack = (found.std_m, found.std_c_r, found.std_c_l)
+        inside = self._bounds.project(*values)
+        if any(
+            abs(a - b) > 3.0 * s + 1e-9 * abs(b)
+            for a, b, s in zip(values, inside, slack, strict=True)
+        ):
+            return None
+        return found
+
+    def _publish(self) -> None:
+        assert self._current is not None
+        found = self._usable(self._current)
+        if found is None:
+            self._reason = Status.INCONSISTENT
+            if self._observer is None:
+                return
+        else:
+            if self._contradicted_from is None:
+                self._reason = Status.TRACKING
+            m, c_r, c_l = self._bounds.project(found.m, found.c_r, found.c_l)
+            self._known = True
+            self.estimate = Estimate(
+                m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
+                self.estimate.status,
+            )
+        self._follow_state()
+
+    def _follow_state(self) -> None:
+        """Let play operator and observer stand where the fit says that the plant stands."""
+        current = self._current
+        assert current is not None
+        fit, solution = current
+        estimate = self.estimate
+        gap = estimate.c_r - estimate.c_l
+        v, y = self._record.since(self._record.first + fit.length)
+        p = fit.play_output(gap, solution)
+        observer = self._observer
+        exact, cov = None, None
+        if self._around.model is self.model:
+            exact, cov = fit.state(solution)
+        noise = solution.posterior.noise_std
+        if observer is None:
+            observer = self._observer = Observer(self.model, noise)
+            if exact is None:
+                exact, cov = self._replayed(), None
+        else:
+            observer.settle(noise)
+            if exact is None or cov is None or np.trace(cov) > np.trace(observer.noise_cov):
+                exact = None
+        for value in v.tolist():
+            p = clamp(p, value, value + gap)
+        self._p, self._u = p, estimate.m * (p - estimate.c_r)
+        if exact is not None:
+            start = fit.play_output(gap, solution)
+            observer.start(exact, cov)
+            for value in v.tolist():
+                start = clamp(start, value, value + gap)
+                observer.predict(estimate.m * (start - estimate.c_r))
+
+    def _replayed(self) -> Array:
+        """State of a G that is not the one of the fit, from the samples of the fit."""
+        current = self._current
+        assert current is not None
+        fit, solution = current
+        v, y = self._record.since(self._record.first)
+        v, y = v[:fit.length], y[:fit.length]
+        u = fit.input(solution, v)
+        observer = Observer(self.model, solution.posterior.noise_std)
+        for value, measured in zip(u.tolist(), y.tolist(), strict=True):
+            expected = observer.predict(value)
+            if measured == measured:
+                observer.correct(measured - expected)
+        return np.array(observer.state)
+
+    def _explain(self, result: Fitted | None, v: Array) -> None:
+        """Say why there is no estimate, where the samples should suffice for one."""
+        if len(v) < UNDECIDED:
+            return
+        if result is None or result.fit.reversals == 0:
+            self._reason = Status.NOT_EXCITED
+        elif result.solution.m < 0.0 or result.solution.count * result.solution.correlation > 1.0:
+            self._reason = Status.INCONSISTENT
+        else:
+            self._reason = Status.ACQUIRING
+
+    def _drifted(self, theta: Array, cov: Array, samples: int) -> Array:
+        """Covariance of theta after so many samples of drift."""
+        m, product_r, product_l = theta.tolist()
+        jacobian = np.array([[1.0, 0.0, 0.0], [product_r / m, m, 0.0], [product_l / m, 0.0, m]])
+        drift = jacobian @ np.diag(self._drift**2 * samples) @ jacobian.T
+        return np.asarray(cov + drift)
+
+    def _restart_record(self) -> None:
+        """Begin a new record with what the old one says as a prior."""
+        self._task = None
+        current, record = self._current, self._record
+        record.forget_before(record.end)
+        if current is None:
+            self._begin_acquisition()
+            return
+        solution = current.solution
+        self._around = self._around._replace(prior=Prior(solution.theta, solution.theta_cov))
+        estimate = self.estimate
+        gap = estimate.c_r - estimate.c_l
+        fit = current.fit.restarted(self._around, Start(gap, self._p), CAPACITY)
+        self._current = Fitted(fit, fit.solve())
+        self._refit_at = GROWTH * BLOCK[1]
+        self._contradicted_from = None
+
+
+def _prior_of(estimate: Estimate) -> Prior:
+    m, c_r, c_l = estimate.m, estimate.c_r, estimate.c_l
+    jacobian = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [c_l, 0.0, m]])
+    std = np.array([estimate.std_m, estimate.std_c_r, estimate.std_c_l])
+    std = np.maximum(std, 1e-9 * np.array([m, c_r - c_l, c_r - c_l]))
+    return Prior(np.array([m, m * c_r, m * c_l]), jacobian @ np.diag(std**2) @ jacobian.T)
+
+
+def _contradicts(solution: Solution, prior: Prior) -> bool:
+    """Whether two estimates of theta differ by more than chance, 1 in 1,000."""
+    difference = solution.theta - prior.theta
+    return float(difference @ np.linalg.solve(solution.theta_cov + prior.cov, difference)) > CHI2
+
+
+CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
+FEW = 0.2  # share of a block that may be outliers

@@ -1,0 +1,51 @@
+"""The samples that are fitted: v, and y after it, newest last."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Record:
+    """v and y of the newest samples. length: how many; first: number of the oldest one."""
+
+    def __init__(self, capacity: int) -> None:
+        self._v: Array = np.empty(2 * capacity)
+        self._y: Array = np.empty(2 * capacity)
+        self._begin = self._end = 0
+        self.first = 0
+
+    def __len__(self) -> int:
+        return self._end - self._begin
+
+    @property
+    def end(self) -> int:
+        """Number of the next sample."""
+        return self.first + len(self)
+
+    def append(self, v: float, y: float) -> None:
+        """Take in a sample, y = nan where it was lost."""
+        if self._end == len(self._v):
+            self._compact()
+        self._v[self._end], self._y[self._end] = v, y
+        self._end += 1
+
+    def since(self, number: int) -> tuple[Array, Array]:
+        """v and y of the samples from this number on; they stay what they are."""
+        part = slice(self._begin + number - self.first, self._end)
+        return self._v[part].copy(), self._y[part].copy()
+
+    def forget_before(self, number: int) -> None:
+        """Let go of all samples older than this one."""
+        self._begin += number - self.first
+        self.first = number
+
+    def _compact(self) -> None:
+        kept = len(self)
+        if 2 * kept > len(self._v):
+            raise OverflowError(f'record of {kept} samples: let old ones go first')
+        for values in (self._v, self._y):
+            values[:kept] = values[self._begin:self._end].copy()
+        self._begin, self._end = 0, kept

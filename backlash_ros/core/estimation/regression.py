@@ -1,0 +1,115 @@
+"""Bayesian linear regression with learned noise and a learned scale of the error of G.
+
+    y = X_b b + X_e e + noise,  noise ~ N(0, sigma^2),  e ~ N(0, (s m)^2 I)
+
+b has no prior. sigma^2 is inverse gamma with few degrees of freedom around the told one; s is the
+one of the largest evidence. X is kept as the triangle of its QR decomposition, so that rows may come
+in pieces. All of it in closed form from one singular value decomposition of the error part.
+
+Reference: A. Gelman et al., Bayesian Data Analysis, 3rd ed., ch. 14; the evidence for s: D. MacKay,
+Bayesian interpolation, Neural Computation 4 (1992) 415-447.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import log, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+Array = NDArray[np.float64]
+
+NOISE_WEIGHT = 5.0  # samples that the told noise level counts for
+# Scales s of the error of G that are compared, besides none, in units of the spread of the prior.
+SCALES = np.geomspace(1e-4, 10.0, 21)
+SAME = 0.7  # ratio of scales that the grid does not tell apart
+VAGUE = 1e-9  # weight of a prior, as a share of the norm of a column, that is no information
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """mean: of b and e, shape (p,). cov: in units of sigma^2, shape (p, p). noise_std: sigma.
+
+    scale: s. evidence: log-likelihood of the data with b, e and sigma integrated out, comparable
+    between fits of the same data.
+    """
+
+    mean: Array
+    cov: Array
+    noise_std: float
+    scale: float
+    evidence: float
+
+
+class Triangle:
+    """R of the weighted rows [X, y] so far, shape (p + 1, p + 1), and the sum of their weights.
+
+    weights: of a prior at zero, shape (p,), that keeps R regular and is no information.
+    """
+
+    def __init__(self, weights: Array) -> None:
+        self.count = 0.0
+        self.r: Array = np.diag(np.append(weights, 0.0))
+
+    def append(self, rows: Array, y: Array, count: float) -> None:
+        """Take in weighted rows (N, p) with outputs y (N,); count: sum of their weights."""
+        size = len(self.r)
+        stacked = np.empty((size + len(y), size), order='F')
+        stacked[:size], stacked[size:, :-1], stacked[size:, -1] = self.r, rows, y
+        factored = lapack.dgeqrf(stacked, overwrite_a=1)[0]
+        self.r = np.triu(factored[:size])
+        self.count += count
+
+    def absorb(self, where: slice, mean: Array, cov: Array, noise_std: float) -> None:
+        """Take in a prior of some unknowns, in units of the noise."""
+        root = np.linalg.inv(np.linalg.cholesky(cov)) * noise_std
+        rows = np.zeros((len(mean), len(self.r) - 1))
+        rows[:, where] = root
+        self.append(rows, root @ mean, 0.0)
+
+    def posterior(
+        self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,
+    ) -> Posterior:
+        """Posterior with the first `base` columns as b and the others as e.
+
+        slope: m in the prior of e. spreads: prior deviation of each e at s = 1 and m = 1.
+        least_scale: smallest s that is considered.
+        """
+        r, size = self.r, len(self.r) - 1
+        weight = self.count + NOISE_WEIGHT
+        freedom = max(self.count - base, 0.0) + NOISE_WEIGHT
+        squares = float(r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2
+        inverse = lapack.dtrtri(np.asfortranarray(r[:base, :base]))[0]
+        target = inverse @ r[:base, size]
+        if size == base:
+            evidence = -0.5 * weight * log(squares / weight)
+            return Posterior(target, inverse @ inverse.T, sqrt(squares / freedom), 0.0, evidence)
+        weights = abs(slope) * spreads
+        u, s, vt = np.linalg.svd(r[base:size, base:size] * weights)
+        z = u.T @ r[base:size, size]
+        # Grid of (s / sigma)^2, the form in which sigma can be integrated out.
+        ratios = np.append(0.0, SCALES**2 * (freedom / squares))[:, None]
+        shrink = 1.0 / (1.0 + ratios * (s * s))
+        left = squares + shrink @ (z * z)
+        evidence = 0.5 * np.log(shrink).sum(axis=1) - 0.5 * weight * np.log(left / weight)
+        scales = np.sqrt(ratios[:, 0] * left / freedom)
+        # Half a step of the grid below is the same; the largest one of all is never too small.
+        evidence[:-1][scales[:-1] < least_scale * SAME] = -np.inf
+        best = int(np.argmax(evidence))
+        ratio, share, noise_var = float(ratios[best, 0]), shrink[best], float(left[best]) / freedom
+        back = weights[:, None] * vt.T
+        e = back @ (ratio * s * share * z)
+        root = back * np.sqrt(ratio * share)
+        through = inverse @ r[:base, base:size]
+        spread = through @ root
+        cov = np.empty((size, size))
+        cov[:base, :base] = inverse @ inverse.T + spread @ spread.T
+        cov[base:, base:] = root @ root.T
+        cov[:base, base:] = -spread @ root.T
+        cov[base:, :base] = cov[:base, base:].T
+        return Posterior(
+            np.concatenate([target - through @ e, e]), cov, sqrt(noise_var),
+            float(scales[best]), float(evidence[best]),
+        )

@@ -1,0 +1,100 @@
+"""The columns of the regression: how y depends on the start, on u, on theta and on Delta.
+
+For labels R, L (side engaged last) and H (not engaged yet) that the play operator gives for v, with
+v_a the v of the last engaged sample and p the play output,
+
+    y = F x0 + (G v_a) m - (G 1_R) m c_r - (G 1_L) m c_l + (G 1_H) u0 + sum_i (m a_i) E_i
+
+is linear. F is the free response of G from the state x0 before the first sample, u0 the u held
+before the first engagement, and E the responses of (1 - z^-1) F_i G to p, in the coordinates in
+which the a_i are independent and of variance one a priori (error_model.py).
+
+Columns, in this order: x0 (n), u0, m, m c_r, m c_l, a (K), and once more K for the size of the
+first jump of p, which depends on the unknown start of p.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core.estimation.error_model import ErrorFilter, ErrorModel
+from backlash_ros.core.estimation.play import Labels
+from backlash_ros.core.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+SIGNALS = 6  # that drive G: 1_H, v_a, -1_R, -1_L, p(k) - p(k-1), the first jump of p
+
+
+class Layout(NamedTuple):
+    """Where the unknowns stand. n: order of G. errors: K. jump: whether the first jump is there."""
+
+    n: int
+    errors: int
+    jump: bool
+
+    @property
+    def base(self) -> int:
+        """Number of unknowns without those of the error model: x0, u0, theta."""
+        return self.n + 4
+
+    @property
+    def theta(self) -> slice:
+        """m, m c_r, m c_l."""
+        return slice(self.n + 1, self.n + 4)
+
+    @property
+    def unknowns(self) -> int:
+        """Number p of all unknowns."""
+        return self.base + self.errors * (2 if self.jump else 1)
+
+
+class Regressors:
+    """Makes the columns for samples that come in pieces, one piece after the other."""
+
+    def __init__(self, model: StateModel, error: ErrorModel, jump: bool) -> None:
+        n = model.order
+        self.layout = Layout(n, error.count, jump and error.count > 0)
+        self._model, self._error = model, error
+        transfer = model.transfer_function
+        self._numerator, self._denominator = transfer.numerator, transfer.denominator
+        # One filter for all: x0 are states, the others inputs. lfilter keeps the state of the
+        # observer form.
+        self._states = np.zeros((n + SIGNALS, n))
+        self._states[:n] = model.to_observer.T
+        self._errors, self._jumps = ErrorFilter(error), ErrorFilter(error)
+
+    def rows(self, labels: Labels) -> Array:
+        """Columns for the next samples, shape (N, p): how the outputs after them depend on all."""
+        layout, n = self.layout, self.layout.n
+        count, base = len(labels.v_a), layout.base
+        signals = np.zeros((n + SIGNALS, count))
+        signals[n], signals[n + 1] = labels.held, labels.v_a
+        np.negative(labels.right, out=signals[n + 2])
+        np.negative(labels.left, out=signals[n + 3])
+        signals[n + 4], signals[n + 5] = labels.moves, labels.jump
+        # A filter without direct feedthrough answers a sample late; its last state is the rest.
+        late, self._states = lfilter(
+            self._numerator, self._denominator, signals, zi=self._states
+        )
+        answers = np.empty((n + SIGNALS, count))
+        answers[:, :-1], answers[:, -1] = late[:, 1:], self._states[:, 0]
+        rows = np.empty((count, layout.unknowns))
+        rows[:, :base] = answers[:base].T
+        if layout.errors:
+            spread, end = self._error.spread, base + layout.errors
+            rows[:, base:end] = self._errors.filtered(answers[base]) @ spread
+            if layout.jump:
+                rows[:, end:] = self._jumps.filtered(answers[base + 1]) @ spread
+        return rows
+
+    def state_map(self) -> Array:
+        """State of G after the samples so far in the coordinates of StateModel, shape (n, n + 4).
+
+        It depends on x0, u0, m, m c_r, m c_l; the error model has no part in it.
+        """
+        return np.asarray(self._model.to_state @ self._states[:self.layout.base].T)

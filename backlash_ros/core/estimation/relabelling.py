@@ -1,0 +1,146 @@
+"""The fit of a record: labels, least squares, gap; labels anew with that gap, until it stands.
+
+Every solve is a Gauss-Newton step in the gap and the start of the play output, as window_fit.py
+explains. The G that is fitted around moves as well: to the one of low order that does what
+G (1 + Delta) does, where the data speak for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.constants import CANDIDATES
+from backlash_ros.core.estimation.error_model import build_error_model
+from backlash_ros.core.estimation.low_order import OutputError, low_order
+from backlash_ros.core.estimation.search import Candidate, search
+from backlash_ros.core.estimation.window_fit import (
+    Around,
+    Solution,
+    Start,
+    WindowFit,
+    weights_of,
+)
+from backlash_ros.core.model_check import check_model
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+ITERATIONS = 8  # of relabelling, at most
+STANDS = 0.02  # standard deviations by which the gap may still move
+PIECE = 192  # samples that are taken in between two pauses
+NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
+MODELS = 6  # times that G may move in one fit
+SETTLED = 60  # samples at the start of a record that say little of G: what was before is not known
+
+
+class Fitted(NamedTuple):
+    """A fit of a record with its solution."""
+
+    fit: WindowFit
+    solution: Solution
+
+
+def fitted(
+    v: Array, y: Array, around: Around, start: Start, slope: float, capacity: int,
+) -> Generator[None, None, Fitted]:
+    """Fit v (N,) and y (N,), nan where lost, from labels for `start` on; yields between pieces."""
+    weights = weights_of(y)
+    reach = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
+    best: Fitted | None = None
+    for _ in range(ITERATIONS):
+        fit = WindowFit(around, start, slope, reach, capacity)
+        for first in range(0, len(v), PIECE):
+            part = slice(first, first + PIECE)
+            fit.take(fit.columns(v[part]), y[part], weights[part])
+            yield
+        solution = fit.solve()
+        result = Fitted(fit, solution)
+        if best is None or solution.posterior.evidence >= best.solution.posterior.evidence:
+            best = result
+        if abs(solution.gap - start.gap) <= STANDS * solution.std_gap or solution.m == 0.0:
+            break
+        slope = solution.m
+        start = start._replace(p=solution.start).with_gap(solution.gap, v)
+        yield
+    assert best is not None
+    return best
+
+
+def searched(
+    v: Array, y: Array, around: Around, widest: float, capacity: int, uncertainty: float,
+) -> Generator[None, None, tuple[Fitted, Around] | None]:
+    """Search the gap and fit around the best candidates; None where v never engaged."""
+    found = yield from search(
+        v, y, weights_of(y), around.model, around.error, around.told_std, widest
+    )
+    best: Fitted | None = None
+    for candidate in _apart(found.candidates):
+        start = Start(candidate.gap, candidate.start)
+        result = yield from fitted(v, y, around, start, candidate.m, capacity)
+        if best is None \
+                or result.solution.posterior.evidence > best.solution.posterior.evidence:
+            best = result
+    if best is None:
+        return None
+    return (yield from with_better_model(v, y, around, best, capacity, uncertainty))
+
+
+def _apart(candidates: list[Candidate]) -> list[Candidate]:
+    """The best candidates whose gaps are no neighbours."""
+    chosen: list[Candidate] = []
+    for candidate in candidates:
+        if all(abs(candidate.gap - other.gap) > NEIGHBOURS * other.gap for other in chosen):
+            chosen.append(candidate)
+        if len(chosen) == CANDIDATES:
+            break
+    return chosen
+
+
+def with_better_model(
+    v: Array, y: Array, around: Around, result: Fitted, capacity: int, uncertainty: float,
+) -> Generator[None, None, tuple[Fitted, Around]]:
+    """Let G move to the one of low order that fits best, until the evidence grows no more."""
+    weights = np.where(np.isfinite(y), weights_of(y), 0.0)
+    weights[:min(len(v) // 4, SETTLED)] = 0.0
+    for _ in range(MODELS):
+        solution = result.solution
+        posterior = solution.posterior
+        if not solution.m > 0.0 or not result.fit.wants_another_model(solution):
+            break
+        transfer = around.model.transfer_function
+        u = result.fit.input(solution, v)
+        problem = OutputError(transfer, u, y, weights, posterior.noise_std)
+        yield
+        better = yield from low_order(transfer, around.error, problem, posterior.scale)
+        if better is None or not _allowed(better):
+            break
+        model = StateModel(better)
+        moved = around._replace(
+            model=model, error=build_error_model(model, uncertainty),
+            scale=max(around.scale, posterior.scale),
+        )
+        yield
+        start = result.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
+        other = yield from fitted(v, y, moved, start, solution.m, capacity)
+        gained = other.solution.posterior.evidence - posterior.evidence
+        # What moving K coefficients may cost or bring by chance.
+        if gained < -around.error.count:
+            break
+        result, around = other, moved
+        if gained < around.error.count:
+            break
+    return result, around
+
+
+def _allowed(model: TransferFunction) -> bool:
+    try:
+        check_model(model)
+    except ParameterError:
+        return False
+    return True

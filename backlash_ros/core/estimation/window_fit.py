@@ -1,0 +1,293 @@
+"""Least squares over a window of samples for one gap, with all that is not known of G.
+
+The labels of the play operator hold for the gap they were made with. The solution has a gap of its
+own, (m c_r - m c_l) / m, because the column of m c_l is free: it carries the derivative of y by the
+gap, so that labels made anew with it are a Gauss-Newton step (relabelling.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import GATE
+from backlash_ros.core.estimation.crossings import Crossings, crossings_of
+from backlash_ros.core.estimation.error_model import ErrorModel
+from backlash_ros.core.estimation.play import Labels, labels_of
+from backlash_ros.core.estimation.regression import VAGUE, Posterior, Triangle
+from backlash_ros.core.estimation.regressors import Regressors
+from backlash_ros.core.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+FAR = 1e3  # prior of x0, in units of the largest output and of the noise
+SETTLING = 64  # samples over which the size of a column is told
+
+
+class Start(NamedTuple):
+    """Where the play operator begins. gap: of the labels.
+
+    p: play output before the first sample. side: 1 or -1 where one was engaged before, at v_a; 0
+    where the plant was left somewhere in its gap.
+    """
+
+    gap: float
+    p: float
+    side: int = 0
+    v_a: float = 0.0
+
+    def with_gap(self, gap: float, v: Array) -> Start:
+        """The same for another gap, before v (N,): a side that was engaged stays so."""
+        gap = max(gap, 0.0)
+        if self.side != 0:
+            return self._replace(gap=gap, p=self.v_a + (gap if self.side < 0 else 0.0))
+        low = float(v[0])
+        return self._replace(gap=gap, p=min(max(self.p, low), low + gap))
+
+
+class Prior(NamedTuple):
+    """What is known of theta = (m, m c_r, m c_l) from elsewhere: mean (3,), covariance (3, 3)."""
+
+    theta: Array
+    cov: Array
+
+
+class Around(NamedTuple):
+    """What a fit is made around.
+
+    model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that of
+    the error of the G that was told, once this one was moved to where the data want it: it is no
+    better known for that.
+    """
+
+    model: StateModel
+    error: ErrorModel
+    told_std: float
+    prior: Prior | None = None
+    scale: float = 0.0
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the samples of a window say.
+
+    posterior: of all unknowns. crossings: with honest deviations; None unless m > 0. gap: of the
+    solution, start: p of the solution at the start. count: samples that count, repeated readings
+    once. correlation: of successive residuals beyond chance. inflation: 1 - rho + N rho, by which
+    the covariance is widened. rms: of the residual.
+    """
+
+    posterior: Posterior
+    theta: Array
+    theta_cov: Array
+    crossings: Crossings | None
+    gap: float
+    start: float
+    count: float
+    correlation: float
+    inflation: float
+    rms: float
+
+    @property
+    def m(self) -> float:
+        """Slope; negative where v and y have opposite signs."""
+        return float(self.theta[0])
+
+    @property
+    def std_gap(self) -> float:
+        """Standard deviation of the gap; inf unless m > 0."""
+        return self.crossings.std_gap if self.crossings is not None else inf
+
+
+class WindowFit:
+    """Takes in samples and solves for all unknowns.
+
+    slope: about m, for the prior of the error of G. reach: largest |y| and |v|. capacity: samples
+    that it can take in.
+    """
+
+    def __init__(
+        self, around: Around, start: Start, slope: float, reach: tuple[float, float],
+        capacity: int,
+    ) -> None:
+        self.around, self.start, self.slope, self.reach = around, start, slope, reach
+        self.model = around.model
+        self._regressors = Regressors(around.model, around.error, jump=start.side == 0)
+        self.layout = self._regressors.layout
+        self.length = 0  # samples
+        self.reversals = 0
+        self._play = start
+        self._highest, self._lowest = -inf, inf
+        self._rows: Array = np.empty((capacity, self.layout.unknowns))
+        self._y: Array = np.empty(capacity)
+        self._triangle = Triangle(self._vague(*reach))
+        prior = around.prior
+        if prior is not None:
+            self._triangle.absorb(self.layout.theta, prior.theta, prior.cov, around.told_std)
+
+    @property
+    def swing(self) -> float:
+        """Distance between the largest and the smallest v."""
+        return max(self._highest - self._lowest, 0.0)
+
+    def _vague(self, y_reach: float, v_reach: float) -> Array:
+        """Weights of a prior so wide that it only keeps the triangle regular."""
+        n, layout = self.layout.n, self.layout
+        weights = np.zeros(layout.unknowns)
+        told_std = self.around.told_std
+        weights[:n] = told_std / (FAR * (y_reach + told_std))
+        unit = VAGUE * step_norm(self.model)
+        weights[n:layout.base] = unit
+        weights[n + 1] = unit * (v_reach or 1.0)
+        return weights
+
+    def columns(self, v: Array) -> Array:
+        """Columns for the next v (N,), applied one after the other; `take` is to follow."""
+        play = self._play
+        labels = labels_of(v, play.gap, play.p, play.side, play.v_a)
+        self._advance(labels)
+        self._highest = max(self._highest, float(v.max()))
+        self._lowest = min(self._lowest, float(v.min()))
+        return self._regressors.rows(labels)
+
+    def take(self, rows: Array, y: Array, weights: Array) -> None:
+        """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
+        first, last = self.length, self.length + len(y)
+        weight = np.where(np.isfinite(y), weights, 0.0)
+        root = np.sqrt(weight)
+        rows = rows * root[:, None]
+        self._rows[first:last] = rows
+        self._y[first:last] = np.where(weight > 0.0, y, 0.0) * root
+        self._triangle.append(rows, self._y[first:last], float(weight.sum()))
+        self.length = last
+
+    def contradiction(
+        self, rows: Array, y: Array, solution: Solution,
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Square of y minus its prediction from rows, in units of its variance, shape (N,).
+
+        And which of them are outliers. nan where y was lost.
+        """
+        posterior = solution.posterior
+        var = np.einsum('np,pq,nq->n', rows, posterior.cov, rows) * solution.inflation + 1.0
+        squares = (y - rows @ posterior.mean) ** 2 / (var * posterior.noise_std**2)
+        return squares, squares > GATE**2
+
+    def _advance(self, labels: Labels) -> None:
+        sides = labels.right - labels.left
+        before = self._play.side
+        changes = int(np.count_nonzero(np.diff(sides, prepend=float(before))))
+        # The first engagement is no reversal.
+        self.reversals += changes - int(before == 0 and changes > 0)
+        self._play = Start(
+            self._play.gap, float(labels.p[-1]), int(sides[-1]), float(labels.v_a[-1])
+        )
+
+    def play_output(self, gap: float, solution: Solution) -> float:
+        """Play output after the newest sample for a gap close to that of the labels."""
+        play = self._play
+        if play.side == 0:
+            return solution.start
+        return play.v_a + (gap if play.side < 0 else 0.0)
+
+    def start_after(self, v: Array) -> Start:
+        """Where the play operator stands after v (N,), the first samples of this fit."""
+        start = self.start
+        labels = labels_of(v, start.gap, start.p, start.side, start.v_a)
+        side = int(labels.right[-1] - labels.left[-1])
+        return Start(start.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
+
+    def restarted(self, around: Around, start: Start, capacity: int) -> WindowFit:
+        """A fit of samples yet to come, with the prior of `around`, after a break."""
+        return WindowFit(around, start, self.slope, self.reach, capacity)
+
+    def unexplained(self, solution: Solution) -> float:
+        """Motion of u behind the correlated part of the residual, over m times the gap."""
+        scale = step_norm(self.model) / sqrt(SETTLING) * abs(solution.m) * max(solution.gap, 0.0)
+        motion = sqrt(solution.correlation) * solution.rms
+        return motion / scale if scale > 0.0 else inf
+
+    def solve(self) -> Solution:
+        """The solution for all samples so far."""
+        layout, gap = self.layout, self.start.gap
+        spreads = np.ones(layout.errors)
+        if layout.jump:
+            # The first jump of p is known no better than the gap.
+            spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
+        posterior = self._triangle.posterior(
+            layout.base, self.slope, spreads, self.around.told_std, self.around.scale
+        )
+        residual = self.residual(posterior)
+        squares = float(residual @ residual)
+        count = self._triangle.count
+        correlation = 0.0
+        if squares > 0.0 and count > 1.0:
+            lag = float(residual[1:] @ residual[:-1]) / squares
+            correlation = max(0.0, lag - 3.0 / sqrt(count))
+        inflation = 1.0 - correlation + count * correlation
+        theta = posterior.mean[layout.theta]
+        cov = posterior.cov[layout.theta, layout.theta] * (posterior.noise_std**2 * inflation)
+        m = float(theta[0])
+        held = float(posterior.mean[layout.n])
+        start = self.start.p
+        if self.start.side == 0 and m != 0.0:
+            start = (held + float(theta[1])) / m
+        return Solution(
+            posterior, theta, cov, crossings_of(theta, cov),
+            float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
+            inflation, sqrt(squares / max(count, 1.0)),
+        )
+
+    def residual(self, posterior: Posterior, since: int = 0) -> Array:
+        """Weighted y minus its fit from sample `since` on; 0 where y was lost."""
+        rows, y = self._rows[since:self.length], self._y[since:self.length]
+        return np.asarray(y - rows @ posterior.mean)
+
+    def state(self, solution: Solution) -> tuple[Array, Array]:
+        """State of G after the newest sample, shape (n,), and its honest covariance (n, n)."""
+        posterior = solution.posterior
+        by = self._regressors.state_map()
+        variance = posterior.noise_std**2 * solution.inflation
+        base = self.layout.base
+        return by @ posterior.mean[:base], by @ posterior.cov[:base, :base] @ by.T * variance
+
+    def wants_another_model(self, solution: Solution) -> bool:
+        """Whether the error of G is more than chance: then a G of low order may take it over."""
+        layout, posterior = self.layout, solution.posterior
+        if posterior.scale == 0.0:
+            return False
+        part = slice(layout.base, layout.base + layout.errors)
+        error, cov = posterior.mean[part], posterior.cov[part, part] * posterior.noise_std**2
+        return float(error @ np.linalg.pinv(cov) @ error) > 2.0 * layout.errors
+
+    def input(self, solution: Solution, v: Array) -> Array:
+        """u as the fit has it, shape (N,). v: the samples taken in."""
+        start, n = self.start, self.layout.n
+        labels = labels_of(v, start.gap, start.p, start.side, start.v_a)
+        held, m, right, left = solution.posterior.mean[n:n + 4]
+        return np.asarray(
+            labels.held * held + labels.v_a * m - labels.right * right - labels.left * left
+        )
+
+
+def weights_of(y: Array) -> Array:
+    """Weight of each reading: 1 over the length of the run of equal readings it stands in.
+
+    A sensor with a resolution repeats its error with its reading; what repeats tells nothing new.
+    """
+    changes = np.flatnonzero(np.diff(y) != 0.0) + 1  # nan differs from itself
+    lengths = np.diff(np.concatenate([[0], changes, [len(y)]]))
+    return np.repeat(1.0 / lengths, lengths)
+
+
+def step_norm(model: StateModel) -> float:
+    """Norm of the first samples of the step response of G."""
+    x, total = np.zeros(model.order), 0.0
+    for _ in range(SETTLING):
+        x = model.a @ x + model.b
+        total += (model.c * float(x[0])) ** 2
+    return sqrt(total)
