@@ -9,6 +9,7 @@ from math import sqrt
 
 import numpy as np
 from estimation_runs import (
+    EXACT,
     MARKS_S,
     NAMES,
     QUIET,
@@ -101,7 +102,7 @@ class Benchmark:
 
     def noise_free(self) -> Outcome:
         """1: paper example without noise."""
-        run = build_closed_loop(Parameters({})).run(1001)
+        run = build_closed_loop(Parameters(EXACT)).run(1001)
         error, t = relative_errors(run).max(axis=1), run.column('t')
         checks = []
         for since, limit in ((0.35, 0.01), (1.0, 1e-5)):
@@ -185,7 +186,7 @@ class Benchmark:
                 f'{mark:g} s', f'<= {limit:.3f}', ', '.join(f'{value:.3f}' for value in ratio),
                 bool(np.all(ratio <= limit)),
             ))
-        run = build_closed_loop(Parameters({'output_quantum': QUANTUM})).run(101)
+        run = build_closed_loop(Parameters({**EXACT, 'output_quantum': QUANTUM})).run(101)
         error = float(relative_errors(run)[-1].max())
         return Outcome([
             *checks, _limit(f'y quantised to {QUANTUM:g}, relative error at 1 s', error, 0.002),

@@ -77,7 +77,7 @@ def random_case(seed: int, **fixed: object) -> Case:
         'estimator.initial.m': first[0], 'estimator.initial.c_r': first[1],
         'estimator.initial.c_l': first[2], 'proportional.f': f,
         'waveform': waveform, 'amplitude': amplitude, 'frequency': float(omega),
-        'sample_period': period, 'seed': seed,
+        'sample_period': period, 'seed': seed, 'plant.uncertainty': 0.0,
     })
     noise = NOISE_TO_SWING * _swing(parameters, samples_per_period)
     changes = {'output_noise_std': noise, 'estimator.output_noise_std': noise, **fixed}

@@ -16,11 +16,13 @@ SEARCHED = 400  # newest samples of the record that a search looks at
 GAPS = 32  # gaps that are compared, geometric between NO_GAP and 1 times the swing of v
 STARTS = 5  # places within each gap at which the play output may have begun
 ZOOM = (0.2, 17)  # second look: relative reach around the best gap, and gaps within it
+ENGAGED = 15.0  # log-likelihood by which a gap must beat a constant u
 CANDIDATES = 3  # gaps of a search that are fitted
 
 # --- what is published
 PRECISE_SLOPE = 0.2  # relative deviation of m below which an estimate is published
 PRECISE_GAP = 0.3  # relative deviation of the gap below which it is
+REPLACING = 0.05  # of these deviations: those of an estimate that replaces one that held
 NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
 REVERSALS = 2  # changes of the engaged side before the first estimate where G is uncertain
 
@@ -30,6 +32,5 @@ OUTLIERS = 5  # outliers in a row that are none
 MISFIT = 3.0  # mean normalised square of the residuals of a block that contradicts the fit
 RECOVERED = 30  # samples that end a contradiction where they fit, or may explain one
 AS_GOOD = 1.5  # ratio of residuals up to which another fit explains the samples as well
-CORRELATED = 0.1  # correlation of the residual from which a part of the record may be let go
 UNDECIDED = 100  # samples after which it is said why there is no estimate yet
 NO_DATA = 20  # lost samples in a row that are worth a state

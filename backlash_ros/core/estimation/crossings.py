@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Crossings:
-    """m, c_r, c_l with their standard deviations, and that of the gap c_r - c_l."""
+    """m, c_r, c_l with their standard deviations, and that of the gap c_r - c_l.
+
+    cov: their covariance, shape (3, 3).
+    """
 
     m: float
     c_r: float
@@ -20,6 +23,7 @@ class Crossings:
     std_c_r: float
     std_c_l: float
     std_gap: float
+    cov: NDArray[np.float64]
 
     @property
     def gap(self) -> float:
@@ -30,19 +34,18 @@ class Crossings:
 def crossings_of(theta: NDArray[np.float64], cov: NDArray[np.float64]) -> Crossings | None:
     """Divide theta (3,) by m and carry its covariance (3, 3) along to first order.
 
-    None unless m > 0. Written in floats: it runs at every sample.
+    None unless m > 0.
     """
     m, product_r, product_l = theta.tolist()
     if not m > 0.0:
         return None
-    (p_mm, p_mr, p_ml), (_, p_rr, p_rl), (_, _, p_ll) = cov.tolist()
     c_r, c_l = product_r / m, product_l / m
     # d c = (d product - c d m) / m
-    var_r = (p_rr - 2.0 * c_r * p_mr + c_r * c_r * p_mm) / (m * m)
-    var_l = (p_ll - 2.0 * c_l * p_ml + c_l * c_l * p_mm) / (m * m)
-    cov_rl = (p_rl - c_l * p_mr - c_r * p_ml + c_r * c_l * p_mm) / (m * m)
-    var_gap = var_r + var_l - 2.0 * cov_rl
+    jacobian = np.array([[1.0, 0.0, 0.0], [-c_r / m, 1.0 / m, 0.0], [-c_l / m, 0.0, 1.0 / m]])
+    of_all = jacobian @ cov @ jacobian.T
+    (var_m, *_), (_, var_r, cov_rl), (_, _, var_l) = of_all.tolist()
     return Crossings(
-        m, c_r, c_l, sqrt(max(p_mm, 0.0)), sqrt(max(var_r, 0.0)), sqrt(max(var_l, 0.0)),
-        sqrt(max(var_gap, 0.0)),
+        m, c_r, c_l, *(sqrt(max(var, 0.0)) for var in (
+            var_m, var_r, var_l, var_r + var_l - 2.0 * cov_rl,
+        )), of_all,
     )

@@ -13,6 +13,7 @@ delay are off by a relative spread. Its scale is learned (regression.py).
 
 from __future__ import annotations
 
+from copy import copy
 from functools import lru_cache
 
 import numpy as np
@@ -42,9 +43,8 @@ class ErrorModel:
     """
 
     def __init__(self, model: StateModel, uncertainty: float) -> None:
-        poles = model.transfer_function.poles
-        moving = poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)]
-        self.stable: Array = np.real(np.poly(moving))
+        moving = _moving(model)
+        self.stable: Array = monic(moving)
         self.gain = float(self.stable.sum())
         self.taps = len(moving)
         self.count = 2 + 2 * self.taps if uncertainty > 0.0 else 0
@@ -53,6 +53,13 @@ class ErrorModel:
         self.low_order_spread: Array = np.zeros((0, 0))
         if self.count:
             self.spread, self.low_order_spread = _prior(model, self, moving, uncertainty)
+
+    def around(self, model: StateModel) -> ErrorModel:
+        """The same prior for a G of as many moving poles, in units of its own time constants."""
+        other = copy(self)
+        other.stable = monic(_moving(model))
+        other.gain = float(other.stable.sum())
+        return other
 
     def filtered(self, direct: Array) -> Array:
         """Responses of the F_i to signals (..., N) that were 0 before, shape (..., N, K)."""
@@ -97,10 +104,21 @@ class ErrorFilter:
         return out
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=8)
 def build_error_model(model: StateModel, uncertainty: float) -> ErrorModel:
     """The error model of a G, remembered: drawing its prior takes some 50 ms."""
     return ErrorModel(model, uncertainty)
+
+
+def monic(roots: NDArray[np.complex128]) -> Array:
+    """Coefficients of the real polynomial with these roots, leading coefficient 1."""
+    return np.atleast_1d(np.real(np.poly(roots)))
+
+
+def _moving(model: StateModel) -> NDArray[np.complex128]:
+    """Poles that are neither integrators nor delays."""
+    poles = model.transfer_function.poles
+    return poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)]
 
 
 def _prior(
@@ -126,7 +144,7 @@ def _prior(
     coefficients = np.empty((taps + len(moving), DRAWN))
     k = np.arange(samples, dtype=float)
     for i in range(DRAWN):
-        stable = np.real(np.poly(_moved(moving, uncertainty, rng)))
+        stable = monic(_moved(moving, uncertainty, rng))
         true = np.cumsum(lfilter(numerator * (stable.sum() / error.gain), stable, impulse))
         lag = uncertainty * delay * float(rng.standard_normal())
         lagged = np.interp(k - lag, k, true)

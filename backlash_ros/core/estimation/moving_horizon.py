@@ -23,7 +23,6 @@ from backlash_ros.core.estimation.constants import (
     AS_GOOD,
     BLOCK,
     BLOCK_SHARE,
-    CORRELATED,
     FIRST_SEARCH,
     GATE,
     GROWTH,
@@ -36,6 +35,7 @@ from backlash_ros.core.estimation.constants import (
     PRECISE_GAP,
     PRECISE_SLOPE,
     RECOVERED,
+    REPLACING,
     REVERSALS,
     SEARCH_GROWTH,
     SEARCHED,
@@ -81,7 +81,7 @@ class MovingHorizon:
         self.outliers = 0
         self.innovation = nan
         self._adapting = True
-        self._bounds, self._uncertainty = bounds, uncertainty
+        self._bounds = bounds
         self._drift = np.array(drift_std) * sample_period**0.5
         self._told = model
         self._around = Around(
@@ -91,6 +91,8 @@ class MovingHorizon:
         self._observer: Observer | None = None
         self._no_state = [0.0] * model.order
         self._known = initial.learned
+        self._covariance: Array | None = None
+        self._paused = False  # whether samples are left out, as nothing moves
         self._inherited = initial if initial.learned else None
         self._record = Record(CAPACITY)
         self._current: Fitted | None = None
@@ -108,7 +110,8 @@ class MovingHorizon:
 
     def _begin_acquisition(self) -> None:
         self._search_at = self._record.end + FIRST_SEARCH
-        self._refit_at = 0.0
+        self._refit_at = 0.0  # length of the record at which all of it is fitted anew
+        self._moved_at = 0  # ... from which a gap that moved is reason to do so
         self._contradicted_from = None
 
     # --- what it tells -------------------------------------------------------------------------
@@ -135,6 +138,11 @@ class MovingHorizon:
         """The G that was learned where it is another one than `model`."""
         around = self._around
         return around.model if self._current is not None and around.model is not self.model else None
+
+    @property
+    def covariance(self) -> Array | None:
+        """Covariance of (m, c_r, c_l) behind the published deviations, shape (3, 3)."""
+        return self._covariance
 
     @property
     def noise_ratio(self) -> float:
@@ -218,8 +226,6 @@ class MovingHorizon:
             self._restart_record()
         self._record.append(v, y)
 
-    _paused = False
-
     def _set_status(self) -> None:
         if self._lost_in_a_row >= NO_DATA:
             status = Status.NO_DATA
@@ -269,11 +275,10 @@ class MovingHorizon:
         if abs(solution.gap - current.fit.start.gap) > MOVED * solution.std_gap \
                 and length >= self._moved_at:
             return self._refit()
-        if solution.correlation > CORRELATED and record.end >= self._next_try:
+        aged = solution.correlation > 0.0 or self._drifted_away(solution, length)
+        if aged and record.end >= self._next_try:
             return self._halve()
         return None
-
-    _moved_at = 0
 
     def _acquire(self) -> Task:
         """Look for the backlash in the newest samples."""
@@ -283,7 +288,7 @@ class MovingHorizon:
         first = max(record.first, end - SEARCHED)
         v, y = record.since(first)
         around = self._around._replace(prior=None)
-        found = yield from searched(v, y, around, self._widest, CAPACITY, self._uncertainty)
+        found = yield from searched(v, y, around, self._widest, CAPACITY)
         inherited = self._inherited
         if inherited is not None:
             prior = _prior_of(inherited)
@@ -297,9 +302,9 @@ class MovingHorizon:
                 self._install(kept, around._replace(prior=prior), first)
                 return
         if found is None:
-            self._explain(None, v)
+            self._explain(None)
         elif self._usable(found[0]) is None:
-            self._explain(found[0], v)
+            self._explain(found[0])
         else:
             self._install(*found, first)
 
@@ -362,12 +367,15 @@ class MovingHorizon:
             v, y, around, start.with_gap(solution.gap, v), solution.m, CAPACITY
         )
         result, around = yield from with_better_model(
-            v, y, around, result, CAPACITY, self._uncertainty
+            v, y, around, result, CAPACITY
         )
         self._install(result, around, first)
 
     def _halve(self) -> Task:
-        """Let the older half of the record go where the newer one alone fits far better."""
+        """Let the older half of the record go where the newer one contradicts the whole.
+
+        Or where theta, as told, drifts by more than its deviation meanwhile.
+        """
         current = self._current
         assert current is not None
         record = self._record
@@ -380,7 +388,10 @@ class MovingHorizon:
         around = self._around._replace(prior=None)
         start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
         newer = yield from fitted(v[half:], y[half:], around, start, solution.m, CAPACITY)
-        if newer.solution.rms**2 <= 0.5 * solution.rms**2 and self._usable(newer) is not None:
+        whole = Prior(solution.theta, np.zeros((3, 3)))
+        if self._usable(newer, REPLACING) is not None and (
+            _contradicts(newer.solution, whole) or self._drifted_away(newer.solution, half)
+        ):
             self._install(newer, around, record.first + half)
 
     def _reconsider(self) -> Task:
@@ -393,7 +404,7 @@ class MovingHorizon:
         self._next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
         v, y = record.since(record.first)
         if len(v) <= SEARCHED:
-            found = yield from searched(v, y, around, self._widest, CAPACITY, self._uncertainty)
+            found = yield from searched(v, y, around, self._widest, CAPACITY)
         else:
             start = current.fit.start.with_gap(current.solution.gap, v)
             result = yield from fitted(v, y, around, start, current.solution.m, CAPACITY)
@@ -405,9 +416,10 @@ class MovingHorizon:
         if end - since >= RECOVERED:
             v, y = record.since(since)
             found = yield from searched(
-                v[-SEARCHED:], y[-SEARCHED:], around, self._widest, CAPACITY, self._uncertainty
+                v[-SEARCHED:], y[-SEARCHED:], around, self._widest, CAPACITY
             )
-            if found is not None and self._usable(found[0]) and found[0].solution.rms <= bound:
+            sharp = found is not None and self._usable(found[0], REPLACING)
+            if found is not None and sharp and found[0].solution.rms <= bound:
                 self._install(*found, max(since, since + len(v) - SEARCHED))
                 return
             self._reason = Status.INCONSISTENT
@@ -433,13 +445,16 @@ class MovingHorizon:
         self._reason = Status.TRACKING
         self._publish()
 
-    def _usable(self, result: Fitted) -> Crossings | None:
-        """The crossings of a fit if they are precise and within the bounds by their deviations."""
+    def _usable(self, result: Fitted, share: float = 1.0) -> Crossings | None:
+        """The crossings of a fit if they are precise and within the bounds by their deviations.
+
+        share: of the usual deviations that is allowed.
+        """
         solution = result.solution
         found = solution.crossings
-        if found is None or not found.std_m <= PRECISE_SLOPE * found.m:
+        if found is None or not found.std_m <= share * PRECISE_SLOPE * found.m:
             return None
-        if not found.std_gap <= max(PRECISE_GAP * found.gap, NO_GAP * result.fit.swing):
+        if not found.std_gap <= share * max(PRECISE_GAP * found.gap, NO_GAP * result.fit.swing):
             return None
         wanted = REVERSALS if self._around.error.count else 1
         if self._current is None and result.fit.reversals < wanted:
@@ -466,6 +481,7 @@ class MovingHorizon:
                 self._reason = Status.TRACKING
             m, c_r, c_l = self._bounds.project(found.m, found.c_r, found.c_l)
             self._known = True
+            self._covariance = found.cov
             self.estimate = Estimate(
                 m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
                 self.estimate.status,
@@ -519,16 +535,26 @@ class MovingHorizon:
                 observer.correct(measured - expected)
         return np.array(observer.state)
 
-    def _explain(self, result: Fitted | None, v: Array) -> None:
+    def _explain(self, result: Fitted | None) -> None:
         """Say why there is no estimate, where the samples should suffice for one."""
-        if len(v) < UNDECIDED:
+        if self._record.end < UNDECIDED:
             return
-        if result is None or result.fit.reversals == 0:
+        if result is None:
             self._reason = Status.NOT_EXCITED
-        elif result.solution.m < 0.0 or result.solution.count * result.solution.correlation > 1.0:
+            return
+        solution = result.solution
+        wrong_sign = solution.m < 0.0
+        if wrong_sign or solution.count * solution.correlation > 1.0:
             self._reason = Status.INCONSISTENT
         else:
             self._reason = Status.ACQUIRING
+
+    def _drifted_away(self, solution: Solution, samples: int) -> bool:
+        """Whether the mean drift over so many samples is more than what is not known anyway."""
+        found = solution.crossings
+        if found is None or not self._drift.any():
+            return False
+        return bool(np.any(self._drift**2 * (samples / 3.0) > np.diag(found.cov)))
 
     def _drifted(self, theta: Array, cov: Array, samples: int) -> Array:
         """Covariance of theta after so many samples of drift."""

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimation.constants import CANDIDATES
-from backlash_ros.core.estimation.error_model import build_error_model
+from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED
 from backlash_ros.core.estimation.low_order import OutputError, low_order
 from backlash_ros.core.estimation.search import Candidate, search
 from backlash_ros.core.estimation.window_fit import (
@@ -73,12 +72,17 @@ def fitted(
 
 
 def searched(
-    v: Array, y: Array, around: Around, widest: float, capacity: int, uncertainty: float,
+    v: Array, y: Array, around: Around, widest: float, capacity: int,
 ) -> Generator[None, None, tuple[Fitted, Around] | None]:
-    """Search the gap and fit around the best candidates; None where v never engaged."""
+    """Search the gap and fit around the best candidates.
+
+    None where a constant u explains y as well: v never engaged.
+    """
     found = yield from search(
         v, y, weights_of(y), around.model, around.error, around.told_std, widest
     )
+    if not found.candidates or found.candidates[0].evidence < found.null + ENGAGED:
+        return None
     best: Fitted | None = None
     for candidate in _apart(found.candidates):
         start = Start(candidate.gap, candidate.start)
@@ -86,9 +90,8 @@ def searched(
         if best is None \
                 or result.solution.posterior.evidence > best.solution.posterior.evidence:
             best = result
-    if best is None:
-        return None
-    return (yield from with_better_model(v, y, around, best, capacity, uncertainty))
+    assert best is not None
+    return (yield from with_better_model(v, y, around, best, capacity))
 
 
 def _apart(candidates: list[Candidate]) -> list[Candidate]:
@@ -103,7 +106,7 @@ def _apart(candidates: list[Candidate]) -> list[Candidate]:
 
 
 def with_better_model(
-    v: Array, y: Array, around: Around, result: Fitted, capacity: int, uncertainty: float,
+    v: Array, y: Array, around: Around, result: Fitted, capacity: int,
 ) -> Generator[None, None, tuple[Fitted, Around]]:
     """Let G move to the one of low order that fits best, until the evidence grows no more."""
     weights = np.where(np.isfinite(y), weights_of(y), 0.0)
@@ -122,7 +125,7 @@ def with_better_model(
             break
         model = StateModel(better)
         moved = around._replace(
-            model=model, error=build_error_model(model, uncertainty),
+            model=model, error=around.error.around(model),
             scale=max(around.scale, posterior.scale),
         )
         yield

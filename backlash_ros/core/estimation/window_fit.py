@@ -8,6 +8,7 @@ gap, so that labels made anew with it are a Gauss-Newton step (relabelling.py).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import inf, sqrt
 from typing import NamedTuple
 
@@ -284,6 +285,7 @@ def weights_of(y: Array) -> Array:
     return np.repeat(1.0 / lengths, lengths)
 
 
+@lru_cache(maxsize=64)
 def step_norm(model: StateModel) -> float:
     """Norm of the first samples of the step response of G."""
     x, total = np.zeros(model.order), 0.0
