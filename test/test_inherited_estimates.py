@@ -10,6 +10,7 @@ from backlash_ros.core.controller import AdaptiveController
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 
+EXACT = {'plant.uncertainty': 0.0}
 TRUE = np.array([1.3, 3.0, -3.0])
 
 
@@ -42,7 +43,7 @@ def errors(estimates: list[Estimate]) -> np.ndarray:
 @pytest.mark.parametrize('structure', ['proportional', 'tracking'])
 @pytest.mark.parametrize('noise', [0.0, 1e-3])
 def test_inherited_estimate_holds_from_the_first_sample_on(structure: str, noise: float) -> None:
-    p = Parameters({'structure': structure, 'output_noise_std': noise})
+    p = Parameters({**EXACT, 'structure': structure, 'output_noise_std': noise})
     loop = Loop(p)
     first = build_controller(p)
     learned = loop.run(first, 400)[-1]
@@ -56,7 +57,7 @@ def test_inherited_estimate_holds_from_the_first_sample_on(structure: str, noise
 
 
 def test_backlash_that_changed_meanwhile_is_learned_anew() -> None:
-    p = Parameters({'output_noise_std': 1e-3})
+    p = Parameters({**EXACT, 'output_noise_std': 1e-3})
     wrong = Estimate(2.0, 5.0, -1.0, 0.22, 1e-4, 1e-4, 1e-4, Status.TRACKING)
     after = Loop(p).run(build_controller(p, wrong), 1500)
     assert errors(after[-1:])[0] < 0.01
@@ -79,7 +80,7 @@ def test_held_estimates_do_not_move_and_learning_can_go_on(law: str) -> None:
 
 
 def test_estimator_that_is_held_before_it_knows_anything_learns_afterwards() -> None:
-    p = Parameters({'output_noise_std': 1e-3})
+    p = Parameters({**EXACT, 'output_noise_std': 1e-3})
     loop, controller = Loop(p), build_controller(p)
     controller.estimator.adapting = False
     assert {e.m for e in loop.run(controller, 100)} == {0.696}
@@ -90,7 +91,7 @@ def test_estimator_that_is_held_before_it_knows_anything_learns_afterwards() -> 
 @pytest.mark.parametrize('structure', ['proportional', 'tracking'])
 @pytest.mark.parametrize('deaf', [5, 25, 150])
 def test_driver_that_does_not_hear_v_at_first_spoils_nothing(structure: str, deaf: int) -> None:
-    p = Parameters({'structure': structure, 'output_noise_std': 1e-3})
+    p = Parameters({**EXACT, 'structure': structure, 'output_noise_std': 1e-3})
     learned = Loop(p).run(build_controller(p), 400)[-1]
     loop = Loop(p.replaced({'seed': 3, 'backlash.initial_u': 1.0}))
     controller = build_controller(p, learned)
@@ -101,7 +102,7 @@ def test_driver_that_does_not_hear_v_at_first_spoils_nothing(structure: str, dea
 
 
 def test_what_was_learned_is_held_while_the_data_contradict_it() -> None:
-    p = Parameters({'output_noise_std': 1e-3})
+    p = Parameters({**EXACT, 'output_noise_std': 1e-3})
     learned = Loop(p).run(build_controller(p), 400)[-1]
     after = Loop(p).run(build_controller(p, learned), 300, deaf=300)
     assert after[-1].status == Status.INCONSISTENT

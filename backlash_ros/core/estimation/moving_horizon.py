@@ -93,11 +93,9 @@ class MovingHorizon:
         self._known = initial.learned
         self._covariance: Array | None = None
         self._paused = False  # whether samples are left out, as nothing moves
-        self._inherited = initial if initial.learned else None
         self._record = Record(CAPACITY)
-        self._current: Fitted | None = None
         self._task: Task | None = None
-        self._begin_acquisition()
+        self._begin_acquisition(initial if initial.learned else None)
         # Of the play operator, once it is known.
         self._p = self._u = nan
         self._lost_in_a_row = self._refused = 0
@@ -108,7 +106,10 @@ class MovingHorizon:
         self._consistent = 0  # samples that do fit since then
         self._next_try = 0  # sample at which to try again
 
-    def _begin_acquisition(self) -> None:
+    def _begin_acquisition(self, inherited: Estimate | None) -> None:
+        """Look for the backlash afresh; inherited: what is believed unless the samples deny it."""
+        self._current: Fitted | None = None
+        self._inherited = inherited
         self._search_at = self._record.end + FIRST_SEARCH
         self._refit_at = 0.0  # length of the record at which all of it is fitted anew
         self._moved_at = 0  # ... from which a gap that moved is reason to do so
@@ -265,7 +266,9 @@ class MovingHorizon:
             return self._acquire() if record.end >= self._search_at else None
         length = current.fit.length
         waiting = len(record) - length
-        if waiting >= min(max(length // BLOCK_SHARE, BLOCK[0]), BLOCK[1]):
+        fewest, most = BLOCK
+        wanted = min(max(length // BLOCK_SHARE, fewest), most)
+        if waiting >= (wanted if self._contradicted_from is None else fewest):
             return self._take_block()
         if self._contradicted_from is not None:
             return self._reconsider() if record.end >= self._next_try else None
@@ -286,27 +289,58 @@ class MovingHorizon:
         end = record.end
         self._search_at = end + max(int(len(record) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
         first = max(record.first, end - SEARCHED)
+        record.forget_before(first)
         v, y = record.since(first)
-        around = self._around._replace(prior=None)
+        around = self._around._replace(prior=None, most=inf)
         found = yield from searched(v, y, around, self._widest, CAPACITY)
-        inherited = self._inherited
-        if inherited is not None:
-            prior = _prior_of(inherited)
-            gap = inherited.c_r - inherited.c_l
-            start = Start(gap, float(v[0]) + 0.5 * gap)
-            kept = yield from fitted(
-                v, y, around._replace(prior=prior), start, inherited.m, CAPACITY
-            )
-            usable = found is not None and self._usable(found[0]) is not None
-            if not (usable and found is not None and _contradicts(found[0].solution, prior)):
-                self._install(kept, around._replace(prior=prior), first)
+        if self._inherited is not None:
+            half = len(v) // 2
+            for begin in (0, half):
+                alone = found if begin == 0 else None
+                kept = yield from self._confirmed(v[begin:], y[begin:], self._inherited, alone)
+                if kept is not None:
+                    self._install(*kept, first + begin)
+                    return
+            if found is None or self._usable(found[0], REPLACING) is None:
+                self._reason = Status.INCONSISTENT
                 return
-        if found is None:
-            self._explain(None)
-        elif self._usable(found[0]) is None:
-            self._explain(found[0])
+        if found is None or self._usable(found[0]) is None:
+            self._explain(None if found is None else found[0])
         else:
             self._install(*found, first)
+
+    def _confirmed(
+        self, v: Array, y: Array, inherited: Estimate, free: tuple[Fitted, Around] | None,
+    ) -> Generator[None, None, tuple[Fitted, Around] | None]:
+        """A fit with what was learned before; None where the samples contradict it.
+
+        free: a fit without it, if there is one.
+        """
+        prior = _prior_of(inherited)
+        current = self._current
+        # G is no worse known than it was: it does not explain whatever has happened.
+        most = TOLD if current is None else current.solution.posterior.scale
+        alone = self._around._replace(prior=None, most=most)
+        around = alone._replace(prior=prior)
+        gap = inherited.c_r - inherited.c_l
+        start = Start(gap, float(v[0]) + 0.5 * gap)
+        kept = yield from fitted(v, y, around, start, inherited.m, CAPACITY)
+        swing = float(np.ptp(v)) + gap
+        # A gap wider than all of v: u never moves.
+        still = yield from fitted(
+            v, y, alone, Start(3.0 * swing, float(v[0]) + 1.5 * swing), inherited.m, CAPACITY
+        )
+        least = still.solution.rms
+        if free is not None:
+            usable = self._usable(free[0], REPLACING) is not None
+            if usable and _contradicts(free[0].solution, prior):
+                return None
+            least = min(least, free[0].solution.rms)
+        solution = kept.solution
+        good = solution.rms <= AS_GOOD * least and kept.fit.plausible(solution)
+        moved = solution.theta - prior.theta
+        same = float(moved @ np.linalg.solve(prior.cov, moved)) <= CHI2
+        return (kept, around) if good and same else None
 
     def _take_block(self) -> Task:
         """Take in the samples that have come since the last block."""
@@ -321,6 +355,7 @@ class MovingHorizon:
         valid = np.isfinite(y)
         if np.count_nonzero(outliers) <= FEW * np.count_nonzero(valid):
             valid &= ~outliers
+            self._record.lose(number + np.flatnonzero(outliers))
         misfit = float(squares[valid].mean()) if valid.any() else 0.0
         fits = misfit <= MISFIT
         fit.take(rows, np.where(valid & fits, y, nan), weights_of(y))
@@ -335,7 +370,10 @@ class MovingHorizon:
         """Note from when on the samples contradict the fit, or that they fit again."""
         if fits:
             self._consistent += count
-            if self._contradicted_from is not None and self._consistent >= RECOVERED:
+            since = self._contradicted_from
+            if since is not None and self._consistent >= RECOVERED:
+                # Whatever it was, it is over: what was measured meanwhile says nothing.
+                self._record.lose(np.arange(since, number + count - self._consistent))
                 self._contradicted_from = None
                 self._reason = Status.TRACKING
             return
@@ -361,7 +399,7 @@ class MovingHorizon:
                     v[:gone], y[:gone], around, fit.start, solution.m, CAPACITY
                 )
                 prior = Prior(part.solution.theta, self._drifted(part.solution.theta, part.solution.theta_cov, len(v) - gone))
-            around = around._replace(prior=prior)
+            around = around._replace(prior=prior, most=around.most if prior else inf)
         v, y = record.since(first)
         result = yield from fitted(
             v, y, around, start.with_gap(solution.gap, v), solution.m, CAPACITY
@@ -385,7 +423,7 @@ class MovingHorizon:
         if half < RECOVERED:
             return
         v, y = record.since(record.first)
-        around = self._around._replace(prior=None)
+        around = self._around._replace(prior=None, most=inf)
         start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
         newer = yield from fitted(v[half:], y[half:], around, start, solution.m, CAPACITY)
         whole = Prior(solution.theta, np.zeros((3, 3)))
@@ -398,7 +436,7 @@ class MovingHorizon:
         """Explain samples that contradict the fit: by all of them, or by a change of the plant."""
         current, since = self._current, self._contradicted_from
         assert current is not None and since is not None
-        record, around = self._record, self._around._replace(prior=None)
+        record, around = self._record, self._around._replace(prior=None, most=inf)
         bound = AS_GOOD * current.solution.posterior.noise_std
         end = record.end
         self._next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
@@ -412,20 +450,24 @@ class MovingHorizon:
         if found is not None and self._usable(found[0]) and found[0].solution.rms <= bound:
             self._install(*found, record.first)
             return
-        whole = found
-        if end - since >= RECOVERED:
-            v, y = record.since(since)
-            found = yield from searched(
-                v[-SEARCHED:], y[-SEARCHED:], around, self._widest, CAPACITY
-            )
+        for first in (since, (since + end) // 2):
+            first = max(first, end - SEARCHED)
+            if end - first < RECOVERED:
+                continue
+            v, y = record.since(first)
+            found = yield from searched(v, y, around, self._widest, CAPACITY)
             sharp = found is not None and self._usable(found[0], REPLACING)
             if found is not None and sharp and found[0].solution.rms <= bound:
-                self._install(*found, max(since, since + len(v) - SEARCHED))
+                self._install(*found, first)
+                return
+            # The same backlash, but something has moved the plant meanwhile.
+            kept = yield from self._confirmed(v, y, self.estimate, found)
+            if kept is not None and kept[0].solution.rms <= bound:
+                self._install(*kept, first)
                 return
             self._reason = Status.INCONSISTENT
-        if end - since > SEARCHED and whole is not None:
-            # This is how the plant is now: what cannot be explained widens the deviations.
-            self._install(*whole, record.first)
+        if end - since > SEARCHED:
+            self._begin_acquisition(self.estimate)
 
     # --- what comes out --------------------------------------------------------------------------
 
@@ -569,7 +611,7 @@ class MovingHorizon:
         current, record = self._current, self._record
         record.forget_before(record.end)
         if current is None:
-            self._begin_acquisition()
+            self._begin_acquisition(self._inherited)
             return
         solution = current.solution
         self._around = self._around._replace(prior=Prior(solution.theta, solution.theta_cov))
@@ -596,4 +638,5 @@ def _contradicts(solution: Solution, prior: Prior) -> bool:
 
 
 CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
+TOLD = 1.0  # scale of the error of G that was told
 FEW = 0.2  # share of a block that may be outliers

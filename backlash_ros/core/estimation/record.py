@@ -37,6 +37,10 @@ class Record:
         part = slice(self._begin + number - self.first, self._end)
         return self._v[part].copy(), self._y[part].copy()
 
+    def lose(self, numbers: NDArray[np.intp]) -> None:
+        """Count y of these samples as lost."""
+        self._y[self._begin + numbers - self.first] = np.nan
+
     def forget_before(self, number: int) -> None:
         """Let go of all samples older than this one."""
         self._begin += number - self.first

@@ -71,11 +71,12 @@ class Triangle:
 
     def posterior(
         self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,
+        most_scale: float,
     ) -> Posterior:
         """Posterior with the first `base` columns as b and the others as e.
 
         slope: m in the prior of e. spreads: prior deviation of each e at s = 1 and m = 1.
-        least_scale: smallest s that is considered.
+        least_scale, most_scale: those that are considered.
         """
         r, size = self.r, len(self.r) - 1
         weight = self.count + NOISE_WEIGHT
@@ -95,8 +96,9 @@ class Triangle:
         left = squares + shrink @ (z * z)
         evidence = 0.5 * np.log(shrink).sum(axis=1) - 0.5 * weight * np.log(left / weight)
         scales = np.sqrt(ratios[:, 0] * left / freedom)
-        # Half a step of the grid below is the same; the largest one of all is never too small.
+        # Half a step of the grid beyond is the same. None at all, and the largest one, remain.
         evidence[:-1][scales[:-1] < least_scale * SAME] = -np.inf
+        evidence[1:][scales[1:] > most_scale / SAME] = -np.inf
         best = int(np.argmax(evidence))
         ratio, share, noise_var = float(ratios[best, 0]), shrink[best], float(left[best]) / freedom
         back = weights[:, None] * vt.T

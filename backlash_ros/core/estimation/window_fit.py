@@ -62,7 +62,7 @@ class Around(NamedTuple):
 
     model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that of
     the error of the G that was told, once this one was moved to where the data want it: it is no
-    better known for that.
+    better known for that. most: largest scale that is believed.
     """
 
     model: StateModel
@@ -70,6 +70,7 @@ class Around(NamedTuple):
     told_std: float
     prior: Prior | None = None
     scale: float = 0.0
+    most: float = inf
 
 
 @dataclass(frozen=True)
@@ -220,7 +221,8 @@ class WindowFit:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
         posterior = self._triangle.posterior(
-            layout.base, self.slope, spreads, self.around.told_std, self.around.scale
+            layout.base, self.slope, spreads, self.around.told_std, self.around.scale,
+            self.around.most,
         )
         residual = self.residual(posterior)
         squares = float(residual @ residual)
@@ -255,6 +257,15 @@ class WindowFit:
         variance = posterior.noise_std**2 * solution.inflation
         base = self.layout.base
         return by @ posterior.mean[:base], by @ posterior.cov[:base, :base] @ by.T * variance
+
+    def plausible(self, solution: Solution) -> bool:
+        """Whether the error of G is one that its prior with the largest scale expects."""
+        layout, most = self.layout, self.around.most
+        if layout.errors == 0 or most == inf:
+            return True
+        error = solution.posterior.mean[layout.base:layout.base + layout.errors]
+        size = float(error @ error) / (most * solution.m) ** 2 if most > 0.0 else 0.0
+        return size <= 9.0 * layout.errors
 
     def wants_another_model(self, solution: Solution) -> bool:
         """Whether the error of G is more than chance: then a G of low order may take it over."""

@@ -1,4 +1,4 @@
-"""What the Kalman law makes of data that do not fit."""
+"""What the default law makes of data that do not fit."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from backlash_ros.core.assembly import build_state_model
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.gap_bank import GapBank, Noise, Prior
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
 
@@ -20,7 +18,7 @@ NAMES = ('m', 'c_r', 'c_l')
 
 def run(samples: int, fault: Callable[[int, float], float], **changes: float) -> RunRecord:
     """The paper's example with noise, y as the sensor with this fault shows it."""
-    loop = build_closed_loop(Parameters({'output_noise_std': NOISE, **changes}))
+    loop = build_closed_loop(Parameters({'plant.uncertainty': 0.0, 'output_noise_std': NOISE, **changes}))
     measure = loop.plant.measure
     loop.plant.measure = lambda: fault(loop.plant.sample, measure())  # type: ignore[method-assign]
     return loop.run(samples)
@@ -44,9 +42,9 @@ def test_one_wild_sample_moves_no_estimate_by_more_than_its_deviation() -> None:
 def test_broken_sensor_freezes_the_estimates_and_says_so() -> None:
     record = run(700, lambda k, y: -y if k >= 300 else y)
     status = record.column('status')
-    assert np.all(status[330:] == Status.INCONSISTENT)
+    assert np.all(status[340:] == Status.INCONSISTENT)
     for name in NAMES:
-        assert np.ptp(record.column(name)[330:]) == 0.0
+        assert np.ptp(record.column(name)[340:]) == 0.0
     assert errors(record, -1).max() < 0.01
 
 
@@ -71,19 +69,3 @@ def test_plant_without_a_gap_is_recognised() -> None:
     assert record.column('status')[-1] == Status.TRACKING
     assert record.column('m')[-1] == pytest.approx(1.3, rel=0.01)
     assert record.column('c_r')[-1] - record.column('c_l')[-1] < 0.05
-
-
-def test_a_hypothesis_goes_on_when_its_gap_moves_beyond_the_swing_of_v() -> None:
-    model = build_state_model(Parameters())
-    gaps = np.array([1.0, 2.0, 4.0])
-    bank = GapBank(gaps, model, Prior(np.array([1.0, 1.0, -1.0]), 1.0), Noise(NOISE))
-    for v in (0.0, 2.5):
-        bank.predict(v)
-        bank.correct(0.1 * v)
-    bank.log_likelihood[1] += 100.0
-    bank.elect()
-    assert (bank.active, bank.leader) == (2, 1)
-    bank.move_gaps(np.array([2.8, 3.0, 4.0]))
-    bank.predict(2.6)
-    assert bank.correct(0.26)
-    assert (bank.active, bank.leader) == (2, 1)
