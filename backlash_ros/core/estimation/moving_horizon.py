@@ -110,6 +110,7 @@ class MovingHorizon:
         """Look for the backlash afresh; inherited: what is believed unless the samples deny it."""
         self._current: Fitted | None = None
         self._inherited = inherited
+        self._candidate: Prior | None = None  # what the last search found
         self._search_at = self._record.end + FIRST_SEARCH
         self._refit_at = 0.0  # length of the record at which all of it is fitted anew
         self._moved_at = 0  # ... from which a gap that moved is reason to do so
@@ -304,10 +305,18 @@ class MovingHorizon:
             if found is None or self._usable(found[0], REPLACING) is None:
                 self._reason = Status.INCONSISTENT
                 return
+        before, self._candidate = self._candidate, None
         if found is None or self._usable(found[0]) is None:
             self._explain(None if found is None else found[0])
-        else:
-            self._install(*found, first)
+            return
+        # A first estimate has to be found twice: some samples alone may mislead.
+        solution = found[0].solution
+        self._candidate = Prior(solution.theta, solution.theta_cov)
+        self._search_at = end + BLOCK[0]
+        exact = not around.error.count
+        if exact or (before is not None and not _contradicts(solution, before)):
+            if found[0].fit.reversals >= (1 if exact else REVERSALS):
+                self._install(*found, first)
 
     def _confirmed(
         self, v: Array, y: Array, inherited: Estimate, free: tuple[Fitted, Around] | None,
@@ -498,9 +507,6 @@ class MovingHorizon:
             return None
         if not found.std_gap <= share * max(PRECISE_GAP * found.gap, NO_GAP * result.fit.swing):
             return None
-        wanted = REVERSALS if self._around.error.count else 1
-        if self._current is None and result.fit.reversals < wanted:
-            return None
         values = (found.m, found.c_r, found.c_l)
         slack = (found.std_m, found.std_c_r, found.std_c_l)
         inside = self._bounds.project(*values)
@@ -631,10 +637,10 @@ def _prior_of(estimate: Estimate) -> Prior:
     return Prior(np.array([m, m * c_r, m * c_l]), jacobian @ np.diag(std**2) @ jacobian.T)
 
 
-def _contradicts(solution: Solution, prior: Prior) -> bool:
+def _contradicts(solution: Solution, other: Prior) -> bool:
     """Whether two estimates of theta differ by more than chance, 1 in 1,000."""
-    difference = solution.theta - prior.theta
-    return float(difference @ np.linalg.solve(solution.theta_cov + prior.cov, difference)) > CHI2
+    difference = solution.theta - other.theta
+    return float(difference @ np.linalg.solve(solution.theta_cov + other.cov, difference)) > CHI2
 
 
 CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
