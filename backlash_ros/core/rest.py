@@ -13,15 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum, auto
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.backlash import Region
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Situation
+from backlash_ros.core.structure import dot
 
 Array = NDArray[np.float64]
 
@@ -65,12 +66,14 @@ class Rest:
         self.mode = Mode.HOLD
         self.u_d = 0.0  # where v rests
         self.caution = 0.0  # standard deviations by which the crossings are shrunk for it
-        self._model, self._gain, self._noise_std = model, gain, noise_std
-        self._reach = 0.0  # largest |x*| so far
+        self._noise_std = noise_std
+        self._gain: list[float] = gain.tolist()
+        self._push = float(np.linalg.norm(_response_to_step(model, HORIZON)))
+        self._reach = 0.0  # square of the largest |x*| so far
         self._limit = 0.0  # tolerance in use
         self._rested = 0  # samples for which the trajectory has rested
         self._pull = 0.0  # u - u* with which leading back began
-        self._push = float(np.linalg.norm(_response_to_step(model, HORIZON)))
+        self._low, self._high = inf, -inf  # of the window, where it was still the sample before
 
     def go_on_from(self, other: Rest) -> None:
         """Take over where another one of the same model rests."""
@@ -79,44 +82,52 @@ class Rest:
         self._rested = other._rested
 
     def decide(
-        self, situation: Situation, window: Sequence[float], x: Array, ideal: float,
-        deviation: Array,
+        self, y: float, window: Array, x: Sequence[float], onward: Sequence[float],
+        deviation: Sequence[float], x_std: float | None,
     ) -> Mode:
         """Set the mode for this sample.
 
-        window: r from now on. x, ideal: x* and u*. deviation: x_hat - x*.
+        window: r from now on. x, onward: x* now and at the next sample. deviation: x_hat - x*.
+        x_std: standard deviation of x_hat, None where it is unknown.
         """
-        self._reach = max(self._reach, sqrt(float(x @ x)))
-        least = SHARE * self._reach
+        self._reach = max(self._reach, dot(x, x))
+        least = SHARE * sqrt(self._reach)
         tolerance = max(TOLERANCE * self._noise_std, least)
-        motion = self._model.a @ x + self._model.b * ideal - x
-        before = self.mode
-        if (
-            max(window) - min(window) > self._noise_std
-            or sqrt(float(motion @ motion)) > STEADY * tolerance
-        ):
+        motion = 0.0
+        for now, then in zip(x, onward, strict=True):
+            motion += (then - now) ** 2
+        if motion > (STEADY * tolerance) ** 2:
+            self._low, self._high = inf, -inf
             self.mode, self._rested = Mode.FOLLOW, 0
-        elif situation.x_cov is None:
-            off = abs(situation.y - window[0]) > OFF * self._noise_std
+        elif not self._is_still(window):
+            self.mode, self._rested = Mode.FOLLOW, 0
+        elif x_std is None:
+            off = abs(y - window.item(0)) > OFF * self._noise_std
             self.mode = Mode.FOLLOW if off else Mode.HOLD
-            if before is Mode.FOLLOW:
-                self.u_d, self.caution = ideal, 0.0
         else:
             self._rested += 1
             if self._rested < SETTLING:
                 tolerance = max(CLOSE * self._noise_std, least)
-            doubt = DOUBT * sqrt(max(float(np.trace(situation.x_cov)), 0.0))
-            self._limit = max(tolerance, doubt)
+            self._limit = max(tolerance, DOUBT * x_std)
             self.mode = self._mode_for(deviation)
         return self.mode
 
-    def _mode_for(self, deviation: Array) -> Mode:
-        size = sqrt(float(deviation @ deviation))
+    def _is_still(self, window: Array) -> bool:
+        newest = window.item(-1)
+        if self._low <= newest <= self._high:
+            return True  # it has lost one value and won one between the others
+        low, high = float(window.min()), float(window.max())
+        still = high - low <= self._noise_std
+        self._low, self._high = (low, high) if still else (inf, -inf)
+        return still
+
+    def _mode_for(self, deviation: Sequence[float]) -> Mode:
+        size = sqrt(dot(deviation, deviation))
         if size > ASTRAY * self._limit:
             return Mode.FOLLOW
         if self.mode is Mode.FOLLOW:
             return Mode.HOLD if size <= ARRIVED * self._limit else Mode.FOLLOW
-        pull = -float(self._gain @ deviation)
+        pull = self._pull_back(deviation)
         if self.mode is Mode.LEAD_BACK:
             back = pull * self._pull <= LED_BACK * self._pull**2
             return Mode.HOLD if back else Mode.LEAD_BACK
@@ -125,23 +136,26 @@ class Rest:
         self._pull = pull
         return Mode.LEAD_BACK
 
+    def stay(self, u_d: float) -> None:
+        """Rest at this u."""
+        self.u_d, self.caution = u_d, 0.0
+
     def step(
-        self, situation: Situation, ideal: float, deviation: Array, inverse: BacklashInverse,
-        begins: bool,
+        self, estimate: Estimate, ideal: float, deviation: Sequence[float],
+        inverse: BacklashInverse, begins: bool,
     ) -> None:
         """Aim the inverse at the u that is wanted, where that is better than to stay.
 
-        begins: whether the mode has changed with this sample.
+        ideal: u*. begins: whether the mode has changed with this sample.
         """
         if begins:
-            self.u_d, self.caution = inverse.extreme, 0.0
+            self.stay(inverse.extreme)
         if inverse.taking_up:
             return  # still on its way
-        estimate = situation.estimate
         engaged = estimate.c_l if inverse.side == Region.LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
         if self.mode is Mode.LEAD_BACK:
-            pull = -float(self._gain @ deviation)
+            pull = self._pull_back(deviation)
             if begins or (u - ideal) * pull < TOO_WEAK * pull * pull:
                 self._aim(ideal + pull, u, 0.0, inverse)
             return
@@ -149,6 +163,9 @@ class Rest:
         away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
         if away * self._push > MATTERS * self._limit and away > GAIN * uncertain:
             self._aim(ideal, u, SHORT, inverse)
+
+    def _pull_back(self, deviation: Sequence[float]) -> float:
+        return -dot(self._gain, deviation)
 
     def _aim(self, u_d: float, u: float, caution: float, inverse: BacklashInverse) -> None:
         self.u_d, self.caution = u_d, caution

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from operator import mul
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -20,9 +22,10 @@ class Situation(NamedTuple):
     source: StateSource
 
     @property
-    def x_hat(self) -> NDArray[np.float64]:
+    def x_hat(self) -> Sequence[float]:
         """State of G in the coordinates of StateModel, shape (n,)."""
-        return self.source.x_hat
+        x_hat = self.source.x_hat
+        return x_hat.tolist() if isinstance(x_hat, np.ndarray) else x_hat
 
     @property
     def x_cov(self) -> NDArray[np.float64] | None:
@@ -36,6 +39,12 @@ class Command(NamedTuple):
     u_d: float
     v: float
     f: float
+
+
+def dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Inner product of two states: beside so few numbers a call of NumPy takes longer."""
+    product: float = sum(map(mul, a, b))
+    return product
 
 
 class Structure(Protocol):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from math import isnan
@@ -100,7 +101,7 @@ class StateSource(Protocol):
     """Knows the state of G."""
 
     @property
-    def x_hat(self) -> NDArray[np.float64]:
+    def x_hat(self) -> Sequence[float] | NDArray[np.float64]:
         """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
 
     @property
