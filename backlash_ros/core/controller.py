@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, isnan
 from typing import NamedTuple
 
 from backlash_ros.core.errors import ParameterError
@@ -40,10 +40,18 @@ class Limits:
         return min(max(0.0, self.low), self.high)
 
     def apply(self, v: float, v_before: float) -> float:
-        """v within the bounds and not too far from v_before."""
-        if self.move < inf:
-            v = min(max(v, v_before - self.move), v_before + self.move)
-        return min(max(v, self.low), self.high)
+        """What may be sent instead of v after v_before: every command passes through here, last.
+
+        It is within the bounds, or as far on the way to them as one sample allows; v_before stays
+        where v is no number.
+        """
+        if self.low <= v <= self.high and abs(v - v_before) <= self.move and abs(v) <= LARGEST:
+            return v
+        if isnan(v):
+            v = v_before
+        # Beyond the largest measurement nobody could tell what v does.
+        v = min(max(v, self.low, -LARGEST), self.high, LARGEST)
+        return min(max(v, v_before - self.move), v_before + self.move)
 
 
 class ControlStep(NamedTuple):
@@ -54,15 +62,6 @@ class ControlStep(NamedTuple):
     u_d: float
     v: float
     estimate: Estimate
-
-
-class _Lesson(NamedTuple):
-    """An output that is still to be learned from."""
-
-    y: float
-    interval: Interval
-    lost: int
-    applied: Sequence[float]
 
 
 class AdaptiveController:
@@ -83,7 +82,9 @@ class AdaptiveController:
         self.compensating = True
         self.lost_samples = 0
         self._interval: Interval | None = None
-        self._lesson: _Lesson | None = None
+        # y(k), the interval before it, samples lost before it and what was applied, as long as
+        # it is still to be learned from.
+        self._lesson: tuple[float, Interval, int, Sequence[float]] | None = None
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
@@ -94,27 +95,31 @@ class AdaptiveController:
         call; the plant went on with the last v through all of them. applied: the v that was
         really applied in each of the lost + 1 intervals since then, if it is known.
         """
-        if not (plausible(y) and plausible(y_m)) or (applied and not all(map(plausible, applied))):
+        if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST) or (
+            applied and not all(map(plausible, applied))
+        ):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite and no larger than '
                 f'{LARGEST:g}'
             )
-        if lost < 0 or len(applied) not in (0, lost + 1):
+        if lost < 0 or (applied and len(applied) != lost + 1):
             raise ValueError(f'lost={lost!r} must be >= 0 and applied have lost + 1 values')
         if self._lesson is not None:
             self._learn()
         if self._interval is not None:
-            self._lesson = _Lesson(y, self._interval, lost, applied)
+            self._lesson = y, self._interval, lost, applied
             if self.structure.needs_output:
                 self._learn()
-        estimate, inverse = self.estimator.estimate, self.inverse
+        estimator, inverse = self.estimator, self.inverse
+        used = estimate = estimator.estimate
+        if not self.compensating:
+            used = replace(estimate, c_r=0.0, c_l=0.0)
         v_before = inverse.v
-        used = estimate if self.compensating else replace(estimate, c_r=0.0, c_l=0.0)
-        command = self.structure.control(Situation(y_m, y, used, self.estimator), inverse)
-        v = self.limits.apply(command.v, v_before)
+        u_d, v, f = self.structure.control(Situation(y_m, y, used, estimator), inverse)
+        v = self.limits.apply(v, v_before)
         inverse.applied(v)
-        self._interval = Interval(v, y_m, command.u_d, command.f)
-        return ControlStep(y_m, y, command.u_d, v, estimate)
+        self._interval = Interval(v, y_m, u_d, f)
+        return ControlStep(y_m, y, u_d, v, estimate)
 
     def start_from(self, v: float) -> None:
         """Say which v acts now, so that the first command goes on from there."""
@@ -133,11 +138,9 @@ class AdaptiveController:
     def _learn(self) -> None:
         lesson, self._lesson = self._lesson, None
         assert lesson is not None
-        interval, applied = lesson.interval, lesson.applied
-        for i in range(lesson.lost):
+        y, interval, lost, applied = lesson
+        for i in range(lost):
             passed = interval._replace(v=applied[i]) if applied else interval
             self.estimator.update(None, passed)
-        self.lost_samples += lesson.lost
-        self.estimator.update(
-            lesson.y, interval._replace(v=applied[-1]) if applied else interval
-        )
+        self.lost_samples += lost
+        self.estimator.update(y, interval._replace(v=applied[-1]) if applied else interval)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from math import hypot, isnan
+from math import hypot, inf, isnan
 
 from backlash_ros.core.backlash import Region
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.structure import Command, Situation
+from backlash_ros.core.structure import Command, Situation, Structure
 
 # (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
 LARGEST_F_OVER_M = 0.8
@@ -29,14 +29,25 @@ class Proportional:
     delay = 0
     needs_output = False
 
+    def __init__(self) -> None:
+        self._estimate: Estimate | None = None  # that of the sample before
+
+    def go_on_from(self, other: Structure) -> None:
+        """Take over what the present v was made with."""
+        if isinstance(other, Proportional):
+            self._estimate = other._estimate
+
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
         y_m, estimate = situation.y_m, situation.estimate
         m, c_r, c_l, f = estimate.m, estimate.c_r, estimate.c_l, estimate.f
+        before, self._estimate = self._estimate, estimate
         if f == 0.0:  # nothing to solve
             return Command(y_m, inverse.step(y_m, m, c_r, c_l), f)
         if f > LARGEST_F_OVER_M * m:
             f = LARGEST_F_OVER_M * m
+        if before is not None and before is not estimate and inverse.take_up < inf:
+            _slow_down(inverse, _solution(y_m, before, inverse), _solution(y_m, estimate, inverse))
         right = m * (y_m + f * c_r) / (m - f)
         left = m * (y_m + f * c_l) / (m - f)
         v = inverse.v
@@ -71,6 +82,20 @@ class Proportional:
             u_d = right if right_fits else left
             return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
         return Command(held, inverse.hold(held), f)
+
+
+def _solution(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> float:
+    """v on the line in use."""
+    m, c = estimate.m, estimate.c_r if inverse.side is Region.RIGHT else estimate.c_l
+    return c + (y_m + estimate.f * c) / (m - min(estimate.f, LARGEST_F_OVER_M * m))
+
+
+def _slow_down(inverse: BacklashInverse, before: float, now: float) -> None:
+    """Let v go over to what a new estimate wants like it crosses the gap.
+
+    The inverse cannot tell that by itself, as a new estimate moves u_d too.
+    """
+    inverse.taking_up = inverse.taking_up or abs(now - before) > inverse.take_up
 
 
 def _deviation(y_m: float, f: float, estimate: Estimate) -> float:
