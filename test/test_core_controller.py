@@ -32,7 +32,7 @@ class Notebook:
         self.x_cov = None
         self.updates: list[tuple[float | None, Interval]] = []
 
-    def refine(self) -> None:
+    def refine(self, budget_s: float = inf) -> None:
         """Nothing to do after the command."""
 
     def update(self, y: float | None, interval: Interval) -> None:

@@ -27,6 +27,7 @@ from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.core.slope_tolerance import tolerates
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.tracking import cautious_crossings
+from backlash_ros.core.tracking_design import Weights, design
 from backlash_ros.core.transfer_function import TransferFunction
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
@@ -133,7 +134,7 @@ def resting(std: float) -> tuple[Rest, BacklashInverse, Estimate]:
     inverse = BacklashInverse()
     inverse.step(1.0, 1.0, 1.0, -1.0)
     estimate = Estimate(1.0, 1.0, -1.0, 0.0, std, std, std, Status.TRACKING)
-    return Rest(model, np.zeros(2), 1e-3), inverse, estimate
+    return Rest(design(model, Weights(1e-2, 0.0, 10)), 1e-3), inverse, estimate
 
 
 def test_nothing_moves_before_there_is_anything_to_do() -> None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import inf, isnan
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.structure import Situation, Structure
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Adoption, Situation, Structure
 
 LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 
@@ -64,6 +66,17 @@ class ControlStep(NamedTuple):
     estimate: Estimate
 
 
+class ModelLearner(Protocol):
+    """Learns a better model of G."""
+
+    @property
+    def proposal(self) -> StateModel | None:
+        """A better G, of whatever order; None if none is new."""
+
+    def adopt(self, model: StateModel) -> None:
+        """Let x_hat be in the coordinates of this model from now on."""
+
+
 class AdaptiveController:
     """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
 
@@ -71,16 +84,22 @@ class AdaptiveController:
     before v(k) only where the structure feeds y back; else v(k) need not wait for it.
 
     compensating: False inverts the slope alone, as if there were no gap.
+    learner: who proposes better models of G, for the structure to be designed anew; None where
+    that of the beginning is kept.
     """
 
     def __init__(
         self, estimator: Estimator, structure: Structure, inverse: BacklashInverse,
-        limits: Limits,
+        limits: Limits, learner: ModelLearner | None = None,
     ) -> None:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
         self.compensating = True
         self.lost_samples = 0
+        self.adopted: StateModel | None = None  # the learned model of G that is in use
+        self._learner = learner
+        self._considered: StateModel | None = None  # the proposal that was designed for last
+        self._design: Iterator[Adoption | None] = iter(())
         self._interval: Interval | None = None
         # y(k), the interval before it, samples lost before it and what was applied, as long as
         # it is still to be learned from.
@@ -125,15 +144,47 @@ class AdaptiveController:
         """Say which v acts now, so that the first command goes on from there."""
         self.inverse.start_from(v)
 
-    def refine(self) -> None:
-        """Do what the command did not have to wait for.
+    def go_on_from(self, before: AdaptiveController) -> None:
+        """Take over from the controller before this one, as the state of the plant got unknown.
+
+        v, the line that is engaged and the learned model of G stay.
+        """
+        self.inverse.go_on_from(before.inverse)
+        self._considered = before._considered
+        if self._learner is not None and before.adopted is not None:
+            self._learner.adopt(before.adopted)
+            self.adopted = before.adopted
+        self.structure.go_on_from(before.structure, state_known=False)
+
+    def refine(self, budget_s: float = inf) -> None:
+        """Do what the command did not have to wait for, for about so many seconds at most.
 
         Who has no time for it leaves it out: the next step learns what it has to, and a search
         for the gap pauses.
         """
+        started = time.perf_counter()
         if self._lesson is not None:
             self._learn()
-        self.estimator.refine()
+        self.estimator.refine(budget_s)
+        if self._learner is not None:
+            self._design_on(self._learner, started + budget_s)
+
+    def _design_on(self, learner: ModelLearner, until: float) -> None:
+        """Design the structure for the newest proposal, a piece at a time while there is time."""
+        while time.perf_counter() < until:
+            # A design that is begun is ended: a proposal a second would never be used otherwise.
+            for adoption in self._design:
+                if adoption is not None and self._considered is not None:
+                    # At once and together: x_hat and gains of two models do not fit each other.
+                    learner.adopt(self._considered)
+                    self.adopted = self._considered
+                    adoption(self.estimator)
+                break
+            else:
+                proposal = learner.proposal
+                if proposal is None or proposal is self._considered:
+                    return
+                self._considered, self._design = proposal, self.structure.design(proposal)
 
     def _learn(self) -> None:
         lesson, self._lesson = self._lesson, None

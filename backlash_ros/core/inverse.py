@@ -100,7 +100,9 @@ class BacklashInverse:
         return self.v
 
     def start_from(self, v: float) -> None:
-        """Say which v acts before the first step."""
+        """Say which v acts before the next step, whatever was sent."""
+        if v != self.v and self.side is not GAP:
+            self.extreme = self._slope * (v - self._crossing)
         self.v = v
 
     def applied(self, v: float) -> None:

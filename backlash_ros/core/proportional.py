@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import hypot, inf, isnan
 
 from backlash_ros.core.backlash import Region
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.structure import Command, Situation, Structure
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Adoption, Command, Situation, Structure
 
 # (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
 LARGEST_F_OVER_M = 0.8
@@ -32,10 +34,14 @@ class Proportional:
     def __init__(self) -> None:
         self._estimate: Estimate | None = None  # that of the sample before
 
-    def go_on_from(self, other: Structure) -> None:
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
         """Take over what the present v was made with."""
         if isinstance(other, Proportional):
             self._estimate = other._estimate
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Nothing here depends on G."""
+        yield lambda source: None
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""

@@ -15,6 +15,7 @@ class ReferenceWindow:
     """
 
     def __init__(self, preview: int, history: int) -> None:
+        self.history = history
         self._preview, self._kept = preview, history + preview + 1
         # Written from the left to the right; when it is full its end moves to the front.
         self._values: Array = np.zeros(2 * self._kept)
@@ -30,6 +31,16 @@ class ReferenceWindow:
         self._start, self._end = 0, self._preview + 1
         self._values[:self._end] = value
 
+    def lead_to(self, value: float) -> None:
+        """Bend the window so that it leads to a value that is not what would have come next.
+
+        What has become of the reference in between is not known; a jump would be taken for one.
+        """
+        window = self.window
+        jump = value - float(window[-1])
+        if self._preview and abs(jump) > float(np.abs(np.diff(window)).max()):
+            window += np.linspace(0.0, jump, len(window))
+
     def append(self, value: float) -> Array:
         """Take in r(k + N) and return r(k) .. r(k + N), shape (N + 1,)."""
         end = self._end
@@ -38,8 +49,13 @@ class ReferenceWindow:
             self._values[:kept] = self._values[end - kept:]
             self._start, end = 0, kept
         self._values[end] = value
-        self._end = end = end + 1
-        return self._values[end - self._preview - 1:end]
+        self._end = end + 1
+        return self.window
+
+    @property
+    def window(self) -> Array:
+        """r(k) .. r(k + N) once more, shape (N + 1,)."""
+        return self._values[self._end - self._preview - 1:self._end]
 
     def all(self) -> Array:
         """Everything that is kept, the newest last, shape (up to history + N + 1,)."""

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from backlash_ros.core.backlash import Region
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import dot
+from backlash_ros.core.tracking_design import TrackingDesign
 
 Array = NDArray[np.float64]
 
@@ -44,7 +44,6 @@ LED_BACK = 0.25  # share of what brings y back below which it is no longer neede
 TOO_WEAK = 0.5  # share of it with which y would not come back
 SHORT = 2.0  # standard deviations of the crossing by which v stops short of the u at rest
 GAIN = 1.5  # least factor by which a step has to lessen what u is off
-HORIZON = 300  # samples within which what u is off must matter to be worth a step
 MATTERS = 0.25  # share of the tolerance that it must move x by
 
 
@@ -59,21 +58,25 @@ class Mode(Enum):
 class Rest:
     """Decides whether v rests, and steps it there.
 
-    gain: gentle state feedback, shape (n,), which says what u brings y back. noise_std: of y.
+    noise_std: of y.
     """
 
-    def __init__(self, model: StateModel, gain: Array, noise_std: float) -> None:
+    def __init__(self, design: TrackingDesign, noise_std: float) -> None:
         self.mode = Mode.HOLD
         self.u_d = 0.0  # where v rests
         self.caution = 0.0  # standard deviations by which the crossings are shrunk for it
         self._noise_std = noise_std
-        self._gain: list[float] = gain.tolist()
-        self._push = float(np.linalg.norm(_response_to_step(model, HORIZON)))
+        self.use(design)
         self._reach = 0.0  # square of the largest |x*| so far
         self._limit = 0.0  # tolerance in use
         self._rested = 0  # samples for which the trajectory has rested
         self._pull = 0.0  # u - u* with which leading back began
         self._low, self._high = inf, -inf  # of the window, where it was still the sample before
+
+    def use(self, design: TrackingDesign) -> None:
+        """Rest as this design says."""
+        self._gain: list[float] = design.gentle.tolist()
+        self._push = design.push
 
     def go_on_from(self, other: Rest) -> None:
         """Take over where another one of the same model rests."""
@@ -170,10 +173,3 @@ class Rest:
     def _aim(self, u_d: float, u: float, caution: float, inverse: BacklashInverse) -> None:
         self.u_d, self.caution = u_d, caution
         inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)
-
-
-def _response_to_step(model: StateModel, samples: int) -> Array:
-    x: Array = np.zeros(model.order)
-    for _ in range(samples):
-        x = model.a @ x + model.b
-    return x

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from operator import mul
 from typing import NamedTuple, Protocol
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.protocol import Estimate, StateSource
 from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.state_model import StateModel
 
 
 class Situation(NamedTuple):
@@ -47,6 +48,10 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
     return product
 
 
+# Makes a structure use what it has designed, given who knows the state of the better model.
+Adoption = Callable[[StateSource], None]
+
+
 class Structure(Protocol):
     """Makes u_d from the reference and drives the inverse with it."""
 
@@ -60,3 +65,17 @@ class Structure(Protocol):
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Prepare for a better model of G, a piece of some 0.3 ms each time it is asked on.
+
+        Yields None as long as there is more to do, and last what makes the structure use the
+        result at once and without a jump. Where the result would be less safe than what is in
+        use, or the structure does not adapt to G, it ends without that.
+        """
+
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over from a structure that has made v until now, so that v does not jump.
+
+        state_known: whether x_hat still says where the plant is.
+        """

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from math import isnan, sqrt
 from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimation.protocol import Estimate, StateSource, Status
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.reference_window import ReferenceWindow
 from backlash_ros.core.rest import OFF, Mode, Rest
-from backlash_ros.core.structure import Command, Situation, dot
-from backlash_ros.core.tracking_design import TrackingDesign, Weights
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Adoption, Command, Situation, Structure, dot
+from backlash_ros.core.tracking_design import (
+    Replay,
+    TrackingDesign,
+    Weights,
+    better_design_in_pieces,
+    design,
+)
 
 Array = NDArray[np.float64]
 
 HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
+FADING = 0.8  # per sample, of what u_d of a new design differs by from that of the one before
 WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is unknown
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
 # wrong is contradicted by then. Until then feedback hardens step by step.
@@ -50,39 +59,60 @@ class Tracking:
     needs_output = True
 
     def __init__(
-        self, design: TrackingDesign, weights: Weights, caution: float, noise_std: float = 0.0,
+        self, beginning: TrackingDesign, weights: Weights, caution: float, noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
         self._weights, self._caution, self._noise_std = weights, caution, noise_std
-        self._references = ReferenceWindow(self.delay, design.model.memory)
-        self._rest = Rest(design.model, design.gentle, noise_std)
-        self._use(design)
-        self._x = [0.0] * design.model.order  # x* and q* of the trajectory
+        self._references = ReferenceWindow(self.delay, beginning.model.memory)
+        self._rest = Rest(beginning, noise_std)
+        self._use(beginning)
+        self._x = [0.0] * beginning.model.order  # x* and q* of the trajectory
         self._q = 0.0
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
         self._u_reach = 0.0
-        self._trusted_for = 0  # samples
-        self._level = self._free = 0  # gain in use, samples since v last met a limit
+        self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
+        self._level = self._free = 0  # softer while v meets limits, samples since it last did
+        self._softness = 0  # of the gain in use
+        self._u_d = 0.0  # of the sample before
+        self._resumes = False  # whether this goes on from an interruption
+        self._blind_for = 1  # samples from now on in which x_hat cannot be known
+        self._handover = 0.0  # what is still added to u_d since another design took over
 
-    def _use(self, design: TrackingDesign) -> None:
-        model, gains = design.model, design.gains
-        self._design = design
+    @property
+    def model(self) -> StateModel:
+        """The model of G whose gains are in use."""
+        return self._design.model
+
+    def _use(self, chosen: TrackingDesign) -> None:
+        model, gains = chosen.model, chosen.gains
+        self._design = chosen
         self._a: list[list[float]] = model.a.tolist()
         self._b: list[float] = model.b.tolist()
         self._k: list[float] = gains.state.tolist()
-        self._soft: list[list[float]] = [gain.tolist() for gain in (gains.state, *design.softer)]
-        self._careful = None if design.careful is None else design.careful.tolist()
+        self._soft: list[list[float]] = [gain.tolist() for gain in (gains.state, *chosen.softer)]
+        self._careful = None if chosen.careful is None else chosen.careful.tolist()
         self._x_cov: Array | None = None
         self._x_std = self._feedback_std = 0.0  # of x_hat and of K x_hat, as in x_cov
 
-    def go_on_from(self, other: Tracking) -> None:
-        """Take over the trajectory of a structure with the same model and preview."""
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over the trajectory, and the model of G that it is one of."""
+        if not isinstance(other, Tracking) or other.delay != self.delay:
+            return
+        if other.model is not self.model:
+            self._use(design(other.model, self._weights))
+            self._rest.use(self._design)
         self._references, self._x, self._q = other._references, other._x, other._q
-        self._integral, self._ideal = other._integral, other._ideal
-        self._level, self._free = other._level, other._free
-        self._trusted_for, self._u_reach = other._trusted_for, other._u_reach
+        self._integral, self._ideal, self._u_d = other._integral, other._ideal, other._u_d
+        self._level, self._free, self._softness = other._level, other._free, other._softness
+        self._handover, self._sharp_counts = other._handover, other._sharp_counts
         self._rest.go_on_from(other._rest)
+        if state_known:
+            self._trusted_for, self._u_reach = other._trusted_for, other._u_reach
+            self._resumes, self._blind_for = other._resumes, other._blind_for
+        else:
+            # However well the backlash is known, the first x_hat are full of noise.
+            self._resumes, self._blind_for, self._sharp_counts = True, self.model.order, 1
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
@@ -90,24 +120,36 @@ class Tracking:
         first = self._references.empty
         if first:
             self._begin(situation)
+        elif self._resumes:
+            self._references.lead_to(situation.y_m)
         window = self._references.append(situation.y_m)
         x = self._x
-        ideal = -dot(self._k, x) - float(gains.preview.dot(window))
-        if gains.integral:
-            ideal -= gains.integral * self._q
-        onward = [dot(row, x) + b * ideal for row, b in zip(self._a, self._b, strict=True)]
-        deviation = [0.0] * len(x) if first else list(map(sub, situation.x_hat, x))
+        ideal, onward = self._trajectory(x, window)
+        if self._blind_for:
+            self._blind_for -= 1
+            deviation = [0.0] * len(x)
+        else:
+            deviation = list(map(sub, situation.x_hat, x))
         x_cov = situation.x_cov
         if x_cov is not self._x_cov:
             self._note_covariance(x_cov)
         trusted = self._is_trusted(estimate, first)
         if self._trusted_for > 0:
-            u_d = ideal - dot(self._gain(inverse.limited), deviation)
+            feedback = dot(self._gain(inverse.limited), deviation)
         else:
-            u_d = ideal - self._careful_feedback(estimate, deviation, ideal)
+            feedback = self._careful_feedback(estimate, deviation, ideal)
         if trusted and gains.integral:
-            u_d -= gains.integral * (self._integral - self._q)
+            feedback += gains.integral * (self._integral - self._q)
+        u_d = ideal - feedback
         rest = self._rest
+        if self._resumes:
+            self._resumes, self._handover = False, FADING * (inverse.extreme - u_d)
+            u_d = inverse.extreme
+            rest.stay(u_d)
+        elif self._handover:
+            faded = u_d + self._handover
+            self._handover = FADING * self._handover if faded != u_d else 0.0
+            u_d = faded
         before = rest.mode
         mode = rest.decide(
             situation.y, window, x, onward, deviation, None if x_cov is None else self._x_std
@@ -122,12 +164,54 @@ class Tracking:
                 rest.stay(ideal)
             u_d, caution = rest.u_d, rest.caution
             inverse.widen_band(0.0)
-        self._ideal, self._x = ideal, onward
+        self._ideal, self._x, self._u_d = ideal, onward, u_d
         c_r, c_l = cautious_crossings(estimate, caution)
         v = inverse.step(u_d, estimate.m, c_r, c_l)
         if gains.integral:
             self._integrate(window.item(0), situation.y, x[0], trusted, inverse.limited)
         return Command(u_d, v, 0.0)
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Redesign for a better model, see `better_design_in_pieces`."""
+        new = yield from better_design_in_pieces(model, self._weights, self._design)
+        if new is not None:
+            replay = Replay(new, self._references.history)
+            yield None
+            yield partial(self._adopt, new, replay)
+
+    def _adopt(self, new: TrackingDesign, replay: Replay, source: StateSource) -> None:
+        """Go on with the new design as if it had been in use for as long as is remembered.
+
+        What its u_d differs by from that of the sample before fades.
+        """
+        self._use(new)
+        self._rest.use(new)
+        if self._references.empty:
+            self._x = [0.0] * new.model.order
+            return
+        x, q = replay.state(self._references.all())
+        self._integral, self._q = q + self._integral - self._q, q
+        window = self._references.window
+        ideal, onward = self._trajectory(x, window)
+        deviation = list(map(sub, source.x_hat, x))
+        if self._trusted_for > 0:
+            feedback = dot(self._soft[self._softness], deviation)
+        else:
+            feedback = self._bounded(deviation)
+        if self._trusted_for >= TRUSTED_AFTER:
+            feedback += new.gains.integral * (self._integral - q)
+        # The plant is at the next sample when the next command is made.
+        self._q += window.item(0) - new.model.c * x[0]
+        self._ideal, self._x = ideal, onward
+        self._handover = FADING * (self._u_d - ideal + feedback)
+
+    def _trajectory(self, x: list[float], window: Array) -> tuple[float, list[float]]:
+        """u* for x* and the references from now on, and the x* of the next sample."""
+        gains = self._design.gains
+        ideal = -dot(self._k, x) - float(gains.preview.dot(window))
+        if gains.integral:
+            ideal -= gains.integral * self._q
+        return ideal, [dot(row, x) + b * ideal for row, b in zip(self._a, self._b, strict=True)]
 
     def _begin(self, situation: Situation) -> None:
         start, noise = situation.y, OFF * self._noise_std
@@ -147,7 +231,8 @@ class Tracking:
             self._level -= 1
         levels = len(self._soft)
         unproven = levels - 1 - self._trusted_for * levels // TRUSTED_AFTER
-        return self._soft[max(self._level, unproven)]
+        self._softness = max(self._level, unproven)
+        return self._soft[self._softness]
 
     def _careful_feedback(
         self, estimate: Estimate, deviation: Sequence[float], ideal: float,
@@ -157,16 +242,19 @@ class Tracking:
         A wrong slope may make the loop unstable, which bounded feedback slows down. The bound
         widens while it is met: a gap wider than the first guess has to be crossed some day.
         """
-        if self._careful is None:
-            return 0.0
         self._u_reach = max(
             self._u_reach, abs(ideal), estimate.m * (estimate.c_r - estimate.c_l)
         )
-        feedback = dot(self._careful, deviation)
-        if abs(feedback) > self._u_reach:
-            feedback = self._u_reach if feedback > 0.0 else -self._u_reach
+        feedback = self._bounded(deviation)
+        if abs(feedback) == self._u_reach:
             self._u_reach *= WIDENING
         return feedback
+
+    def _bounded(self, deviation: Sequence[float]) -> float:
+        """Careful feedback within its bound."""
+        if self._careful is None:
+            return 0.0
+        return min(max(dot(self._careful, deviation), -self._u_reach), self._u_reach)
 
     def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
         """Whether the estimate gets full feedback; counts the samples for which it has held."""
@@ -176,7 +264,7 @@ class Tracking:
         if first:
             self._trusted_for = TRUSTED_AFTER
         if self._trusted_for < TRUSTED_AFTER:
-            self._trusted_for += SHARP_COUNTS if _is_sharp(estimate, self._u_reach) else 1
+            self._trusted_for += self._sharp_counts if _is_sharp(estimate, self._u_reach) else 1
         return self._trusted_for >= TRUSTED_AFTER
 
     def _note_covariance(self, x_cov: Array | None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from math import isnan
+from math import inf, isnan
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -130,5 +130,5 @@ class Estimator(StateSource, Protocol):
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
 
-    def refine(self) -> None:
-        """Do what the command of this sample need not wait for."""
+    def refine(self, budget_s: float = inf) -> None:
+        """Do what the command of this sample need not wait for, for about so long at most."""
