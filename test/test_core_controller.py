@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import signals
 
-from backlash_ros.core.controller import AdaptiveController, Limits
+from backlash_ros.core.controller import LARGEST, AdaptiveController, Limits
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval
 from backlash_ros.core.inverse import BacklashInverse
@@ -32,7 +32,7 @@ class Notebook:
         self.x_cov = None
         self.updates: list[tuple[float | None, Interval]] = []
 
-    def refine(self) -> None:
+    def refine(self, budget_s: float = inf) -> None:
         """Nothing to do after the command."""
 
     def update(self, y: float | None, interval: Interval) -> None:
@@ -133,6 +133,49 @@ def test_limits_hold_and_the_estimator_is_told_the_limited_v(
         published.append(v)
     c.refine()
     assert [interval.v for _, interval in estimator.updates] == published[1:-1]
+
+
+def test_narrowed_limits_are_entered_at_the_rate_limit() -> None:
+    c = controller(Notebook(replace(PAPER, f=0.0)), Limits(-12.0, 12.0, 1.5))
+    for _ in range(20):
+        c.step(0.0, 20.0)
+    assert c.inverse.v == 12.0
+    c.limits = Limits(-5.0, 5.0, 1.5)
+    assert [c.step(0.0, 20.0).v for _ in range(6)] == [10.5, 9.0, 7.5, 6.0, 5.0, 5.0]
+
+
+@given(st.one_of(st.floats(), st.just(1e300)), st.floats(-10.0, 10.0), st.floats(-20.0, 5.0),
+       st.floats(0.1, 30.0), st.one_of(st.just(inf), st.floats(0.1, 10.0)))
+def test_whatever_is_asked_what_is_sent_is_a_number_that_keeps_the_limits(
+    asked: float, v: float, low: float, width: float, move: float,
+) -> None:
+    limits = Limits(low, low + width, move)
+    sent = limits.apply(asked, v)
+    assert abs(sent - v) <= move * (1.0 + 1e-12)
+    outside, outside_before = (max(low - x, x - low - width, 0.0) for x in (sent, v))
+    assert outside <= max(outside_before - move, 0.0) + 1e-12
+    assert abs(Limits(move=move).apply(asked, v)) <= LARGEST
+
+
+@pytest.mark.parametrize('f', [0.0, 0.22])
+def test_new_estimates_move_v_no_faster_than_the_gap_is_crossed(f: float) -> None:
+    estimator = Notebook(replace(PAPER, f=f, c_r=1.0))
+    c = controller(estimator, inverse=BacklashInverse(take_up=0.1))
+    y_m = 0.0
+    for _ in range(60):
+        y_m += 0.02
+        c.step(0.0, y_m)
+    for changed in (PAPER, replace(PAPER, m=0.7)):
+        estimator.estimate = replace(changed, f=f)
+        moves = []
+        for _ in range(80):
+            before, y_m = c.inverse.v, y_m + 1e-6
+            moves.append(abs(c.step(0.0, y_m).v - before))
+        assert max(moves) <= 0.1 * (1.0 + 1e-9)
+        assert c.inverse.v == pytest.approx(3.0 + (y_m + 3.0 * f) / (changed.m - f))
+    c.compensating = False
+    before = c.inverse.v
+    assert abs(c.step(0.0, y_m + 1e-6).v - before) <= 0.1 * (1.0 + 1e-9)
 
 
 @given(move=st.floats(0.1, 3.0), y_m=st.floats(-20.0, 20.0), f=st.sampled_from([0.0, 0.22]),

@@ -23,7 +23,7 @@ def test_ramp_goes_to_the_v_nearest_to_zero_as_fast_as_the_limits_allow(
     v: float, move: float, low: float, width: float,
 ) -> None:
     limits = Limits(low, low + width, move)
-    v = limits.apply(v, v)
+    v = min(max(v, low), low + width)
     commands = [v, *last_commands('ramp', v, limits)]
     assert abs(commands[-1]) == min(abs(min(max(0.0, low), low + width)), abs(v))
     for before, after in pairwise(commands):
@@ -36,6 +36,13 @@ def test_hold_sends_nothing_and_zero_one_command(v: float) -> None:
     assert list(last_commands('hold', v, Limits())) == []
     assert list(last_commands('zero', v, Limits())) == [0.0]
     assert list(last_commands('zero', v, Limits(low=2.0))) == [2.0]
+
+
+@given(values, st.floats(0.5, 1e3))
+def test_zero_keeps_the_rate_limit_where_there_is_one(v: float, move: float) -> None:
+    commands = [v, *last_commands('zero', v, Limits(move=move))]
+    assert commands[-1] == 0.0
+    assert all(abs(b - a) <= move * (1.0 + 1e-9) for a, b in pairwise(commands))
 
 
 def test_ramp_from_an_absurd_v_ends() -> None:

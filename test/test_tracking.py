@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -28,8 +26,8 @@ from backlash_ros.core.rest import SHORT, Mode, Rest
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.core.slope_tolerance import tolerates
 from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Situation
 from backlash_ros.core.tracking import cautious_crossings
+from backlash_ros.core.tracking_design import Weights, design
 from backlash_ros.core.transfer_function import TransferFunction
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
@@ -115,33 +113,28 @@ def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
 
 
 def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> None:
-    rest, inverse, situation = resting(std=0.01)
-    x, window = np.zeros(2), deque([0.0])
-    assert rest.decide(situation, window, x, 0.0, x) is Mode.HOLD
-    rest.step(situation, 0.0, x, inverse, begins=True)
-    c_r, c_l = cautious_crossings(situation.estimate, rest.caution)
+    rest, inverse, estimate = resting(std=0.01)
+    x = [0.0, 0.0]
+    assert rest.decide(0.0, np.zeros(1), x, x, x, 0.0) is Mode.HOLD
+    rest.step(estimate, 0.0, x, inverse, begins=True)
+    c_r, c_l = cautious_crossings(estimate, rest.caution)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
     assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.01)
-    rest.step(situation, 0.0, x, inverse, begins=False)
+    rest.step(estimate, 0.0, x, inverse, begins=False)
     assert not inverse.taking_up, 'nothing more is known, so nothing more is done'
     known = resting(std=0.001)[2]
     rest.step(known, 0.0, x, inverse, begins=False)
-    c_r, c_l = cautious_crossings(known.estimate, rest.caution)
+    c_r, c_l = cautious_crossings(known, rest.caution)
     assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.001)
 
 
-def resting(std: float) -> tuple[Rest, BacklashInverse, Situation]:
-    """v engaged at u = 1 on the right of a gap from -1 to 1 with m = 1, and x known."""
+def resting(std: float) -> tuple[Rest, BacklashInverse, Estimate]:
+    """v engaged at u = 1 on the right of a gap from -1 to 1 with m = 1, and what is known of it."""
     model = StateModel(TransferFunction([0.1], [1.0, -1.9, 0.9]))
     inverse = BacklashInverse()
     inverse.step(1.0, 1.0, 1.0, -1.0)
     estimate = Estimate(1.0, 1.0, -1.0, 0.0, std, std, std, Status.TRACKING)
-
-    class Known:
-        x_hat = np.zeros(2)
-        x_cov = np.zeros((2, 2))
-
-    return Rest(model, np.zeros(2), 1e-3), inverse, Situation(0.0, 0.0, estimate, Known())
+    return Rest(design(model, Weights(1e-2, 0.0, 10)), 1e-3), inverse, estimate
 
 
 def test_nothing_moves_before_there_is_anything_to_do() -> None:

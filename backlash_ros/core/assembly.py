@@ -21,32 +21,23 @@ from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Estimator
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.last_command import check_last_commands
-from backlash_ros.core.lq_preview import PreviewGains, preview_gains
 from backlash_ros.core.model_check import check_model, model_warnings
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.pole_placement import FourBlocks, PolePlacement, place_poles
 from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.reference_file import read_reference_file
 from backlash_ros.core.reference_signal import ReferenceSignal
-from backlash_ros.core.rest import Rest
 from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
-from backlash_ros.core.slope_tolerance import tolerates
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import Structure
 from backlash_ros.core.tracking import Tracking
+from backlash_ros.core.tracking_design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.transfer_function import TransferFunction
 
 # Until the backlash is known, half of the motion of u may not be what the first guess says.
 DOUBT_OF_FIRST_GUESS = 0.5
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
-# Times the input weight while v meets its limits or the estimate is new; the last one while the
-# backlash is unknown.
-SOFTER = (1e1, 1e2, 1e3, 1e4)
-# Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
-# are led astray by any feedback that would help, and learn faster than they go astray without.
-WRONG_SLOPE = 1.35
-REST_BANDWIDTH = 1.0 / 80.0  # rad per sample, up to which y is corrected while the reference rests
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -221,57 +212,33 @@ def _proportional(p: Parameters) -> Structure:
     return Proportional()
 
 
-def _power_gain(model: TransferFunction, frequency: float) -> float:
-    """|G|^2 at so many rad per sample."""
-    return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
-
-
-def _input_weight(p: Parameters, model: TransferFunction) -> float:
-    return p.real('tracking.input_weight') * _power_gain(model, np.pi / 10.0)
-
-
 def _pole_placement(p: Parameters) -> Structure:
     return PolePlacement(_four_blocks(p))
 
 
 def _four_blocks(p: Parameters) -> FourBlocks:
     model, state = build_model(p), build_state_model(p)
-    gains = _gains(state, _input_weight(p, model))
+    weight = p.real('tracking.input_weight') * power_gain(model, np.pi / 10.0)
+    gains = lq_gains(state, weight)
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
     return place_poles(model, closed, p.real('pole_placement.filter_pole'))
 
 
 def _tracking(p: Parameters) -> Structure:
-    model, state = build_model(p), build_state_model(p)
-    weight = _input_weight(p, model)
-    gains = _gains(state, weight, p.real('tracking.integral_weight'), p.integer('tracking.preview'))
-    softer = [_gains(state, more * weight).state for more in SOFTER]
-    careful = softer[-1] if _bears_wrong_slope(state, SOFTER[-1] * weight) else None
-    noise_std = p.real('estimator.output_noise_std')
-    # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
-    gentle = _gains(state, _power_gain(model, REST_BANDWIDTH)).state
+    weights = Weights(
+        p.real('tracking.input_weight'), p.real('tracking.integral_weight'),
+        p.integer('tracking.preview'),
+    )
     return Tracking(
-        state, gains, careful, p.real('inverse.caution'), Rest(state, gentle, noise_std),
-        noise_std, softer,
+        design(build_state_model(p), weights), weights, p.real('inverse.caution'),
+        p.real('estimator.output_noise_std'),
     )
 
 
-# What follows is remembered: a controller that begins anew does so in the middle of a loop.
+# Remembered: a controller that begins anew does so in the middle of a loop.
 @lru_cache(maxsize=16)
 def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> StateModel:
     return StateModel(TransferFunction(numerator, denominator))
-
-
-@lru_cache(maxsize=64)
-def _gains(
-    model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,
-) -> PreviewGains:
-    return preview_gains(model, input_weight, integral_weight, window)
-
-
-@lru_cache(maxsize=16)
-def _bears_wrong_slope(model: StateModel, input_weight: float) -> bool:
-    return tolerates(model, _gains(model, input_weight).state, WRONG_SLOPE)
 
 
 ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Estimator]] = {

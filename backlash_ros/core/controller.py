@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from math import inf
-from typing import NamedTuple
+from math import inf, isnan
+from typing import NamedTuple, Protocol
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.structure import Situation, Structure
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Adoption, Situation, Structure
 
 LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 
@@ -40,10 +42,18 @@ class Limits:
         return min(max(0.0, self.low), self.high)
 
     def apply(self, v: float, v_before: float) -> float:
-        """v within the bounds and not too far from v_before."""
-        if self.move < inf:
-            v = min(max(v, v_before - self.move), v_before + self.move)
-        return min(max(v, self.low), self.high)
+        """What may be sent instead of v after v_before: every command passes through here, last.
+
+        It is within the bounds, or as far on the way to them as one sample allows; v_before stays
+        where v is no number.
+        """
+        if self.low <= v <= self.high and abs(v - v_before) <= self.move and abs(v) <= LARGEST:
+            return v
+        if isnan(v):
+            v = v_before
+        # Beyond the largest measurement nobody could tell what v does.
+        v = min(max(v, self.low, -LARGEST), self.high, LARGEST)
+        return min(max(v, v_before - self.move), v_before + self.move)
 
 
 class ControlStep(NamedTuple):
@@ -56,13 +66,15 @@ class ControlStep(NamedTuple):
     estimate: Estimate
 
 
-class _Lesson(NamedTuple):
-    """An output that is still to be learned from."""
+class ModelLearner(Protocol):
+    """Learns a better model of G."""
 
-    y: float
-    interval: Interval
-    lost: int
-    applied: Sequence[float]
+    @property
+    def proposal(self) -> StateModel | None:
+        """A better G, of whatever order; None if none is new."""
+
+    def adopt(self, model: StateModel) -> None:
+        """Let x_hat be in the coordinates of this model from now on."""
 
 
 class AdaptiveController:
@@ -72,18 +84,26 @@ class AdaptiveController:
     before v(k) only where the structure feeds y back; else v(k) need not wait for it.
 
     compensating: False inverts the slope alone, as if there were no gap.
+    learner: who proposes better models of G, for the structure to be designed anew; None where
+    that of the beginning is kept.
     """
 
     def __init__(
         self, estimator: Estimator, structure: Structure, inverse: BacklashInverse,
-        limits: Limits,
+        limits: Limits, learner: ModelLearner | None = None,
     ) -> None:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
         self.compensating = True
         self.lost_samples = 0
+        self.adopted: StateModel | None = None  # the learned model of G that is in use
+        self._learner = learner
+        self._considered: StateModel | None = None  # the proposal that was designed for last
+        self._design: Iterator[Adoption | None] = iter(())
         self._interval: Interval | None = None
-        self._lesson: _Lesson | None = None
+        # y(k), the interval before it, samples lost before it and what was applied, as long as
+        # it is still to be learned from.
+        self._lesson: tuple[float, Interval, int, Sequence[float]] | None = None
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
@@ -94,50 +114,84 @@ class AdaptiveController:
         call; the plant went on with the last v through all of them. applied: the v that was
         really applied in each of the lost + 1 intervals since then, if it is known.
         """
-        if not (plausible(y) and plausible(y_m)) or (applied and not all(map(plausible, applied))):
+        if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST) or (
+            applied and not all(map(plausible, applied))
+        ):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite and no larger than '
                 f'{LARGEST:g}'
             )
-        if lost < 0 or len(applied) not in (0, lost + 1):
+        if lost < 0 or (applied and len(applied) != lost + 1):
             raise ValueError(f'lost={lost!r} must be >= 0 and applied have lost + 1 values')
         if self._lesson is not None:
             self._learn()
         if self._interval is not None:
-            self._lesson = _Lesson(y, self._interval, lost, applied)
+            self._lesson = y, self._interval, lost, applied
             if self.structure.needs_output:
                 self._learn()
-        estimate, inverse = self.estimator.estimate, self.inverse
+        estimator, inverse = self.estimator, self.inverse
+        used = estimate = estimator.estimate
+        if not self.compensating:
+            used = replace(estimate, c_r=0.0, c_l=0.0)
         v_before = inverse.v
-        used = estimate if self.compensating else replace(estimate, c_r=0.0, c_l=0.0)
-        command = self.structure.control(Situation(y_m, y, used, self.estimator), inverse)
-        v = self.limits.apply(command.v, v_before)
+        u_d, v, f = self.structure.control(Situation(y_m, y, used, estimator), inverse)
+        v = self.limits.apply(v, v_before)
         inverse.applied(v)
-        self._interval = Interval(v, y_m, command.u_d, command.f)
-        return ControlStep(y_m, y, command.u_d, v, estimate)
+        self._interval = Interval(v, y_m, u_d, f)
+        return ControlStep(y_m, y, u_d, v, estimate)
 
     def start_from(self, v: float) -> None:
         """Say which v acts now, so that the first command goes on from there."""
         self.inverse.start_from(v)
 
-    def refine(self) -> None:
-        """Do what the command did not have to wait for.
+    def go_on_from(self, before: AdaptiveController) -> None:
+        """Take over from the controller before this one, as the state of the plant got unknown.
+
+        v, the line that is engaged and the learned model of G stay.
+        """
+        self.inverse.go_on_from(before.inverse)
+        self._considered = before._considered
+        if self._learner is not None and before.adopted is not None:
+            self._learner.adopt(before.adopted)
+            self.adopted = before.adopted
+        self.structure.go_on_from(before.structure, state_known=False)
+
+    def refine(self, budget_s: float = inf) -> None:
+        """Do what the command did not have to wait for, for about so many seconds at most.
 
         Who has no time for it leaves it out: the next step learns what it has to, and a search
         for the gap pauses.
         """
+        started = time.perf_counter()
         if self._lesson is not None:
             self._learn()
-        self.estimator.refine()
+        self.estimator.refine(budget_s)
+        if self._learner is not None:
+            self._design_on(self._learner, started + budget_s)
+
+    def _design_on(self, learner: ModelLearner, until: float) -> None:
+        """Design the structure for the newest proposal, a piece at a time while there is time."""
+        while time.perf_counter() < until:
+            # A design that is begun is ended: a proposal a second would never be used otherwise.
+            for adoption in self._design:
+                if adoption is not None and self._considered is not None:
+                    # At once and together: x_hat and gains of two models do not fit each other.
+                    learner.adopt(self._considered)
+                    self.adopted = self._considered
+                    adoption(self.estimator)
+                break
+            else:
+                proposal = learner.proposal
+                if proposal is None or proposal is self._considered:
+                    return
+                self._considered, self._design = proposal, self.structure.design(proposal)
 
     def _learn(self) -> None:
         lesson, self._lesson = self._lesson, None
         assert lesson is not None
-        interval, applied = lesson.interval, lesson.applied
-        for i in range(lesson.lost):
+        y, interval, lost, applied = lesson
+        for i in range(lost):
             passed = interval._replace(v=applied[i]) if applied else interval
             self.estimator.update(None, passed)
-        self.lost_samples += lesson.lost
-        self.estimator.update(
-            lesson.y, interval._replace(v=applied[-1]) if applied else interval
-        )
+        self.lost_samples += lost
+        self.estimator.update(y, interval._replace(v=applied[-1]) if applied else interval)

@@ -1,6 +1,8 @@
 """Backlash inverse, equations (2.2) and (2.3), with a direction band and a slow take-up."""
 
-from math import inf
+from __future__ import annotations
+
+from math import inf, nan
 
 from backlash_ros.core.backlash import Region
 from backlash_ros.core.errors import ParameterError
@@ -16,8 +18,9 @@ class BacklashInverse:
 
     direction_band: u_d has turned only when it came back from its extreme by more than this
         [unit of u_d]; until then v is held. 0 is the printed inverse.
-    take_up: largest move of v per sample while the gap is crossed [unit of v] (2.3: "a line
-        segment with a finite slope"); inf jumps.
+    take_up: largest move of v per sample while the gap is crossed (2.3: "a line segment with a
+        finite slope") and while v goes over to a line that the estimates have moved by more than
+        that [unit of v]; inf jumps.
     """
 
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
@@ -32,6 +35,7 @@ class BacklashInverse:
         self.side = GAP  # line in use; GAP until u_d moves for the first time
         self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
         self.taking_up = False  # whether v is still on its way to the line
+        self._slope, self._crossing = nan, nan  # of the line that v was last sent to
 
     def set_band(self, band: float) -> None:
         """Use this band, and none narrower from now on."""
@@ -39,7 +43,14 @@ class BacklashInverse:
 
     def widen_band(self, band: float) -> None:
         """Use this band while it is wider than the one set: the noise of u_d may vary."""
-        self.direction_band = max(self._least_band, band)
+        least = self._least_band
+        self.direction_band = band if band > least else least
+
+    def go_on_from(self, other: BacklashInverse) -> None:
+        """Take over v and the line that is engaged."""
+        self.v, self.side, self.extreme = other.v, other.side, other.extreme
+        self.taking_up, self.limited = other.taking_up, other.limited
+        self._slope, self._crossing = other._slope, other._crossing
 
     def direction(self, u_d: float) -> Region:
         """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held.
@@ -49,26 +60,34 @@ class BacklashInverse:
         move, band = u_d - self.extreme, self.direction_band
         # Only a turn has to leave the band; going on in the same direction is never noise.
         if move > 0.0:
-            return RIGHT if band == 0.0 or self.side == RIGHT or move > band else GAP
+            return RIGHT if band == 0.0 or self.side is RIGHT or move > band else GAP
         if move < 0.0:
-            return LEFT if band == 0.0 or self.side == LEFT or move < -band else GAP
+            return LEFT if band == 0.0 or self.side is LEFT or move < -band else GAP
         return GAP
 
     def step(self, u_d: float, m: float, c_r: float, c_l: float) -> float:
         """Return v(t) for u_d(t) and the parameters in use, equation (2.3)."""
         side = self.direction(u_d)
-        if side != GAP:
-            self.taking_up = self.taking_up or side != self.side
+        if side is not GAP:
+            self.taking_up = self.taking_up or side is not self.side
             self.side, self.extreme = side, u_d
-        elif not self.taking_up:
+        elif not self.taking_up or self.side is GAP:
             return self.v
-        target = self.extreme / m + (c_r if self.side == RIGHT else c_l)
-        move = target - self.v
-        if self.taking_up and abs(move) > self.take_up:
-            self.v += self.take_up if move > 0.0 else -self.take_up
+        crossing = c_r if self.side is RIGHT else c_l
+        v = self.extreme / m + crossing
+        move, take_up = v - self.v, self.take_up
+        if (move > take_up or move < -take_up) and (self.taking_up or self._moved(m, crossing)):
+            self.taking_up = True
+            self.v += take_up if move > 0.0 else -take_up
         else:
-            self.v, self.taking_up = target, False
+            self.v, self.taking_up = v, False
+        self._slope, self._crossing = m, crossing
         return self.v
+
+    def _moved(self, m: float, crossing: float) -> bool:
+        """Whether the line has moved by more than v may in a sample."""
+        before = self.extreme / self._slope + self._crossing
+        return abs(self.extreme / m + crossing - before) > self.take_up
 
     def aim(self, u_d: float, side: Region) -> None:
         """Let the next step go to u_d on the line of this side, whatever it came from."""
@@ -81,12 +100,16 @@ class BacklashInverse:
         return self.v
 
     def start_from(self, v: float) -> None:
-        """Say which v acts before the first step."""
+        """Say which v acts before the next step, whatever was sent."""
+        if v != self.v and self.side is not GAP:
+            self.extreme = self._slope * (v - self._crossing)
         self.v = v
 
     def applied(self, v: float) -> None:
         """Say which v was really applied (limits), so that the next move starts from there."""
-        self.limited = v != self.v
-        # A v that was held back goes on its way although u_d rests.
-        self.taking_up = self.taking_up or self.limited
-        self.v = v
+        limited = v != self.v
+        self.limited = limited
+        if limited:
+            # A v that was held back goes on its way although u_d rests.
+            self.taking_up = True
+            self.v = v

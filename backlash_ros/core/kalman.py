@@ -161,7 +161,7 @@ class KalmanEstimator:
         return std[0] * root, std[1] * root, std[2] * root
 
     @np.errstate(over='ignore', invalid='ignore')
-    def refine(self) -> None:
+    def refine(self, budget_s: float = inf) -> None:
         """Search on: read the record again, compare all gaps."""
         self._search.refine()
         if self._challenger is not None:
@@ -327,7 +327,7 @@ class _Watched:
             self._waiting = (y, v, heard)
         return accepted
 
-    def refine(self) -> None:
+    def refine(self, budget_s: float = inf) -> None:
         """Let the search take in the newest sample and go on."""
         waiting, before = self._waiting, self.search.fine
         if waiting is None:

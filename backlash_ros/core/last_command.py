@@ -1,4 +1,4 @@
-"""What becomes of v when the loop ends or y stays away: it is held, zeroed or ramped to zero."""
+"""What becomes of v when the loop ends or y stays away: it is held, or goes to zero."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from backlash_ros.core.parameters import Parameters
 def last_commands(action: str, v: float, limits: Limits) -> Iterator[float]:
     """Commands that follow v, one per sample; the last one stays in force.
 
-    action: hold (no further command), zero or ramp. Zero is the v nearest to 0 within the limits;
-    it comes at once or, with ramp, as fast as the limits allow.
+    action: hold (no further command), zero or ramp. Both go to the v nearest to 0 within the limits
+    as fast as the limits allow; where they allow any move, which ramp is refused for, that is one
+    command.
     """
-    if action == 'zero':
-        yield limits.zero
-    while action == 'ramp' and v != limits.zero:
+    if action == 'hold':
+        return
+    if action == 'zero' and v == limits.zero:
+        yield v  # said even if nothing changes
+    while v != limits.zero:
         before, v = v, limits.apply(limits.zero, v)
         if v == before:
             return  # v is so large that a step at rate_max does not change it

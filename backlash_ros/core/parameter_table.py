@@ -127,12 +127,15 @@ PARAMETERS: tuple[Parameter, ...] = (
               live=True, infinite=True),
     Parameter('inverse.direction_band', 0.0,
               'u_d has turned only after coming back by more than this', 'u', low=0.0, live=True),
-    Parameter('inverse.take_up_rate', inf, 'largest speed of v while it crosses the gap', 'v/s',
+    Parameter('inverse.take_up_rate', inf,
+              'largest speed of v while it crosses the gap, and while it goes over to a line that '
+              'new estimates have moved', 'v/s',
               low=0.0, above=True, live=True, infinite=True),
     Parameter('autostart', True, 'configure and activate at the start, without being asked'),
     Parameter('on_stop', 'hold',
-              'last command at deactivation and at the end: v is held, set to zero at once, or '
-              'ramped to zero at control.rate_max', choices=('hold', 'zero', 'ramp'), live=True),
+              'last command at deactivation and at the end: v is held, set to zero as fast as '
+              'control.rate_max allows (none: at once), or ramped to zero at control.rate_max, '
+              'which must be set then', choices=('hold', 'zero', 'ramp'), live=True),
     Parameter('on_timeout', 'hold', 'the same while plant_output is silent',
               choices=('hold', 'zero', 'ramp'), live=True),
     Parameter('timeout.plant_output', 0.5,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from math import hypot, isnan
+from collections.abc import Iterator
+from math import hypot, inf, isnan
 
 from backlash_ros.core.backlash import Region
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.structure import Command, Situation
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import Adoption, Command, Situation, Structure
 
 # (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
 LARGEST_F_OVER_M = 0.8
@@ -29,43 +31,82 @@ class Proportional:
     delay = 0
     needs_output = False
 
+    def __init__(self) -> None:
+        self._estimate: Estimate | None = None  # that of the sample before
+
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over what the present v was made with."""
+        if isinstance(other, Proportional):
+            self._estimate = other._estimate
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Nothing here depends on G."""
+        yield lambda source: None
+
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
         y_m, estimate = situation.y_m, situation.estimate
-        if not isnan(estimate.std_m):
-            inverse.widen_band(NOISE_BAND * _deviation(y_m, estimate))
-        m, c_r, c_l = estimate.m, estimate.c_r, estimate.c_l
-        f = min(estimate.f, LARGEST_F_OVER_M * m)
+        m, c_r, c_l, f = estimate.m, estimate.c_r, estimate.c_l, estimate.f
+        before, self._estimate = self._estimate, estimate
+        if f == 0.0:  # nothing to solve
+            return Command(y_m, inverse.step(y_m, m, c_r, c_l), f)
+        if f > LARGEST_F_OVER_M * m:
+            f = LARGEST_F_OVER_M * m
+        if before is not None and before is not estimate and inverse.take_up < inf:
+            _slow_down(inverse, _solution(y_m, before, inverse), _solution(y_m, estimate, inverse))
         right = m * (y_m + f * c_r) / (m - f)
         left = m * (y_m + f * c_l) / (m - f)
-        held = y_m + f * inverse.v
+        v = inverse.v
+        nearer_right = abs(right / m + c_r - v) <= abs(left / m + c_l - v)
+        held = y_m + f * v
+        rests = abs(held - inverse.extreme) <= ROUNDING * (abs(held) + abs(v))
+        if not (rests or inverse.taking_up):
+            # Going on along the line in use, by far the most frequent case, needs no band.
+            side = inverse.side
+            u_d = right if nearer_right else left
+            if (
+                side is (Region.RIGHT if nearer_right else Region.LEFT)
+                and (held - inverse.extreme) * side > 0.0
+                and (u_d - inverse.extreme) * side > 0.0
+            ):
+                return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
+        if not isnan(estimate.std_m):
+            inverse.widen_band(NOISE_BAND * _deviation(y_m, f, estimate))
         if inverse.taking_up:
             for side, u_d in ((Region.RIGHT, right), (Region.LEFT, left)):
-                if inverse.side == side and inverse.direction(u_d) == Region.GAP:
+                if inverse.side is side and inverse.direction(u_d) is Region.GAP:
                     v = inverse.step(u_d, m, c_r, c_l)  # u_d rests, v goes on to its line
                     return Command(y_m + f * v, v, f)
-        elif inverse.direction(held) == Region.GAP or _rests(inverse, held):
-            return Command(held, inverse.v, f)  # first case of (3.3): u_d rests, and so does v
-        right_fits = inverse.direction(right) == Region.RIGHT
-        left_fits = inverse.direction(left) == Region.LEFT
+        elif rests or inverse.direction(held) is Region.GAP:
+            return Command(held, v, f)  # first case of (3.3): u_d rests, and so does v
+        right_fits = inverse.direction(right) is Region.RIGHT
+        left_fits = inverse.direction(left) is Region.LEFT
         if right_fits and left_fits:
             # Both directions solve the loop: the smaller move is the one a shaft would make.
-            right_fits = abs(right / m + c_r - inverse.v) <= abs(left / m + c_l - inverse.v)
+            right_fits = nearer_right
         if right_fits or left_fits:
             u_d = right if right_fits else left
             return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
         return Command(held, inverse.hold(held), f)
 
 
-def _rests(inverse: BacklashInverse, u_d: float) -> bool:
-    """Whether u_d has moved by no more than u_d on a line and y_m + f v differ in rounding."""
-    return abs(u_d - inverse.extreme) <= ROUNDING * (abs(u_d) + abs(inverse.v))
+def _solution(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> float:
+    """v on the line in use."""
+    m, c = estimate.m, estimate.c_r if inverse.side is Region.RIGHT else estimate.c_l
+    return c + (y_m + estimate.f * c) / (m - min(estimate.f, LARGEST_F_OVER_M * m))
 
 
-def _deviation(y_m: float, estimate: Estimate) -> float:
+def _slow_down(inverse: BacklashInverse, before: float, now: float) -> None:
+    """Let v go over to what a new estimate wants like it crosses the gap.
+
+    The inverse cannot tell that by itself, as a new estimate moves u_d too.
+    """
+    inverse.taking_up = inverse.taking_up or abs(now - before) > inverse.take_up
+
+
+def _deviation(y_m: float, f: float, estimate: Estimate) -> float:
     """Standard deviation of u_d that comes from the estimates."""
-    m, c = estimate.m, estimate.c_r
-    f = min(estimate.f, LARGEST_F_OVER_M * m)
-    by_m = f * (y_m + f * c) / (m - f) ** 2
+    m = estimate.m
+    by_m = f * (y_m + f * estimate.c_r) / (m - f) ** 2
     by_c = m * f / (m - f)
     return hypot(by_m * estimate.std_m, by_c * max(estimate.std_c_r, estimate.std_c_l))

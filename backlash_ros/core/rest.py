@@ -13,15 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum, auto
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.backlash import Region
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Situation
+from backlash_ros.core.structure import dot
+from backlash_ros.core.tracking_design import TrackingDesign
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,6 @@ LED_BACK = 0.25  # share of what brings y back below which it is no longer neede
 TOO_WEAK = 0.5  # share of it with which y would not come back
 SHORT = 2.0  # standard deviations of the crossing by which v stops short of the u at rest
 GAIN = 1.5  # least factor by which a step has to lessen what u is off
-HORIZON = 300  # samples within which what u is off must matter to be worth a step
 MATTERS = 0.25  # share of the tolerance that it must move x by
 
 
@@ -58,19 +58,25 @@ class Mode(Enum):
 class Rest:
     """Decides whether v rests, and steps it there.
 
-    gain: gentle state feedback, shape (n,), which says what u brings y back. noise_std: of y.
+    noise_std: of y.
     """
 
-    def __init__(self, model: StateModel, gain: Array, noise_std: float) -> None:
+    def __init__(self, design: TrackingDesign, noise_std: float) -> None:
         self.mode = Mode.HOLD
         self.u_d = 0.0  # where v rests
         self.caution = 0.0  # standard deviations by which the crossings are shrunk for it
-        self._model, self._gain, self._noise_std = model, gain, noise_std
-        self._reach = 0.0  # largest |x*| so far
+        self._noise_std = noise_std
+        self.use(design)
+        self._reach = 0.0  # square of the largest |x*| so far
         self._limit = 0.0  # tolerance in use
         self._rested = 0  # samples for which the trajectory has rested
         self._pull = 0.0  # u - u* with which leading back began
-        self._push = float(np.linalg.norm(_response_to_step(model, HORIZON)))
+        self._low, self._high = inf, -inf  # of the window, where it was still the sample before
+
+    def use(self, design: TrackingDesign) -> None:
+        """Rest as this design says."""
+        self._gain: list[float] = design.gentle.tolist()
+        self._push = design.push
 
     def go_on_from(self, other: Rest) -> None:
         """Take over where another one of the same model rests."""
@@ -79,44 +85,52 @@ class Rest:
         self._rested = other._rested
 
     def decide(
-        self, situation: Situation, window: Sequence[float], x: Array, ideal: float,
-        deviation: Array,
+        self, y: float, window: Array, x: Sequence[float], onward: Sequence[float],
+        deviation: Sequence[float], x_std: float | None,
     ) -> Mode:
         """Set the mode for this sample.
 
-        window: r from now on. x, ideal: x* and u*. deviation: x_hat - x*.
+        window: r from now on. x, onward: x* now and at the next sample. deviation: x_hat - x*.
+        x_std: standard deviation of x_hat, None where it is unknown.
         """
-        self._reach = max(self._reach, sqrt(float(x @ x)))
-        least = SHARE * self._reach
+        self._reach = max(self._reach, dot(x, x))
+        least = SHARE * sqrt(self._reach)
         tolerance = max(TOLERANCE * self._noise_std, least)
-        motion = self._model.a @ x + self._model.b * ideal - x
-        before = self.mode
-        if (
-            max(window) - min(window) > self._noise_std
-            or sqrt(float(motion @ motion)) > STEADY * tolerance
-        ):
+        motion = 0.0
+        for now, then in zip(x, onward, strict=True):
+            motion += (then - now) ** 2
+        if motion > (STEADY * tolerance) ** 2:
+            self._low, self._high = inf, -inf
             self.mode, self._rested = Mode.FOLLOW, 0
-        elif situation.x_cov is None:
-            off = abs(situation.y - window[0]) > OFF * self._noise_std
+        elif not self._is_still(window):
+            self.mode, self._rested = Mode.FOLLOW, 0
+        elif x_std is None:
+            off = abs(y - window.item(0)) > OFF * self._noise_std
             self.mode = Mode.FOLLOW if off else Mode.HOLD
-            if before is Mode.FOLLOW:
-                self.u_d, self.caution = ideal, 0.0
         else:
             self._rested += 1
             if self._rested < SETTLING:
                 tolerance = max(CLOSE * self._noise_std, least)
-            doubt = DOUBT * sqrt(max(float(np.trace(situation.x_cov)), 0.0))
-            self._limit = max(tolerance, doubt)
+            self._limit = max(tolerance, DOUBT * x_std)
             self.mode = self._mode_for(deviation)
         return self.mode
 
-    def _mode_for(self, deviation: Array) -> Mode:
-        size = sqrt(float(deviation @ deviation))
+    def _is_still(self, window: Array) -> bool:
+        newest = window.item(-1)
+        if self._low <= newest <= self._high:
+            return True  # it has lost one value and won one between the others
+        low, high = float(window.min()), float(window.max())
+        still = high - low <= self._noise_std
+        self._low, self._high = (low, high) if still else (inf, -inf)
+        return still
+
+    def _mode_for(self, deviation: Sequence[float]) -> Mode:
+        size = sqrt(dot(deviation, deviation))
         if size > ASTRAY * self._limit:
             return Mode.FOLLOW
         if self.mode is Mode.FOLLOW:
             return Mode.HOLD if size <= ARRIVED * self._limit else Mode.FOLLOW
-        pull = -float(self._gain @ deviation)
+        pull = self._pull_back(deviation)
         if self.mode is Mode.LEAD_BACK:
             back = pull * self._pull <= LED_BACK * self._pull**2
             return Mode.HOLD if back else Mode.LEAD_BACK
@@ -125,23 +139,26 @@ class Rest:
         self._pull = pull
         return Mode.LEAD_BACK
 
+    def stay(self, u_d: float) -> None:
+        """Rest at this u."""
+        self.u_d, self.caution = u_d, 0.0
+
     def step(
-        self, situation: Situation, ideal: float, deviation: Array, inverse: BacklashInverse,
-        begins: bool,
+        self, estimate: Estimate, ideal: float, deviation: Sequence[float],
+        inverse: BacklashInverse, begins: bool,
     ) -> None:
         """Aim the inverse at the u that is wanted, where that is better than to stay.
 
-        begins: whether the mode has changed with this sample.
+        ideal: u*. begins: whether the mode has changed with this sample.
         """
         if begins:
-            self.u_d, self.caution = inverse.extreme, 0.0
+            self.stay(inverse.extreme)
         if inverse.taking_up:
             return  # still on its way
-        estimate = situation.estimate
         engaged = estimate.c_l if inverse.side == Region.LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
         if self.mode is Mode.LEAD_BACK:
-            pull = -float(self._gain @ deviation)
+            pull = self._pull_back(deviation)
             if begins or (u - ideal) * pull < TOO_WEAK * pull * pull:
                 self._aim(ideal + pull, u, 0.0, inverse)
             return
@@ -150,13 +167,9 @@ class Rest:
         if away * self._push > MATTERS * self._limit and away > GAIN * uncertain:
             self._aim(ideal, u, SHORT, inverse)
 
+    def _pull_back(self, deviation: Sequence[float]) -> float:
+        return -dot(self._gain, deviation)
+
     def _aim(self, u_d: float, u: float, caution: float, inverse: BacklashInverse) -> None:
         self.u_d, self.caution = u_d, caution
         inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)
-
-
-def _response_to_step(model: StateModel, samples: int) -> Array:
-    x: Array = np.zeros(model.order)
-    for _ in range(samples):
-        x = model.a @ x + model.b
-    return x

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from operator import mul
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.protocol import Estimate, StateSource
 from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.state_model import StateModel
 
 
 class Situation(NamedTuple):
@@ -20,9 +23,10 @@ class Situation(NamedTuple):
     source: StateSource
 
     @property
-    def x_hat(self) -> NDArray[np.float64]:
+    def x_hat(self) -> Sequence[float]:
         """State of G in the coordinates of StateModel, shape (n,)."""
-        return self.source.x_hat
+        x_hat = self.source.x_hat
+        return x_hat.tolist() if isinstance(x_hat, np.ndarray) else x_hat
 
     @property
     def x_cov(self) -> NDArray[np.float64] | None:
@@ -38,6 +42,16 @@ class Command(NamedTuple):
     f: float
 
 
+def dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Inner product of two states: beside so few numbers a call of NumPy takes longer."""
+    product: float = sum(map(mul, a, b))
+    return product
+
+
+# Makes a structure use what it has designed, given who knows the state of the better model.
+Adoption = Callable[[StateSource], None]
+
+
 class Structure(Protocol):
     """Makes u_d from the reference and drives the inverse with it."""
 
@@ -51,3 +65,17 @@ class Structure(Protocol):
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Prepare for a better model of G, a piece of some 0.3 ms each time it is asked on.
+
+        Yields None as long as there is more to do, and last what makes the structure use the
+        result at once and without a jump. Where the result would be less safe than what is in
+        use, or the structure does not adapt to G, it ends without that.
+        """
+
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over from a structure that has made v until now, so that v does not jump.
+
+        state_known: whether x_hat still says where the plant is.
+        """

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 from math import isnan, sqrt
+from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimation.protocol import Estimate, StateSource, Status
 from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.lq_preview import PreviewGains
+from backlash_ros.core.reference_window import ReferenceWindow
 from backlash_ros.core.rest import OFF, Mode, Rest
 from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Command, Situation
+from backlash_ros.core.structure import Adoption, Command, Situation, Structure, dot
+from backlash_ros.core.tracking_design import (
+    Replay,
+    TrackingDesign,
+    Weights,
+    better_design_in_pieces,
+    design,
+)
 
 Array = NDArray[np.float64]
 
 HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
+FADING = 0.8  # per sample, of what u_d of a new design differs by from that of the one before
 WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is unknown
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
 # wrong is contradicted by then. Until then feedback hardens step by step.
@@ -39,85 +48,181 @@ class Tracking:
     The trajectory is what the LQ preview controller does without backlash, for the reference r,
     which is y_m delayed by the preview window: the delay is what the preview costs. Before the
     first reference has passed the window r is the output at the start, so that nothing jumps.
-    While the backlash is unknown, `careful` replaces K, or nothing where it is None: the trajectory
-    itself excites the backlash. With the first estimate it gives way to softer gains, then to K.
+    While the backlash is unknown, the careful gain of the design replaces K: the trajectory itself
+    excites the backlash. With the first estimate it gives way to softer gains, then to K.
     caution: standard deviations by which the crossings are shrunk before they are inverted.
-    softer: gains to replace K with, step by step, while v meets its limits, where full feedback
-    would cycle between them, and while the estimate is new.
-    rest: what v does while the trajectory rests. noise_std: of y.
+    noise_std: of y.
+
+    x_cov is only looked into when it is another array than the sample before.
     """
 
     needs_output = True
 
     def __init__(
-        self, model: StateModel, gains: PreviewGains, careful: Array | None, caution: float,
-        rest: Rest, noise_std: float = 0.0, softer: Sequence[Array] = (),
+        self, beginning: TrackingDesign, weights: Weights, caution: float, noise_std: float = 0.0,
     ) -> None:
-        self.delay = len(gains.preview) - 1
-        self._model, self._gains = model, gains
-        self._careful, self._caution = careful, caution
-        self._window: deque[float] = deque(maxlen=self.delay + 1)  # r(k) .. r(k + delay)
-        self._x: Array = np.zeros(model.order)  # x* and q* of the trajectory
+        self.delay = weights.preview
+        self._weights, self._caution, self._noise_std = weights, caution, noise_std
+        self._references = ReferenceWindow(self.delay, beginning.model.memory)
+        self._rest = Rest(beginning, noise_std)
+        self._use(beginning)
+        self._x = [0.0] * beginning.model.order  # x* and q* of the trajectory
         self._q = 0.0
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
-        self._noise_std, self._u_reach = noise_std, 0.0
-        self._trusted_for = 0  # samples
-        self._soft = (gains.state, *softer)
-        self._level = self._free = 0  # gain in use, samples since v last met a limit
-        self._rest = rest
+        self._u_reach = 0.0
+        self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
+        self._level = self._free = 0  # softer while v meets limits, samples since it last did
+        self._softness = 0  # of the gain in use
+        self._u_d = 0.0  # of the sample before
+        self._resumes = False  # whether this goes on from an interruption
+        self._blind_for = 1  # samples from now on in which x_hat cannot be known
+        self._handover = 0.0  # what is still added to u_d since another design took over
 
-    def go_on_from(self, other: Tracking) -> None:
-        """Take over the trajectory of a structure with the same model and preview."""
-        self._window, self._x, self._q = other._window, other._x, other._q
-        self._integral, self._ideal = other._integral, other._ideal
-        self._level, self._free = other._level, other._free
-        self._trusted_for, self._u_reach = other._trusted_for, other._u_reach
+    @property
+    def model(self) -> StateModel:
+        """The model of G whose gains are in use."""
+        return self._design.model
+
+    def _use(self, chosen: TrackingDesign) -> None:
+        model, gains = chosen.model, chosen.gains
+        self._design = chosen
+        self._a: list[list[float]] = model.a.tolist()
+        self._b: list[float] = model.b.tolist()
+        self._k: list[float] = gains.state.tolist()
+        self._soft: list[list[float]] = [gain.tolist() for gain in (gains.state, *chosen.softer)]
+        self._careful = None if chosen.careful is None else chosen.careful.tolist()
+        self._x_cov: Array | None = None
+        self._x_std = self._feedback_std = 0.0  # of x_hat and of K x_hat, as in x_cov
+
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over the trajectory, and the model of G that it is one of."""
+        if not isinstance(other, Tracking) or other.delay != self.delay:
+            return
+        if other.model is not self.model:
+            self._use(design(other.model, self._weights))
+            self._rest.use(self._design)
+        self._references, self._x, self._q = other._references, other._x, other._q
+        self._integral, self._ideal, self._u_d = other._integral, other._ideal, other._u_d
+        self._level, self._free, self._softness = other._level, other._free, other._softness
+        self._handover, self._sharp_counts = other._handover, other._sharp_counts
         self._rest.go_on_from(other._rest)
+        if state_known:
+            self._trusted_for, self._u_reach = other._trusted_for, other._u_reach
+            self._resumes, self._blind_for = other._resumes, other._blind_for
+        else:
+            # However well the backlash is known, the first x_hat are full of noise.
+            self._resumes, self._blind_for, self._sharp_counts = True, self.model.order, 1
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
-        first = not self._window
-        self._take_in(situation)
-        gains = self._gains
-        window = np.fromiter(self._window, np.float64, self.delay + 1)
-        ideal = -float(gains.state @ self._x) - gains.integral * self._q
-        ideal -= float(gains.preview @ window)
-        deviation = np.zeros(len(self._x)) if first else situation.x_hat - self._x
-        trusted = self._is_trusted(situation.estimate, first)
-        if self._trusted_for > 0:
-            u_d = ideal - float(self._gain(inverse.limited) @ deviation)
+        estimate, gains = situation.estimate, self._design.gains
+        first = self._references.empty
+        if first:
+            self._begin(situation)
+        elif self._resumes:
+            self._references.lead_to(situation.y_m)
+        window = self._references.append(situation.y_m)
+        x = self._x
+        ideal, onward = self._trajectory(x, window)
+        if self._blind_for:
+            self._blind_for -= 1
+            deviation = [0.0] * len(x)
         else:
-            u_d = ideal - self._careful_feedback(situation.estimate, deviation, ideal)
-        if trusted:
-            u_d -= gains.integral * (self._integral - self._q)
-        before = self._rest.mode
-        mode = self._rest.decide(situation, self._window, self._x, ideal, deviation)
+            deviation = list(map(sub, situation.x_hat, x))
+        x_cov = situation.x_cov
+        if x_cov is not self._x_cov:
+            self._note_covariance(x_cov)
+        trusted = self._is_trusted(estimate, first)
+        if self._trusted_for > 0:
+            feedback = dot(self._gain(inverse.limited), deviation)
+        else:
+            feedback = self._careful_feedback(estimate, deviation, ideal)
+        if trusted and gains.integral:
+            feedback += gains.integral * (self._integral - self._q)
+        u_d = ideal - feedback
+        rest = self._rest
+        if self._resumes:
+            self._resumes, self._handover = False, FADING * (inverse.extreme - u_d)
+            u_d = inverse.extreme
+            rest.stay(u_d)
+        elif self._handover:
+            faded = u_d + self._handover
+            self._handover = FADING * self._handover if faded != u_d else 0.0
+            u_d = faded
+        before = rest.mode
+        mode = rest.decide(
+            situation.y, window, x, onward, deviation, None if x_cov is None else self._x_std
+        )
         caution = self._caution
         if mode is Mode.FOLLOW:
-            inverse.widen_band(self._noise_band(situation, ideal, inverse))
+            inverse.widen_band(self._noise_band(ideal, inverse))
         else:
-            if situation.x_cov is not None:
-                self._rest.step(situation, ideal, deviation, inverse, mode is not before)
-            u_d, caution = self._rest.u_d, self._rest.caution
+            if x_cov is not None:
+                rest.step(estimate, ideal, deviation, inverse, mode is not before)
+            elif before is Mode.FOLLOW:
+                rest.stay(ideal)
+            u_d, caution = rest.u_d, rest.caution
             inverse.widen_band(0.0)
-        self._ideal = ideal
-        c_r, c_l = cautious_crossings(situation.estimate, caution)
-        v = inverse.step(u_d, situation.estimate.m, c_r, c_l)
-        self._advance(ideal, situation.y, trusted, inverse.limited)
+        self._ideal, self._x, self._u_d = ideal, onward, u_d
+        c_r, c_l = cautious_crossings(estimate, caution)
+        v = inverse.step(u_d, estimate.m, c_r, c_l)
+        if gains.integral:
+            self._integrate(window.item(0), situation.y, x[0], trusted, inverse.limited)
         return Command(u_d, v, 0.0)
 
-    def _take_in(self, situation: Situation) -> None:
-        if not self._window:
-            start, noise = situation.y, OFF * self._noise_std
-            # What may be noise is no distance to go: a loop at rest stays at rest.
-            near = abs(start - situation.y_m) <= noise
-            self._window.extend([situation.y_m if near else start] * (self.delay + 1))
-            # No v has acted yet, so nobody knows the state better than rest at y.
-            self._x = self._model.equilibrium * self._window[0]
-        self._window.append(situation.y_m)
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Redesign for a better model, see `better_design_in_pieces`."""
+        new = yield from better_design_in_pieces(model, self._weights, self._design)
+        if new is not None:
+            replay = Replay(new, self._references.history)
+            yield None
+            yield partial(self._adopt, new, replay)
 
-    def _gain(self, limited: bool) -> Array:
+    def _adopt(self, new: TrackingDesign, replay: Replay, source: StateSource) -> None:
+        """Go on with the new design as if it had been in use for as long as is remembered.
+
+        What its u_d differs by from that of the sample before fades.
+        """
+        self._use(new)
+        self._rest.use(new)
+        if self._references.empty:
+            self._x = [0.0] * new.model.order
+            return
+        x, q = replay.state(self._references.all())
+        self._integral, self._q = q + self._integral - self._q, q
+        window = self._references.window
+        ideal, onward = self._trajectory(x, window)
+        deviation = list(map(sub, source.x_hat, x))
+        if self._trusted_for > 0:
+            feedback = dot(self._soft[self._softness], deviation)
+        else:
+            feedback = self._bounded(deviation)
+        if self._trusted_for >= TRUSTED_AFTER:
+            feedback += new.gains.integral * (self._integral - q)
+        # The plant is at the next sample when the next command is made.
+        self._q += window.item(0) - new.model.c * x[0]
+        self._ideal, self._x = ideal, onward
+        self._handover = FADING * (self._u_d - ideal + feedback)
+
+    def _trajectory(self, x: list[float], window: Array) -> tuple[float, list[float]]:
+        """u* for x* and the references from now on, and the x* of the next sample."""
+        gains = self._design.gains
+        ideal = -dot(self._k, x) - float(gains.preview.dot(window))
+        if gains.integral:
+            ideal -= gains.integral * self._q
+        return ideal, [dot(row, x) + b * ideal for row, b in zip(self._a, self._b, strict=True)]
+
+    def _begin(self, situation: Situation) -> None:
+        start, noise = situation.y, OFF * self._noise_std
+        # What may be noise is no distance to go: a loop at rest stays at rest.
+        near = abs(start - situation.y_m) <= noise
+        r = situation.y_m if near else start
+        self._references.fill(r)
+        # No v has acted yet, so nobody knows the state better than rest at y.
+        self._x = (self._design.model.equilibrium * r).tolist()
+
+    def _gain(self, limited: bool) -> list[float]:
         """K, or a softer one: the longer v meets its limits, and the newer the estimate."""
         self._free = 0 if limited else self._free + 1
         if limited:
@@ -126,51 +231,64 @@ class Tracking:
             self._level -= 1
         levels = len(self._soft)
         unproven = levels - 1 - self._trusted_for * levels // TRUSTED_AFTER
-        return self._soft[max(self._level, unproven)]
+        self._softness = max(self._level, unproven)
+        return self._soft[self._softness]
 
-    def _careful_feedback(self, estimate: Estimate, deviation: Array, ideal: float) -> float:
+    def _careful_feedback(
+        self, estimate: Estimate, deviation: Sequence[float], ideal: float,
+    ) -> float:
         """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.
 
         A wrong slope may make the loop unstable, which bounded feedback slows down. The bound
         widens while it is met: a gap wider than the first guess has to be crossed some day.
         """
-        if self._careful is None:
-            return 0.0
         self._u_reach = max(
             self._u_reach, abs(ideal), estimate.m * (estimate.c_r - estimate.c_l)
         )
-        feedback = float(self._careful @ deviation)
-        if abs(feedback) > self._u_reach:
-            feedback = self._u_reach if feedback > 0.0 else -self._u_reach
+        feedback = self._bounded(deviation)
+        if abs(feedback) == self._u_reach:
             self._u_reach *= WIDENING
         return feedback
 
+    def _bounded(self, deviation: Sequence[float]) -> float:
+        """Careful feedback within its bound."""
+        if self._careful is None:
+            return 0.0
+        return min(max(dot(self._careful, deviation), -self._u_reach), self._u_reach)
+
     def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
-        # Constants that are given, not learned, are trusted from the start.
-        known = TRUSTED_AFTER if first else self._trusted_for
-        known += SHARP_COUNTS if _is_sharp(estimate, self._u_reach) else 1
-        self._trusted_for = known if _trusted(estimate) else 0
+        """Whether the estimate gets full feedback; counts the samples for which it has held."""
+        if not _trusted(estimate):
+            self._trusted_for = 0
+            return False
+        if first:
+            self._trusted_for = TRUSTED_AFTER
+        if self._trusted_for < TRUSTED_AFTER:
+            self._trusted_for += self._sharp_counts if _is_sharp(estimate, self._u_reach) else 1
         return self._trusted_for >= TRUSTED_AFTER
 
-    def _noise_band(
-        self, situation: Situation, ideal: float, inverse: BacklashInverse,
-    ) -> float:
-        if situation.x_cov is None:
-            return 0.0  # no noise of x enters u_d, a turn is one
-        gain = self._gains.state
-        variance = float(gain @ situation.x_cov @ gain)
-        onward = (ideal - self._ideal) * inverse.side >= 0.0
-        return (ONWARD_BAND if onward else NOISE_BAND) * sqrt(max(variance, 0.0))
+    def _note_covariance(self, x_cov: Array | None) -> None:
+        self._x_cov = x_cov
+        if x_cov is None:
+            self._x_std = self._feedback_std = 0.0
+            return
+        rows: list[list[float]] = x_cov.tolist()
+        variance = dot(self._k, [dot(row, self._k) for row in rows])
+        self._feedback_std = sqrt(max(variance, 0.0))
+        self._x_std = sqrt(max(sum(row[i] for i, row in enumerate(rows)), 0.0))
 
-    def _advance(self, ideal: float, y: float, trusted: bool, limited: bool) -> None:
-        r = self._window[0]
+    def _noise_band(self, ideal: float, inverse: BacklashInverse) -> float:
+        # Where x has no covariance no noise of it enters u_d, and a turn is one.
+        onward = (ideal - self._ideal) * inverse.side >= 0.0
+        return (ONWARD_BAND if onward else NOISE_BAND) * self._feedback_std
+
+    def _integrate(self, r: float, y: float, x_0: float, trusted: bool, limited: bool) -> None:
         if not trusted:
             self._integral = self._q
         elif not limited:
             # A saturated actuator cannot follow: integrating on would only wind up.
             self._integral += r - y
-        self._q += r - self._model.c * float(self._x[0])
-        self._x = self._model.a @ self._x + self._model.b * ideal
+        self._q += r - self._design.model.c * x_0
 
 
 def _trusted(estimate: Estimate) -> bool:

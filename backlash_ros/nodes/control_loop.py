@@ -13,7 +13,6 @@ from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.last_command import last_commands
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.tracking import Tracking
 from backlash_ros.nodes.command_history import CommandHistory
 from backlash_ros.nodes.driver_io import Output
 from backlash_ros.nodes.loop_statistics import LoopStatistics
@@ -66,7 +65,8 @@ class ControlLoop:
 
         inherited: estimates to begin with, None for those of the parameters.
         """
-        self.core = build_controller(self._p, inherited)
+        before, self.core = self.core, build_controller(self._p, inherited)
+        self.core.go_on_from(before)
         self.core.compensating = self.compensating
         self.core.estimator.adapting = self.adapting
         self._begun, self._missing = False, 0
@@ -162,8 +162,7 @@ class ControlLoop:
             )
         if any(p[name] != before[name] for name in OF_THE_STRUCTURE):
             structure = build_structure(p)
-            if isinstance(structure, Tracking) and isinstance(core.structure, Tracking):
-                structure.go_on_from(core.structure)
+            structure.go_on_from(core.structure)
             core.structure = structure
 
     def _note_missing(self, arrival: Arrival) -> None:

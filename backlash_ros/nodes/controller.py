@@ -152,7 +152,7 @@ class ControllerNode(ManagedNode):
         step_s = max(self.settings.real('sample_period'), SHORTEST_STEP_S)
         for v in loop.last_commands(action):
             loop.send(v)
-            if action != 'ramp' or v == loop.zero:
+            if v == loop.zero:
                 break
             if time.monotonic() + step_s > deadline:
                 self.log.warning(

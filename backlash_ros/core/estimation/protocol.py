@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from math import isnan
+from math import inf, isnan
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -100,7 +101,7 @@ class StateSource(Protocol):
     """Knows the state of G."""
 
     @property
-    def x_hat(self) -> NDArray[np.float64]:
+    def x_hat(self) -> Sequence[float] | NDArray[np.float64]:
         """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
 
     @property
@@ -129,5 +130,5 @@ class Estimator(StateSource, Protocol):
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
 
-    def refine(self) -> None:
-        """Do what the command of this sample need not wait for."""
+    def refine(self, budget_s: float = inf) -> None:
+        """Do what the command of this sample need not wait for, for about so long at most."""

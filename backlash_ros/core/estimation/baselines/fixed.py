@@ -7,7 +7,7 @@ disturbance d of u, which takes up what the fixed constants get wrong.
 from __future__ import annotations
 
 from dataclasses import replace
-from math import nan
+from math import inf, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class FixedBacklash:
         """Covariance of x_hat, shape (n, n)."""
         return self._p[:-1, :-1]
 
-    def refine(self) -> None:
+    def refine(self, budget_s: float = inf) -> None:
         """Nothing is left to do after the command."""
 
     def update(self, y: float | None, interval: Interval) -> None:

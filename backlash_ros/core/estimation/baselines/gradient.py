@@ -21,7 +21,7 @@ Nonlinearities, Wiley 1996.
 
 from __future__ import annotations
 
-from math import nan
+from math import inf, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,7 +97,7 @@ class GradientEstimator:
         m, c_r, c_l = self._bounds.project(m, float(theta[1]) / m, float(theta[2]) / m)
         self.estimate = Estimate(m, c_r, c_l, old.f, status=Status.TRACKING)
 
-    def refine(self) -> None:
+    def refine(self, budget_s: float = inf) -> None:
         """Nothing is left to do after the command."""
 
     def _engage(self, interval: Interval, used: Estimate) -> None:

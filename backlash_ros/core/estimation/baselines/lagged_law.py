@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,5 +39,5 @@ class LaggedLaw:
         """y(k) minus its prediction; nan where y(k) was lost."""
         return self._reconstruction.innovation
 
-    def refine(self) -> None:
+    def refine(self, budget_s: float = inf) -> None:
         """Nothing is left to do after the command."""
