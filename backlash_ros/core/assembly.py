@@ -66,10 +66,11 @@ def build_controller(p: Parameters, inherited: Estimate | None = None) -> Adapti
     inverse = BacklashInverse(
         p.real('inverse.direction_band'), p.real('inverse.take_up_rate') * period
     )
-    return AdaptiveController(
-        ESTIMATORS[p.word('estimator.law')](p, inherited or _initial(p)), build_structure(p),
-        inverse, build_limits(p),
-    )
+    estimator = ESTIMATORS[p.word('estimator.law')](p, inherited or _initial(p))
+    learner = None
+    if isinstance(estimator, MovingHorizon) and p.flag('plant.adapt'):
+        learner = estimator
+    return AdaptiveController(estimator, build_structure(p), inverse, build_limits(p), learner)
 
 
 def build_structure(p: Parameters) -> Structure:

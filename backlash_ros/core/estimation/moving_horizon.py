@@ -128,7 +128,7 @@ class MovingHorizon:
         """State of G in the coordinates of `model`, n values."""
         if self._observer is not None:
             return self._observer.state
-        return self._before.x_hat if self._before is not None else self._no_state
+        return self._before.x_hat.tolist() if self._before is not None else self._no_state
 
     @property
     def x_cov(self) -> Array | None:
@@ -173,9 +173,14 @@ class MovingHorizon:
         """Give x_hat for this G from now on."""
         self.model = model
         self._no_state = [0.0] * model.order
-        if self._observer is not None:
+        if self._current is not None:
             self._observer = None
             self._follow_state()
+            return
+        around = self._around
+        self._around = around._replace(model=model, error=around.error.around(model))
+        if self._before is not None:
+            self._before = self._before.with_model(model)
 
     def set_noise(self, noise_std: float, drift_std: Array) -> None:
         """Take another first guess of the noise; whatever was learned stays."""

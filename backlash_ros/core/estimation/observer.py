@@ -129,6 +129,7 @@ class Observer:
         gain = self._gain_at(level)
         if level > self._level or self.variance <= (gain.innovation * noise_std) ** 2:
             self._level, self._gain = level, gain
+        self.cov = self.noise_cov
 
     def _gain_at(self, level: int) -> Gain:
         gain = gain_of(self.model, RATIOS[level])

@@ -51,6 +51,10 @@ class FixedBacklash:
         self._u = 0.0
         self._started = False
 
+    def with_model(self, model: StateModel) -> FixedBacklash:
+        """The same for another G, the state of which is not known yet."""
+        return FixedBacklash(self.estimate, model, self._noise_var**0.5, self._doubt)
+
     @property
     def u_hat(self) -> float:
         """u of the given backlash plus the estimated disturbance."""
