@@ -45,7 +45,6 @@ def crossings_of(theta: NDArray[np.float64], cov: NDArray[np.float64]) -> Crossi
     of_all = jacobian @ cov @ jacobian.T
     (var_m, *_), (_, var_r, cov_rl), (_, _, var_l) = of_all.tolist()
     return Crossings(
-        m, c_r, c_l, *(sqrt(max(var, 0.0)) for var in (
-            var_m, var_r, var_l, var_r + var_l - 2.0 * cov_rl,
-        )), of_all,
+        m, c_r, c_l, sqrt(max(var_m, 0.0)), sqrt(max(var_r, 0.0)), sqrt(max(var_l, 0.0)),
+        sqrt(max(var_r + var_l - 2.0 * cov_rl, 0.0)), of_all,
     )

@@ -153,7 +153,7 @@ def _prior(
         coefficients[taps:, i] = stable[1:]
     told_taps = _taps(told, error.stable, start, taps)
     coefficients -= np.append(told_taps, error.stable[1:])[:, None]
-    h = np.linalg.lstsq(basis, off, rcond=NEGLIGIBLE)[0]
+    h = np.asarray(np.linalg.lstsq(basis, off, rcond=NEGLIGIBLE)[0], dtype=np.float64)
     # A lag by a part of a sample moves single taps in ways of its own.
     free = uncertainty * FREE_TAPS * float(np.abs(told_taps).max())
     taps_alone = np.eye(taps + len(moving), taps) * free
@@ -162,7 +162,7 @@ def _prior(
 
 def _root(draws: Array) -> Array:
     """L of the second moment L L' of draws (K, DRAWN)."""
-    return np.asarray(np.linalg.qr(draws.T / DRAWN**0.5, mode='r').T)
+    return np.asarray(np.linalg.qr(draws.T / DRAWN**0.5, mode='r')).T
 
 
 def _taps(step: Array, stable: Array, start: int, count: int) -> Array:

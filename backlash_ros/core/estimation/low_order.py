@@ -32,16 +32,15 @@ NO_TAP = 1e-6  # share of the largest tap below which the last ones are none
 class OutputError:
     """The problem: u (N,), applied from k to k+1, and y (N,) after it, with its weights.
 
-    weights: 0 where y was lost or is not to be compared. noise_std: of y.
+    weights: 0 where y was lost or is not to be compared. noise_std: of y. integrate: denominator
+    of the integrators of G.
     """
 
     def __init__(
         self, model: TransferFunction, u: Array, y: Array, weights: Array, noise_std: float,
     ) -> None:
         self.integrators = int(np.count_nonzero(np.abs(model.poles - 1.0) < ON_CIRCLE))
-        self._integrate = np.ones(1)
-        for _ in range(self.integrators):
-            self._integrate = np.convolve(self._integrate, [1.0, -1.0])
+        self.integrate = np.atleast_1d(np.poly([1.0] * self.integrators))
         self._rows = np.flatnonzero(weights > 0.0)
         self._u, self._y = u, y[self._rows]
         self._root = np.sqrt(weights[self._rows]) / noise_std
@@ -53,14 +52,14 @@ class OutputError:
     def residual(self, b: Array, a: Array, delay: int) -> tuple[Array, Array]:
         """Weighted residual without drift, and the response (N,)."""
         answer = lfilter(
-            np.append(np.zeros(delay - 1), b), np.convolve(a, self._integrate), self._u
+            np.append(np.zeros(delay - 1), b), np.convolve(a, self.integrate), self._u
         )
         return self._without_drift((self._y - answer[self._rows]) * self._root), answer
 
     def slopes(self, a: Array, answer: Array, delay: int, taps: int, prior: Array) -> Array:
         """Derivatives of the weighted response in the directions of the prior, shape (N, ..)."""
         n, count = len(a) - 1, len(self._u)
-        by_input = lfilter([1.0], np.convolve(a, self._integrate), self._u)
+        by_input = lfilter([1.0], np.convolve(a, self.integrate), self._u)
         by_output = lfilter([1.0], a, answer)
         columns = np.zeros((count, taps + n))
         for j in range(taps):
@@ -81,13 +80,14 @@ def low_order(
     Yields between pieces.
     """
     n = error.taps
-    told = np.zeros(n + MORE_TAPS)
+    told: Array = np.zeros(n + MORE_TAPS)
     given = model.numerator[model.delay:][:len(told)]
     told[:len(given)] = given
     gain = float(told.sum()) / error.gain
     prior = scale * error.low_order_spread
     cost, delay = np.inf, model.delay
-    b, a = told, error.stable
+    b: Array = told
+    a: Array = error.stable
     for shift in SHIFTS:
         if model.delay + shift >= 1:
             fit = yield from _fit(told, error.stable, model.delay + shift, problem, prior)
@@ -99,11 +99,11 @@ def low_order(
     b = b * (gain * float(a.sum()) / float(b.sum()))
     taps = int(np.flatnonzero(np.abs(b) > NO_TAP * np.abs(b).max())[-1]) + 1
     order = max(n, delay + taps - 1)
-    numerator, denominator = np.zeros(order + 1), np.append(a, np.zeros(order - n))
+    numerator: Array = np.zeros(order + 1)
+    denominator: Array = np.append(a, np.zeros(order - n))
     numerator[delay:delay + taps] = b[:taps]
-    for _ in range(problem.integrators):
-        denominator = np.convolve(denominator, [1.0, -1.0])
-    return TransferFunction(numerator.tolist(), denominator.tolist())
+    whole = np.convolve(denominator, problem.integrate)
+    return TransferFunction(numerator.tolist(), whole.tolist())
 
 
 def _fit(
@@ -112,8 +112,9 @@ def _fit(
     """Cost, numerator taps and denominator near b and a."""
     taps = len(b)
     start = np.append(b, a[1:])
-    best = (np.inf, b, a)
-    xi = step = np.zeros(prior.shape[1])
+    best: tuple[float, Array, Array] = (np.inf, b, a)
+    xi: Array = np.zeros(prior.shape[1])
+    step: Array = xi
     length = 1.0
     for _ in range(ITERATIONS):
         trial = xi + length * step
@@ -128,8 +129,8 @@ def _fit(
             continue
         xi, length, best = trial, 1.0, (cost, b, a)
         slopes = problem.slopes(a, answer, delay, taps, prior)
-        step = np.linalg.solve(
+        step = np.asarray(np.linalg.solve(
             slopes.T @ slopes + np.eye(len(xi)), slopes.T @ residual - xi
-        )
+        ), dtype=np.float64)
         yield
     return best

@@ -44,6 +44,7 @@ from backlash_ros.core.estimation.constants import (
 from backlash_ros.core.estimation.crossings import Crossings
 from backlash_ros.core.estimation.error_model import build_error_model
 from backlash_ros.core.estimation.observer import Observer
+from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
 from backlash_ros.core.estimation.record import Record
 from backlash_ros.core.estimation.relabelling import (
@@ -67,8 +68,8 @@ class MovingHorizon:
 
     initial: a first guess, or with its deviations what was learned before. model: G as told.
     uncertainty: relative spread of its time constants, damping and delay, 0 where it is exact.
-    noise_std: of y, a first guess. drift_std: random walk of m, c_r, c_l per square root of a second.
-    observer: gives the state of G until the backlash is known, for structures that want it.
+    noise_std: of y, a first guess. drift_std: random walk of m, c_r, c_l per square root of a
+    second. observer: gives the state of G until the backlash is known, for structures that want it.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class MovingHorizon:
         self.outliers = 0
         self.innovation = nan
         self._adapting = True
+        self._pace = Pace()
         self._bounds = bounds
         self._drift = np.array(drift_std) * sample_period**0.5
         self._told = model
@@ -139,7 +141,8 @@ class MovingHorizon:
     def proposal(self) -> StateModel | None:
         """The G that was learned where it is another one than `model`."""
         around = self._around
-        return around.model if self._current is not None and around.model is not self.model else None
+        known = self._current is not None
+        return around.model if known and around.model is not self.model else None
 
     @property
     def covariance(self) -> Array | None:
@@ -220,7 +223,7 @@ class MovingHorizon:
             if self._before is not None:
                 self._before.update(y, interval)
         self._v = v
-        if self._adapting and len(self._record) < CAPACITY:
+        if self._adapting:
             self._note(v, nan if accepted is None else accepted)
         self._set_status()
 
@@ -228,7 +231,8 @@ class MovingHorizon:
         if self._since_motion > self.model.memory:
             self._paused = True
             return
-        if self._paused:
+        if self._paused or len(self._record) == CAPACITY:
+            # The samples between are missing, or there was no time to take any in.
             self._paused = False
             self._restart_record()
         self._record.append(v, y)
@@ -251,7 +255,8 @@ class MovingHorizon:
 
     def refine(self, budget_s: float = inf) -> None:
         """Go on with the fit, in pieces, until nothing is left to do or the time is over."""
-        begun = perf_counter() if budget_s < inf else 0.0
+        timed = budget_s < inf
+        begun = before = perf_counter() if timed else 0.0
         while True:
             if self._task is None:
                 self._task = self._next_task()
@@ -261,8 +266,13 @@ class MovingHorizon:
                 next(self._task)
             except StopIteration:
                 self._task = None
-            if budget_s < inf and perf_counter() - begun > budget_s:
-                return
+            if timed:
+                now = perf_counter()
+                self._pace.note(now - before, budget_s)
+                # Another piece that takes as long must fit in as well.
+                if 2.0 * now - before - begun > budget_s:
+                    return
+                before = now
 
     def _next_task(self) -> Task | None:
         if not self._adapting:
@@ -298,7 +308,7 @@ class MovingHorizon:
         record.forget_before(first)
         v, y = record.since(first)
         around = self._around._replace(prior=None, most=inf)
-        found = yield from searched(v, y, around, self._widest, CAPACITY)
+        found = yield from searched(v, y, around, self._widest, self._pace)
         if self._inherited is not None:
             half = len(v) // 2
             for begin in (0, half):
@@ -319,9 +329,9 @@ class MovingHorizon:
         self._candidate = Prior(solution.theta, solution.theta_cov)
         self._search_at = end + BLOCK[0]
         exact = not around.error.count
-        if exact or (before is not None and not _contradicts(solution, before)):
-            if found[0].fit.reversals >= (1 if exact else REVERSALS):
-                self._install(*found, first)
+        again = before is not None and not _contradicts(solution, before)
+        if (exact or again) and found[0].fit.reversals >= (1 if exact else REVERSALS):
+            self._install(*found, first)
 
     def _confirmed(
         self, v: Array, y: Array, inherited: Estimate, free: tuple[Fitted, Around] | None,
@@ -338,11 +348,12 @@ class MovingHorizon:
         around = alone._replace(prior=prior)
         gap = inherited.c_r - inherited.c_l
         start = Start(gap, float(v[0]) + 0.5 * gap)
-        kept = yield from fitted(v, y, around, start, inherited.m, CAPACITY)
+        kept = yield from fitted(v, y, around, start, inherited.m, self._pace)
         swing = float(np.ptp(v)) + gap
         # A gap wider than all of v: u never moves.
         still = yield from fitted(
-            v, y, alone, Start(3.0 * swing, float(v[0]) + 1.5 * swing), inherited.m, CAPACITY
+            v, y, alone, Start(3.0 * swing, float(v[0]) + 1.5 * swing), inherited.m,
+            self._pace,
         )
         least = still.solution.rms
         if free is not None:
@@ -410,16 +421,16 @@ class MovingHorizon:
             prior = None
             if around.error.count == 0 and solution.correlation == 0.0:
                 part = yield from fitted(
-                    v[:gone], y[:gone], around, fit.start, solution.m, CAPACITY
+                    v[:gone], y[:gone], around, fit.start, solution.m, self._pace
                 )
-                prior = Prior(part.solution.theta, self._drifted(part.solution.theta, part.solution.theta_cov, len(v) - gone))
+                prior = self._drifted(part.solution, len(v) - gone)
             around = around._replace(prior=prior, most=around.most if prior else inf)
         v, y = record.since(first)
         result = yield from fitted(
-            v, y, around, start.with_gap(solution.gap, v), solution.m, CAPACITY
+            v, y, around, start.with_gap(solution.gap, v), solution.m, self._pace
         )
         result, around = yield from with_better_model(
-            v, y, around, result, CAPACITY
+            v, y, around, result, self._pace
         )
         self._install(result, around, first)
 
@@ -439,7 +450,7 @@ class MovingHorizon:
         v, y = record.since(record.first)
         around = self._around._replace(prior=None, most=inf)
         start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
-        newer = yield from fitted(v[half:], y[half:], around, start, solution.m, CAPACITY)
+        newer = yield from fitted(v[half:], y[half:], around, start, solution.m, self._pace)
         whole = Prior(solution.theta, np.zeros((3, 3)))
         if self._usable(newer, REPLACING) is not None and (
             _contradicts(newer.solution, whole) or self._drifted_away(newer.solution, half)
@@ -449,17 +460,18 @@ class MovingHorizon:
     def _reconsider(self) -> Task:
         """Explain samples that contradict the fit: by all of them, or by a change of the plant."""
         current, since = self._current, self._contradicted_from
-        assert current is not None and since is not None
+        assert current is not None
+        assert since is not None
         record, around = self._record, self._around._replace(prior=None, most=inf)
         bound = AS_GOOD * current.solution.posterior.noise_std
         end = record.end
         self._next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
         v, y = record.since(record.first)
         if len(v) <= SEARCHED:
-            found = yield from searched(v, y, around, self._widest, CAPACITY)
+            found = yield from searched(v, y, around, self._widest, self._pace)
         else:
             start = current.fit.start.with_gap(current.solution.gap, v)
-            result = yield from fitted(v, y, around, start, current.solution.m, CAPACITY)
+            result = yield from fitted(v, y, around, start, current.solution.m, self._pace)
             found = result, around
         if found is not None and self._usable(found[0]) and found[0].solution.rms <= bound:
             self._install(*found, record.first)
@@ -469,7 +481,7 @@ class MovingHorizon:
             if end - first < RECOVERED:
                 continue
             v, y = record.since(first)
-            found = yield from searched(v, y, around, self._widest, CAPACITY)
+            found = yield from searched(v, y, around, self._widest, self._pace)
             sharp = found is not None and self._usable(found[0], REPLACING)
             if found is not None and sharp and found[0].solution.rms <= bound:
                 self._install(*found, first)
@@ -548,7 +560,7 @@ class MovingHorizon:
         fit, solution = current
         estimate = self.estimate
         gap = estimate.c_r - estimate.c_l
-        v, y = self._record.since(self._record.first + fit.length)
+        v = self._record.since(self._record.first + fit.length)[0]
         p = fit.play_output(gap, solution)
         observer = self._observer
         exact, cov = None, None
@@ -609,12 +621,12 @@ class MovingHorizon:
             return False
         return bool(np.any(self._drift**2 * (samples / 3.0) > np.diag(found.cov)))
 
-    def _drifted(self, theta: Array, cov: Array, samples: int) -> Array:
-        """Covariance of theta after so many samples of drift."""
-        m, product_r, product_l = theta.tolist()
+    def _drifted(self, solution: Solution, samples: int) -> Prior:
+        """What a solution says of theta after so many samples of drift."""
+        m, product_r, product_l = solution.theta.tolist()
         jacobian = np.array([[1.0, 0.0, 0.0], [product_r / m, m, 0.0], [product_l / m, 0.0, m]])
         drift = jacobian @ np.diag(self._drift**2 * samples) @ jacobian.T
-        return np.asarray(cov + drift)
+        return Prior(solution.theta, solution.theta_cov + drift)
 
     def _restart_record(self) -> None:
         """Begin a new record with what the old one says as a prior."""
@@ -628,7 +640,7 @@ class MovingHorizon:
         self._around = self._around._replace(prior=Prior(solution.theta, solution.theta_cov))
         estimate = self.estimate
         gap = estimate.c_r - estimate.c_l
-        fit = current.fit.restarted(self._around, Start(gap, self._p), CAPACITY)
+        fit = current.fit.restarted(self._around, Start(gap, self._p))
         self._current = Fitted(fit, fit.solve())
         self._refit_at = GROWTH * BLOCK[1]
         self._contradicted_from = None

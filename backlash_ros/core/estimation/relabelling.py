@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED
 from backlash_ros.core.estimation.low_order import OutputError, low_order
+from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.search import Candidate, search
 from backlash_ros.core.estimation.window_fit import (
     Around,
@@ -32,7 +33,7 @@ Array = NDArray[np.float64]
 
 ITERATIONS = 8  # of relabelling, at most
 STANDS = 0.02  # standard deviations by which the gap may still move
-PIECE = 192  # samples that are taken in between two pauses
+FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
 NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
 MODELS = 6  # times that G may move in one fit
 SETTLED = 60  # samples at the start of a record that say little of G: what was before is not known
@@ -46,16 +47,16 @@ class Fitted(NamedTuple):
 
 
 def fitted(
-    v: Array, y: Array, around: Around, start: Start, slope: float, capacity: int,
+    v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
 ) -> Generator[None, None, Fitted]:
     """Fit v (N,) and y (N,), nan where lost, from labels for `start` on; yields between pieces."""
     weights = weights_of(y)
     reach = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
     best: Fitted | None = None
     for _ in range(ITERATIONS):
-        fit = WindowFit(around, start, slope, reach, capacity)
-        for first in range(0, len(v), PIECE):
-            part = slice(first, first + PIECE)
+        fit = WindowFit(around, start, slope, reach)
+        while fit.length < len(v):
+            part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
             fit.take(fit.columns(v[part]), y[part], weights[part])
             yield
         solution = fit.solve()
@@ -72,26 +73,27 @@ def fitted(
 
 
 def searched(
-    v: Array, y: Array, around: Around, widest: float, capacity: int,
+    v: Array, y: Array, around: Around, widest: float, pace: Pace,
 ) -> Generator[None, None, tuple[Fitted, Around] | None]:
     """Search the gap and fit around the best candidates.
 
     None where a constant u explains y as well: v never engaged.
     """
     found = yield from search(
-        v, y, weights_of(y), around.model, around.error, around.told_std, widest
+        v, y, weights_of(y), around.model, around.error, around.told_std, widest,
+        pace,
     )
     if not found.candidates or found.candidates[0].evidence < found.null + ENGAGED:
         return None
     best: Fitted | None = None
     for candidate in _apart(found.candidates):
         start = Start(candidate.gap, candidate.start)
-        result = yield from fitted(v, y, around, start, candidate.m, capacity)
+        result = yield from fitted(v, y, around, start, candidate.m, pace)
         if best is None \
                 or result.solution.posterior.evidence > best.solution.posterior.evidence:
             best = result
     assert best is not None
-    return (yield from with_better_model(v, y, around, best, capacity))
+    return (yield from with_better_model(v, y, around, best, pace))
 
 
 def _apart(candidates: list[Candidate]) -> list[Candidate]:
@@ -106,11 +108,10 @@ def _apart(candidates: list[Candidate]) -> list[Candidate]:
 
 
 def with_better_model(
-    v: Array, y: Array, around: Around, result: Fitted, capacity: int,
+    v: Array, y: Array, around: Around, result: Fitted, pace: Pace,
 ) -> Generator[None, None, tuple[Fitted, Around]]:
     """Let G move to the one of low order that fits best, until the evidence grows no more."""
     weights = np.where(np.isfinite(y), weights_of(y), 0.0)
-    weights[:min(len(v) // 4, SETTLED)] = 0.0
     for _ in range(MODELS):
         solution = result.solution
         posterior = solution.posterior
@@ -118,7 +119,10 @@ def with_better_model(
             break
         transfer = around.model.transfer_function
         u = result.fit.input(solution, v)
-        problem = OutputError(transfer, u, y, weights, posterior.noise_std)
+        newest = slice(-max(pace.pieces(around.error.taps + 2), FEWEST_ROWS), None)
+        compared = weights[newest].copy()
+        compared[:min(len(v) // 4, SETTLED)] = 0.0
+        problem = OutputError(transfer, u[newest], y[newest], compared, posterior.noise_std)
         yield
         better = yield from low_order(transfer, around.error, problem, posterior.scale)
         if better is None or not _allowed(better):
@@ -130,7 +134,7 @@ def with_better_model(
         )
         yield
         start = result.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
-        other = yield from fitted(v, y, moved, start, solution.m, capacity)
+        other = yield from fitted(v, y, moved, start, solution.m, pace)
         gained = other.solution.posterior.evidence - posterior.evidence
         # What moving K coefficients may cost or bring by chance.
         if gained < -around.error.count:

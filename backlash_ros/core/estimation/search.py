@@ -17,12 +17,11 @@ from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import GAPS, NO_GAP, STARTS, ZOOM
 from backlash_ros.core.estimation.error_model import ErrorModel
+from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.regression import NOISE_WEIGHT, SCALES
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
-
-PIECE = 40_000  # samples times pairs that are compared in one piece: some tenths of a ms each
 
 
 class Candidate(NamedTuple):
@@ -43,7 +42,7 @@ class Found(NamedTuple):
 
 def search(
     v: Array, y: Array, weights: Array, model: StateModel, error: ErrorModel, told_std: float,
-    widest: float,
+    widest: float, pace: Pace,
 ) -> Generator[None, None, Found]:
     """Compare gaps up to `widest` over v (N,) and y (N,), nan where lost; yields between pieces."""
     swing = float(np.ptp(v))
@@ -52,12 +51,14 @@ def search(
     top = min(swing, widest)
     if not top > 0.0 or comparison.rows <= model.order + 2:
         return Found([], null)
-    gaps = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
-    coarse = yield from comparison.best_per_gap(gaps, STARTS)
+    gaps: Array = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
+    coarse = yield from comparison.best_per_gap(gaps, STARTS, pace)
     best = max(coarse)
     reach, count = ZOOM
-    close = best.gap * np.linspace(1.0 - reach, 1.0 + reach, count)
-    fine = yield from comparison.best_per_gap(close[close <= top], 2 * STARTS - 1)
+    close = np.asarray(best.gap * np.linspace(1.0 - reach, 1.0 + reach, count))
+    fine = yield from comparison.best_per_gap(
+        close[close <= top], 2 * STARTS - 1, pace
+    )
     found = sorted([*coarse, *fine], reverse=True)
     return Found(found, null)
 
@@ -88,7 +89,7 @@ class _Comparison:
         self.null = float(self._log_likelihood(self._energy + self._told))
 
     def best_per_gap(
-        self, gaps: Array, starts: int,
+        self, gaps: Array, starts: int, pace: Pace,
     ) -> Generator[None, None, list[Candidate]]:
         """The best start for each gap."""
         v0 = float(self._v[0])
@@ -96,10 +97,10 @@ class _Comparison:
             (float(gap), v0 + float(share) * float(gap))
             for gap in gaps for share in np.linspace(0.0, 1.0, starts if gap > 0.0 else 1)
         ]
-        size = max(PIECE // len(self._v), 8)
         best: dict[float, Candidate] = {}
-        for first in range(0, len(pairs), size):
-            part = np.array(pairs[first:first + size])
+        while pairs:
+            count = pace.pieces(len(self._v))
+            part, pairs = np.array(pairs[:count]), pairs[count:]
             evidence, slopes = self._compare(part[:, 0], part[:, 1])
             for (gap, start), value, m in zip(part, evidence, slopes, strict=True):
                 if gap not in best or value > best[gap].evidence:
@@ -152,7 +153,7 @@ class _Comparison:
         if states is None:
             states = np.zeros((len(inputs), self._model.order))
         late, last = lfilter(transfer.numerator, transfer.denominator, inputs, zi=states)
-        answers = np.empty_like(late)
+        answers: Array = np.empty_like(late)
         answers[:, :-1], answers[:, -1] = late[:, 1:], last[:, 0]
         return answers
 

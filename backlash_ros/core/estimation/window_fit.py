@@ -60,8 +60,8 @@ class Prior(NamedTuple):
 class Around(NamedTuple):
     """What a fit is made around.
 
-    model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that of
-    the error of the G that was told, once this one was moved to where the data want it: it is no
+    model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that
+    of the error of the G that was told, once this one was moved to where the data want it: it is no
     better known for that. most: largest scale that is believed.
     """
 
@@ -108,13 +108,11 @@ class Solution:
 class WindowFit:
     """Takes in samples and solves for all unknowns.
 
-    slope: about m, for the prior of the error of G. reach: largest |y| and |v|. capacity: samples
-    that it can take in.
+    slope: about m, for the prior of the error of G. reach: largest |y| and |v|.
     """
 
     def __init__(
         self, around: Around, start: Start, slope: float, reach: tuple[float, float],
-        capacity: int,
     ) -> None:
         self.around, self.start, self.slope, self.reach = around, start, slope, reach
         self.model = around.model
@@ -124,8 +122,8 @@ class WindowFit:
         self.reversals = 0
         self._play = start
         self._highest, self._lowest = -inf, inf
-        self._rows: Array = np.empty((capacity, self.layout.unknowns))
-        self._y: Array = np.empty(capacity)
+        self._rows: Array = np.empty((0, self.layout.unknowns))
+        self._y: Array = np.empty(0)
         self._triangle = Triangle(self._vague(*reach))
         prior = around.prior
         if prior is not None:
@@ -162,10 +160,18 @@ class WindowFit:
         weight = np.where(np.isfinite(y), weights, 0.0)
         root = np.sqrt(weight)
         rows = rows * root[:, None]
+        if last > len(self._y):
+            self._grow(last)
         self._rows[first:last] = rows
         self._y[first:last] = np.where(weight > 0.0, y, 0.0) * root
         self._triangle.append(rows, self._y[first:last], float(weight.sum()))
         self.length = last
+
+    def _grow(self, least: int) -> None:
+        """Make room for more samples than now, twice as many as there are."""
+        more = max(2 * len(self._y), least) - len(self._y)
+        self._rows = np.concatenate([self._rows, np.empty((more, self.layout.unknowns))])
+        self._y = np.concatenate([self._y, np.empty(more)])
 
     def contradiction(
         self, rows: Array, y: Array, solution: Solution,
@@ -176,7 +182,7 @@ class WindowFit:
         """
         posterior = solution.posterior
         var = np.einsum('np,pq,nq->n', rows, posterior.cov, rows) * solution.inflation + 1.0
-        squares = (y - rows @ posterior.mean) ** 2 / (var * posterior.noise_std**2)
+        squares: Array = (y - rows @ posterior.mean) ** 2 / (var * posterior.noise_std**2)
         return squares, squares > GATE**2
 
     def _advance(self, labels: Labels) -> None:
@@ -203,9 +209,9 @@ class WindowFit:
         side = int(labels.right[-1] - labels.left[-1])
         return Start(start.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
 
-    def restarted(self, around: Around, start: Start, capacity: int) -> WindowFit:
+    def restarted(self, around: Around, start: Start) -> WindowFit:
         """A fit of samples yet to come, with the prior of `around`, after a break."""
-        return WindowFit(around, start, self.slope, self.reach, capacity)
+        return WindowFit(around, start, self.slope, self.reach)
 
     def unexplained(self, solution: Solution) -> float:
         """Motion of u behind the correlated part of the residual, over m times the gap."""
@@ -216,7 +222,7 @@ class WindowFit:
     def solve(self) -> Solution:
         """The solution for all samples so far."""
         layout, gap = self.layout, self.start.gap
-        spreads = np.ones(layout.errors)
+        spreads: Array = np.ones(layout.errors)
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
@@ -299,7 +305,8 @@ def weights_of(y: Array) -> Array:
 @lru_cache(maxsize=64)
 def step_norm(model: StateModel) -> float:
     """Norm of the first samples of the step response of G."""
-    x, total = np.zeros(model.order), 0.0
+    x: Array = np.zeros(model.order)
+    total = 0.0
     for _ in range(SETTLING):
         x = model.a @ x + model.b
         total += (model.c * float(x[0])) ** 2
