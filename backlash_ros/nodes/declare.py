@@ -101,6 +101,8 @@ def _declared(node: Node) -> dict[str, RosParameter]:
 
 
 def _ros_value(value: object) -> object:
+    if value == ():
+        return RosParameter.Type.DOUBLE_ARRAY  # declared and not set: ROS has no empty lists
     return list(value) if isinstance(value, tuple) else value
 
 
