@@ -216,6 +216,16 @@ def test_word_must_be_a_text(parameter: Parameter) -> None:
     assert 'must be a text' in refusal_of(parameter.name, 1.0)
 
 
+@named([p for p in PARAMETERS if 'true' in p.choices])
+def test_word_that_may_be_true_or_false_is_taken_as_yaml_and_ros_read_it(
+    parameter: Parameter,
+) -> None:
+    for given_value, word in ((True, 'true'), (False, 'false'), ('True', 'true')):
+        assert Parameters({parameter.name: given_value}).word(parameter.name) == word
+    for value in (1, 0.0, None, 'yes', ['true']):
+        refusal_of(parameter.name, value)
+
+
 @named([p for p in PARAMETERS if isinstance(p.default, bool)])
 def test_flag_is_true_or_false(parameter: Parameter) -> None:
     for given_value, flag in ((True, True), ('False', False), ('true', True)):

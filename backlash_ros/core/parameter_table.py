@@ -86,8 +86,10 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('estimator.drift_std', (0.0, 0.0, 0.0),
               'kalman: random walk of m, c_r, c_l per square root of a second', length=3,
               low=0.0, live=True),
-    Parameter('estimator.use_applied_control', False,
-              'take v from applied_control instead of the own command'),
+    Parameter('estimator.use_applied_control', 'auto',
+              'take v from applied_control instead of the own command; auto: as soon as the driver '
+              'reports every sample, as long as it does, and where control.delay_samples is 0',
+              choices=('auto', 'true', 'false')),
     Parameter('estimator.lag', 20,
               'lms and printed: samples by which the reconstruction of u looks back', 'samples',
               low=10, high=1000),

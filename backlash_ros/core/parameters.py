@@ -129,6 +129,8 @@ def _flag(parameter: Parameter, value: object) -> bool:
 
 
 def _word(parameter: Parameter, value: object) -> str:
+    if 'true' in parameter.choices and isinstance(value, (bool, str)):
+        value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
     if not isinstance(value, str):
         raise ParameterError(parameter.name, value, 'must be a text')
     if parameter.choices and value not in parameter.choices:
