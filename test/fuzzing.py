@@ -56,7 +56,7 @@ def parameters_of(rng: np.random.Generator) -> dict[str, object]:
         'inverse.direction_band': float(rng.choice([0.0, 0.1])),
         'inverse.take_up_rate': float(rng.choice([inf, 1e3])),
         'control.delay_samples': int(rng.integers(0, 3)),
-        'estimator.use_applied_control': bool(rng.integers(2)),
+        'estimator.use_applied_control': str(rng.choice(['auto', 'true', 'false'])),
         'timeout.plant_output': float(rng.choice([0.0, 0.01, 0.5])),
         'autostart': False,
     }
@@ -193,7 +193,7 @@ def fuzz(seed: int, sequences: int) -> int:
     rate = values['control.rate_max']
     assert isinstance(rate, float)
     # A loop that begins anew goes on from the v that the driver says it applies.
-    move = inf if values['estimator.use_applied_control'] else rate * PERIOD_S
+    move = rate * PERIOD_S if values['estimator.use_applied_control'] == 'false' else inf
     with free_domain() as domain, node_with(values, domain) as node:
         fuzzer = Fuzzer(node, rng, move)
         for i in range(sequences):

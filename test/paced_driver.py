@@ -108,11 +108,15 @@ class PacedDriver:
         status = self.status()
         return status is not None and words in status.message
 
-    def value(self, key: str) -> float:
-        """A value in the newest diagnostics."""
+    def text(self, key: str) -> str:
+        """A value in the newest diagnostics as it stands there, empty without it."""
         status = self.status()
         values: dict[str, Any] = {v.key: v.value for v in status.values} if status else {}
-        return float(values.get(key, 0.0))
+        return str(values.get(key, ''))
+
+    def value(self, key: str) -> float:
+        """The same as a number."""
+        return float(self.text(key) or 0.0)
 
     def estimate(self) -> dict[str, float]:
         """The newest m, c_r, c_l."""

@@ -35,11 +35,13 @@ def config(tmp_path: Path) -> Path:
     return tmp_path / 'my.yaml'
 
 
-def test_paper_example_says_what_the_table_says() -> None:
+def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() -> None:
     example = load_config(shipped_configs() / 'paper_example.yaml')
-    defaults = Parameters()
-    assert example == {name: defaults[name] for name in example}
-    assert effective_parameters(None) == defaults
+    # The paper supposes G(z) exact, which the plant of a user never is.
+    exact = Parameters().replaced({'plant.uncertainty': 0.0})
+    assert example == {name: exact[name] for name in example}
+    assert effective_parameters(None) == exact
+    assert Parameters().real('plant.uncertainty') > 0.0
 
 
 @pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.name)
@@ -61,16 +63,18 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
         'driver': "ros2 run 'it'", 'axes': ['x', 'y'], 'plant.numerator': [1 / 3, 1e-300],
         'control.min': -0.1, 'control.rate_max': 5.5, 'lockstep': True,
         'file': "it's a: file.csv", 'seed': 7, 'backlash.jump': [0.0, 1e22, -0.5],
+        'truth.numerator': [0.5], 'truth.denominator': [1.0, -0.5],
     })
     write_config(parameters, config)
     assert Parameters(load_config(config)) == parameters
     assert len(load_config(config)) == len(parameters)
 
 
-def test_what_bringup_alone_uses_is_written_only_where_it_is_given(config: Path) -> None:
+def test_empty_list_is_left_out_and_so_is_what_bringup_alone_would_use(config: Path) -> None:
     # ROS 2 knows no empty list.
     write_config(Parameters(), config)
     assert '/bringup' not in config.read_text()
+    assert '[]' not in config.read_text()
     assert Parameters(load_config(config)) == Parameters()
 
 

@@ -189,7 +189,11 @@ def test_list_is_taken_as_a_list_or_as_text(value: object) -> None:
 @pytest.mark.parametrize('value', [3.0, True, None, [], [True], ['x'], 'x', [nan], [[1.0]]],
                          ids=repr)
 def test_what_is_no_list_of_numbers_is_refused(parameter: Parameter, value: object) -> None:
-    refusal_of(parameter.name, value)
+    if value == [] and parameter.may_be_empty:
+        assert Parameters({parameter.name: value})[parameter.name] == ()
+        assert Parameters({parameter.name: '[]'})[parameter.name] == ()
+    else:
+        refusal_of(parameter.name, value)
 
 
 @named([p for p in LISTS if p.length is not None])
@@ -210,6 +214,16 @@ def test_word_outside_the_choices_is_refused_and_they_are_listed(parameter: Para
 @named([p for p in PARAMETERS if isinstance(p.default, str)])
 def test_word_must_be_a_text(parameter: Parameter) -> None:
     assert 'must be a text' in refusal_of(parameter.name, 1.0)
+
+
+@named([p for p in PARAMETERS if 'true' in p.choices])
+def test_word_that_may_be_true_or_false_is_taken_as_yaml_and_ros_read_it(
+    parameter: Parameter,
+) -> None:
+    for given_value, word in ((True, 'true'), (False, 'false'), ('True', 'true')):
+        assert Parameters({parameter.name: given_value}).word(parameter.name) == word
+    for value in (1, 0.0, None, 'yes', ['true']):
+        refusal_of(parameter.name, value)
 
 
 @named([p for p in PARAMETERS if isinstance(p.default, bool)])

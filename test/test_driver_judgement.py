@@ -179,20 +179,32 @@ def test_a_delay_before_applied_control_counts_as_one() -> None:
     found = faults(heard)
     assert subjects(found) == ['reaction delay']
     assert 'set control.delay_samples: 2' in found[0].cure
+    assert faults(heard, control__delay_samples=2) == []
     assert faults(heard, estimator__use_applied_control=True) == []
 
 
 def test_a_limit_inside_the_driver_asks_for_applied_control() -> None:
     heard = heard_from_driver(report=True, limit=3.5)
-    found = faults(heard)
+    found = faults(heard, estimator__use_applied_control=False)
     assert subjects(found) == ['applied_control']
     assert 'estimator.use_applied_control: true' in found[0].cure
-    assert faults(heard, estimator__use_applied_control=True) == []
+    for use in ('true', 'auto'):
+        assert faults(heard, estimator__use_applied_control=use) == []
 
 
 def test_applied_control_that_is_asked_for_and_missing_is_told() -> None:
     found = faults(heard_from_driver(), estimator__use_applied_control=True)
     assert subjects(found) == ['applied_control']
+    assert faults(heard_from_driver()) == []
+
+
+@pytest.mark.parametrize('use', ['auto', 'true'])
+def test_applied_control_that_leaves_samples_out_is_told(use: str) -> None:
+    heard = heard_from_driver(report=True)
+    del heard.applied[::4]
+    found = faults(heard, estimator__use_applied_control=use)
+    assert subjects(found)[0] == 'applied_control'
+    assert 'comes with 75% of the samples' in found[0].found
 
 
 def test_a_wrong_sign_is_told_and_nothing_else() -> None:

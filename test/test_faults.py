@@ -152,18 +152,32 @@ def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent
         assert controller.stop() == 0
 
 
-@pytest.mark.parametrize('share', [0.01, 0.1, 0.3])
+@pytest.mark.parametrize(('share', 'parameters'), [
+    (0.01, {}), (0.1, {'estimator.use_applied_control': True}), (0.3, {}),
+    (0.3, {'estimator.use_applied_control': True}),
+])
 def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_percent(
-    tmp_path: Path, share: float,
+    tmp_path: Path, share: float, parameters: dict[str, object],
 ) -> None:
     with ros_world(tmp_path) as world:
-        controller, driver = controller_and_driver(
-            world, reports_applied=True, **{'estimator.use_applied_control': True}
-        )
+        controller, driver = controller_and_driver(world, reports_applied=True, **parameters)
         driver.heard = lambda: bool(driver.rng.random() > share)
         driver.run(1.0)
         driver.run_until_known(0.05)
         driver.check_sanity()
+        assert controller.stop() == 0
+
+
+def test_reports_that_stop_are_given_up_and_the_loop_goes_on_learning(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world, reports_applied=True)
+        driver.run_until(lambda: driver.text('using applied_control') == 'True', 'their use')
+        driver.learn()
+        driver.applied = None
+        driver.run_until(lambda: driver.text('using applied_control') == 'False', 'their end')
+        missed = driver.value('without applied_control')
+        driver.learn()
+        assert driver.value('without applied_control') == missed
         assert controller.stop() == 0
 
 

@@ -65,7 +65,8 @@ def read_messages(bag: Path) -> dict[str, list[tuple[int, np.ndarray]]]:
     ('parameters', 'samples', 'storage'),
     [
         ({'estimator.law': 'lms', 'estimator.output_noise_std': 0.0}, 450, 'mcap'),
-        ({'output_noise_std': 1e-4, 'output_loss': 0.1, 'seed': 5}, 200, 'sqlite3'),
+        ({'output_noise_std': 1e-4, 'output_loss': 0.1, 'seed': 5, 'truth.walk_std': 1e-3,
+          'truth.numerator': [1.00001e-5, 4e-5, 1e-5]}, 200, 'sqlite3'),
     ],
     ids=['lms-mcap', 'kalman-losses-sqlite3'],
 )

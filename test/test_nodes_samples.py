@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from math import isnan
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.nodes.command_history import CommandHistory
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.command_history import (
+    CONSISTENT,
+    CommandHistory,
+    ReportUse,
+    report_use,
+)
 from backlash_ros.nodes.sample_counter import Arrival, SampleCounter
 
 PERIOD_S, PERIOD_NS = 0.01, 10_000_000
@@ -173,6 +181,69 @@ def test_reports_over_lost_outputs_are_used_one_by_one() -> None:
     for k in (1, 2, 3):
         commands.report(10.0 * k, START_NS + k * PERIOD_NS - 1000)
     assert commands.reported_over(3, START_NS + 3 * PERIOD_NS) == [10.0, 20.0, 30.0]
+
+
+def uses(pattern: list[bool], use: ReportUse = ReportUse.AUTO) -> tuple[list[bool], int]:
+    """Of outputs with and without a report: whether it is used, and how many are missed."""
+    commands = CommandHistory(PERIOD_S, use)
+    commands.begin(START_NS)
+    used = []
+    for k, is_reported in enumerate(pattern, 1):
+        if is_reported:
+            commands.report(float(k), START_NS + k * PERIOD_NS - 1000)
+        used.append(commands.reported_over(1, START_NS + k * PERIOD_NS) == [float(k)])
+    return used, commands.unreported
+
+
+def test_reports_are_used_once_every_interval_has_had_one_and_until_they_stop() -> None:
+    n = CONSISTENT
+    used, unreported = uses([True] * (n + 10) + [False] + [True] * 5 + [False] * 2 * n + [True] * n)
+    assert used == [
+        *[False] * (n - 1), *[True] * 11, False, *[True] * 5, *[False] * 2 * n,
+        *[False] * (n - 1), True,
+    ]
+    # What is missing counts while reports are used, and not from a driver that has none.
+    assert unreported == 1 + n - 1
+
+
+@given(st.lists(st.integers(0, CONSISTENT - 1), max_size=20))
+def test_reports_that_leave_an_interval_out_now_and_then_are_not_begun_with(
+    lengths: list[int],
+) -> None:
+    pattern = [is_reported for n in lengths for is_reported in [*[True] * n, False]]
+    assert uses(pattern) == ([False] * len(pattern), 0)
+
+
+@given(st.lists(st.booleans(), max_size=100))
+def test_reports_are_used_always_or_never_where_that_is_asked_for(pattern: list[bool]) -> None:
+    missing = pattern.count(False)
+    assert uses(pattern, ReportUse.ALWAYS) == (pattern, missing)
+    assert uses(pattern, ReportUse.NEVER) == ([False] * len(pattern), 0)
+
+
+@pytest.mark.parametrize(('use', 'told'), [
+    (ReportUse.ALWAYS, True), (ReportUse.AUTO, True), (ReportUse.NEVER, False),
+])
+def test_first_command_goes_on_from_a_report_of_its_own_interval(
+    use: ReportUse, told: bool,
+) -> None:
+    commands = CommandHistory(PERIOD_S, use)
+    assert isnan(commands.newest_report(START_NS))
+    commands.report(7.0, START_NS)
+    assert (commands.newest_report(START_NS + 1000) == 7.0) is told
+    assert isnan(commands.newest_report(START_NS + 5 * PERIOD_NS))
+
+
+@pytest.mark.parametrize(('changes', 'use'), [
+    ({}, ReportUse.AUTO), ({'estimator.use_applied_control': True}, ReportUse.ALWAYS),
+    ({'estimator.use_applied_control': False}, ReportUse.NEVER),
+    # Whether a report stands before or behind that delay only the user knows.
+    ({'control.delay_samples': 1}, ReportUse.NEVER),
+    ({'control.delay_samples': 1, 'estimator.use_applied_control': 'true'}, ReportUse.ALWAYS),
+    ({'lockstep': True, 'estimator.use_applied_control': True}, ReportUse.NEVER),
+])
+def test_use_of_reports_follows_the_parameters(changes: dict[str, object], use: ReportUse) -> None:
+    assert report_use(Parameters(changes)) is use
 
 
 def paced_counter(samples: int = 40) -> tuple[SampleCounter, int]:

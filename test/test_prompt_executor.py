@@ -16,6 +16,7 @@ from ros_processes import wait_until
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
+from backlash_ros.nodes.inbox import Inbox
 from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.spin import spin_paced
 from backlash_ros.tools.processes import free_domain
@@ -40,6 +41,10 @@ class Loop:
         self.spin_until(self.publisher.get_subscription_count, 'a subscriber')
         for value in values:
             self.publisher.publish(Float64(data=value))
+
+    def served(self) -> int:
+        """Subscriptions that the executor waits for."""
+        return len(self.executor._subscriptions)
 
     def close(self) -> None:
         """Leave the domain."""
@@ -74,6 +79,24 @@ def test_every_message_is_served_in_order_with_its_number_where_that_is_wanted(
     assert plain == list(range(5))
     first = numbered[0][1]
     assert numbered == [(value, first + value) for value in range(5)]
+
+
+def test_messages_of_an_inbox_wait_until_they_are_taken_and_wake_nobody(loop: Loop) -> None:
+    inbox = Inbox(loop.node, Float64, 'number', 3)
+    other: list[float] = []
+    loop.node.create_subscription(Float64, 'other', lambda message: other.append(message.data), 10)
+    publisher = loop.node.create_publisher(Float64, 'other', 10)
+    loop.spin_until(publisher.get_subscription_count, 'the other subscriber')
+    loop.say(*map(float, range(5)))
+    # What is said later and heard already shows that the numbers have come.
+    publisher.publish(Float64(data=1.0))
+    loop.spin_until(lambda: other, 'the other message')
+    taken = list(inbox.take_all())
+    assert [message.data for message, _ in taken] == [2.0, 3.0, 4.0]
+    numbers = [info['publication_sequence_number'] for _, info in taken]
+    assert numbers == [numbers[0], numbers[0] + 1, numbers[0] + 2]
+    assert list(inbox.take_all()) == []
+    assert loop.served() == 1
 
 
 def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> None:

@@ -50,6 +50,27 @@ def test_run_writes_its_results_and_prints_a_table(
     assert lines[-1] == f'report: {tmp_path / "report.html"}'
 
 
+def test_sweep_over_true_plants_that_differ_from_the_known_one(tmp_path: Path) -> None:
+    sweep = ['--sweep', 'truth.scale_frequency=0.8,1,1.2', '--set', 'estimator.law=lms']
+    arguments = ['--duration', '1', '--config', 'geared_motor.yaml', *sweep]
+    assert main([*arguments, '--out', str(tmp_path)]) == 0
+    rows = rows_of(tmp_path / 'sweep.csv')
+    assert [float(row['truth.scale_frequency']) for row in rows] == [0.8, 1.0, 1.2]
+    assert len({row['tracking_error_rms'] for row in rows}) == 3
+
+
+def test_true_plant_of_a_file_is_simulated(tmp_path: Path) -> None:
+    text = '/plant: {ros__parameters: {truth: {numerator: [0.5], denominator: [1.0, -0.5]}}}'
+    (tmp_path / 'my.yaml').write_text(text)
+    arguments = ['--duration', '1', '--set', 'estimator.law=fixed']
+    assert main([*arguments, '--config', str(tmp_path / 'my.yaml'), '--out', str(tmp_path)]) == 0
+    rows = rows_of(tmp_path / 'samples.csv')
+    y, u = ([float(row[name]) for row in rows] for name in ('y', 'u'))
+    assert max(map(abs, u)) > 1.0
+    # u is what the backlash lets through, y what the true plant makes of it.
+    assert y[1:] == pytest.approx([0.5 * a + 0.5 * b for a, b in zip(y, u, strict=True)][:-1])
+
+
 def test_seed_decides_every_sample() -> None:
     def final(seed: int) -> Outcome:
         [job] = batch.make_jobs(noisy(), [{}], [seed], 0.5)

@@ -33,6 +33,7 @@ from backlash_ros.core.structure import Structure
 from backlash_ros.core.tracking import Tracking
 from backlash_ros.core.tracking_design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.true_plant import Alteration, altered_plant, delayed
 
 # Until the backlash is known, half of the motion of u may not be what the first guess says.
 DOUBT_OF_FIRST_GUESS = 0.5
@@ -44,6 +45,26 @@ def build_model(p: Parameters) -> TransferFunction:
     """G(z), and the delay between control and its effect as poles at 0."""
     delay = (0.0,) * p.integer('control.delay_samples')
     return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator') + delay)
+
+
+def build_true_model(p: Parameters) -> TransferFunction:
+    """G(z) of the simulated plant, which truth.* may set apart from the one that is known.
+
+    Raises ParameterError where that G(z) cannot be altered as truth.* asks.
+    """
+    delay = p.integer('truth.delay_samples')
+    if delay < 0:
+        delay = p.integer('control.delay_samples')
+    numerator, denominator = p.reals('truth.numerator'), p.reals('truth.denominator')
+    base = TransferFunction(
+        numerator or p.reals('plant.numerator'), denominator or p.reals('plant.denominator'),
+        'truth' if numerator or denominator else 'plant',
+    )
+    altered = altered_plant(base, Alteration(
+        p.real('truth.scale_frequency'), p.real('truth.scale_damping'),
+        p.real('truth.extra_lag') / p.real('sample_period'),
+    ))
+    return delayed(altered, delay)
 
 
 def build_state_model(p: Parameters) -> StateModel:
@@ -117,10 +138,13 @@ def build_plant(p: Parameters) -> SimulatedPlant:
     )
     imperfections = Imperfections(
         p.real('output_noise_std'), p.real('output_quantum'), p.real('input_disturbance'),
-        p.triple('backlash.rate'), p.real('backlash.jump_time'), p.triple('backlash.jump'),
+        p.real('truth.walk_std'), p.triple('backlash.rate'), p.real('backlash.jump_time'),
+        p.triple('backlash.jump'),
     )
     rng = np.random.default_rng(p.integer('seed'))
-    return SimulatedPlant(build_model(p), backlash, p.real('sample_period'), rng, imperfections)
+    return SimulatedPlant(
+        build_true_model(p), backlash, p.real('sample_period'), rng, imperfections
+    )
 
 
 def build_reference(p: Parameters) -> ReferenceSignal:

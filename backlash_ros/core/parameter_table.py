@@ -33,6 +33,7 @@ class Parameter:
     live: bool = False
     infinite: bool = False  # inf is allowed and means "no limit"
     names: bool = False  # a list of names instead of numbers, possibly empty
+    may_be_empty: bool = False  # a list of numbers that stands for another one where it is empty
 
 
 BOTH = (CONTROLLER, PLANT)
@@ -85,8 +86,10 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('estimator.drift_std', (0.0, 0.0, 0.0),
               'kalman: random walk of m, c_r, c_l per square root of a second', length=3,
               low=0.0, live=True),
-    Parameter('estimator.use_applied_control', False,
-              'take v from applied_control instead of the own command'),
+    Parameter('estimator.use_applied_control', 'auto',
+              'take v from applied_control instead of the own command; auto: as soon as the driver '
+              'reports every sample, as long as it does, and where control.delay_samples is 0',
+              choices=('auto', 'true', 'false')),
     Parameter('estimator.lag', 20,
               'lms and printed: samples by which the reconstruction of u looks back', 'samples',
               low=10, high=1000),
@@ -179,6 +182,27 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('output_loss', 0.0, 'simulated share of y that never arrives', low=0.0, high=0.99,
               used_by=(PLANT,)),
     Parameter('input_disturbance', 0.0, 'simulated constant added to u', 'u', used_by=(PLANT,)),
+    Parameter('truth.numerator', (), 'numerator of the simulated G(z), empty: plant.numerator',
+              used_by=(PLANT,), may_be_empty=True),
+    Parameter('truth.denominator', (),
+              'denominator of the simulated G(z), empty: plant.denominator', used_by=(PLANT,),
+              may_be_empty=True),
+    Parameter('truth.delay_samples', -1,
+              'simulated samples between control and its effect, -1: control.delay_samples',
+              'samples', low=-1, high=100, used_by=(PLANT,)),
+    Parameter('truth.scale_frequency', 1.0,
+              'simulated G(z): factor on the natural frequency of every pole', low=0.0, above=True,
+              used_by=(PLANT,)),
+    Parameter('truth.scale_damping', 1.0,
+              'simulated G(z): factor on the damping ratio of every complex pair of poles',
+              low=0.0, above=True, used_by=(PLANT,)),
+    Parameter('truth.extra_lag', 0.0,
+              'simulated dead time of u, parts of a sample included', 's', low=0.0,
+              used_by=(PLANT,)),
+    Parameter('truth.walk_std', 0.0,
+              'simulated random walk added to u, per square root of a second; like '
+              'input_disturbance it is no part of the u that plant/truth shows', 'u', low=0.0,
+              used_by=(PLANT,)),
     Parameter('seed', 1, 'seed of the simulated noise', low=0, used_by=(PLANT,)),
     Parameter('samples', 0, 'outputs to simulate, 0 for no end', low=0, used_by=(PLANT,)),
     Parameter('waveform', 'sine', 'shape of y_m',

@@ -129,6 +129,8 @@ def _flag(parameter: Parameter, value: object) -> bool:
 
 
 def _word(parameter: Parameter, value: object) -> str:
+    if 'true' in parameter.choices and isinstance(value, (bool, str)):
+        value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
     if not isinstance(value, str):
         raise ParameterError(parameter.name, value, 'must be a text')
     if parameter.choices and value not in parameter.choices:
@@ -155,7 +157,8 @@ def _names(parameter: Parameter, value: object) -> tuple[str, ...]:
 
 def _reals(parameter: Parameter, value: object) -> tuple[float, ...]:
     if isinstance(value, str):
-        value = value.strip('[] ').split(',')
+        listed = value.strip('[] ')
+        value = listed.split(',') if listed else []
     if isinstance(value, (bool, int, float)) or not isinstance(value, Iterable):
         raise ParameterError(parameter.name, value, 'must be a list of numbers')
     numbers = tuple(_real(parameter, element) for element in value)
@@ -163,7 +166,7 @@ def _reals(parameter: Parameter, value: object) -> tuple[float, ...]:
         raise ParameterError(
             parameter.name, list(numbers), f'must have {parameter.length} numbers'
         )
-    if not numbers:
+    if not (numbers or parameter.may_be_empty):
         raise ParameterError(parameter.name, [], 'must have at least one number')
     return numbers
 

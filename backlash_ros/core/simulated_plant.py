@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ class Imperfections:
     output_noise_std: standard deviation of white noise on y [unit of y].
     output_quantum: step of the sensor, 0 for none [unit of y].
     input_disturbance: constant added to u [unit of u].
+    walk_std: random walk added to u, from 0 on [unit of u per square root of a second].
     rate: drift of (m, c_r, c_l) per second, absolute.
     jump_time, jump: at jump_time [s] jump is added to (m, c_r, c_l).
     """
@@ -25,15 +27,17 @@ class Imperfections:
     output_noise_std: float = 0.0
     output_quantum: float = 0.0
     input_disturbance: float = 0.0
+    walk_std: float = 0.0
     rate: tuple[float, float, float] = (0.0, 0.0, 0.0)
     jump_time: float = 0.0
     jump: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class SimulatedPlant:
-    """y = G(z) (B[v] + d), measured with noise and a quantum.
+    """y = G(z) (B[v] + d + w), measured with noise and a quantum.
 
-    backlash: its u is the held output at the start. rng: source of the noise.
+    d is constant, w a random walk, w(k+1) = w(k) + walk_std sqrt(T) N(0, 1), w(0) = 0.
+    backlash: its u is the held output at the start. rng: source of the noise and of the walk.
     """
 
     def __init__(
@@ -48,6 +52,10 @@ class SimulatedPlant:
         self._sample_period = sample_period
         self._rng = rng
         self._extra = imperfections or Imperfections()
+        self._walk = 0.0
+        self._walk_step = self._extra.walk_std * sqrt(sample_period)
+        # Draws of their own: the noise on y is the same with and without a walk.
+        self._walk_rng = rng.spawn(1)[0] if self._walk_step > 0.0 else rng
         self._wears = any(self._extra.rate) or any(self._extra.jump)
 
     def measure(self) -> float:
@@ -60,11 +68,15 @@ class SimulatedPlant:
         return y
 
     def step(self, v: float) -> float:
-        """Apply v over one sample period and return u = B[v]."""
+        """Apply v over one sample period and return u = B[v], without the disturbances."""
         if self._wears:
             self._wear()
         u = self.backlash.step(v)
-        self._x = self._a @ self._x + self._b * (u + self._extra.input_disturbance)
+        disturbance = self._extra.input_disturbance
+        if self._walk_step > 0.0:
+            disturbance += self._walk
+            self._walk += self._walk_step * float(self._walk_rng.standard_normal())
+        self._x = self._a @ self._x + self._b * (u + disturbance)
         self.sample += 1
         return u
 

@@ -16,17 +16,20 @@ class TransferFunction:
     """G(z) with at least one sample of delay, coefficients in descending powers of z.
 
     numerator, denominator: plain sequences of floats; leading zeros of the numerator are dropped.
-    Raises ParameterError for empty, non-finite or zero polynomials and for a G(z) without delay.
+    group: of parameters that errors speak of. Raises ParameterError for empty, non-finite or zero
+    polynomials and for a G(z) without delay.
     """
 
-    def __init__(self, numerator: Sequence[float], denominator: Sequence[float]) -> None:
-        b = _polynomial('plant.numerator', numerator)
-        a = _polynomial('plant.denominator', denominator)
+    def __init__(
+        self, numerator: Sequence[float], denominator: Sequence[float], group: str = 'plant',
+    ) -> None:
+        b = _polynomial(f'{group}.numerator', numerator)
+        a = _polynomial(f'{group}.denominator', denominator)
         if len(b) >= len(a):
             raise ParameterError(
-                'plant.numerator', list(numerator),
+                f'{group}.numerator', list(numerator),
                 f'has degree {len(b) - 1}, must be below the degree {len(a) - 1} of '
-                'plant.denominator',
+                f'{group}.denominator',
                 'a sampled plant has a delay of at least one sample',
             )
         self.numerator = np.concatenate([np.zeros(len(a) - len(b)), b]) / a[0]
@@ -78,6 +81,6 @@ def _polynomial(name: str, coefficients: Sequence[float]) -> Array:
     nonzero = np.flatnonzero(values)
     if nonzero.size == 0:
         raise ParameterError(name, coefficients, 'must not be zero')
-    if name == 'plant.denominator' and nonzero[0] != 0:
+    if name.endswith('.denominator') and nonzero[0] != 0:
         raise ParameterError(name, coefficients, 'must have a leading coefficient other than 0')
     return values[nonzero[0]:]

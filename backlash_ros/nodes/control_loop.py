@@ -13,7 +13,7 @@ from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.last_command import last_commands
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.command_history import CommandHistory
+from backlash_ros.nodes.command_history import CommandHistory, report_use
 from backlash_ros.nodes.driver_io import Output
 from backlash_ros.nodes.loop_statistics import LoopStatistics
 from backlash_ros.nodes.sample_counter import Arrival, SampleCounter
@@ -40,7 +40,7 @@ class ControlLoop:
     ) -> None:
         self.statistics = LoopStatistics()
         self.counter = SampleCounter(p.real('sample_period'))
-        self.commands = CommandHistory(p.real('sample_period'))
+        self.commands = CommandHistory(p.real('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
         self.v = 0.0
         self.silent = False
@@ -49,7 +49,6 @@ class ControlLoop:
         self.heard_at: float | None = None  # on the steady clock [s]
         self._p, self._send, self._now_ns = p, send, now_ns
         self._lockstep = p.flag('lockstep')
-        self._use_applied = p.flag('estimator.use_applied_control') and not self._lockstep
         self._missing = 0  # outputs since the newest one that was used
         self._anew = False  # whether sender or clock began anew since then
         self._begun = False  # whether the present core has taken a step
@@ -189,14 +188,12 @@ class ControlLoop:
         lost, self._missing = self._missing, 0
         if not self._begun:
             self._begun = True
-            reported = commands.newest_report() if self._use_applied else nan
+            reported = commands.newest_report(stamp_ns)
             core.start_from(reported if isfinite(reported) else self.v)
             commands.begin(stamp_ns)
             return core.step(y, y_m)
-        applied: list[float] = []
-        if self._use_applied:
-            applied = commands.reported_over(lost + 1, stamp_ns)
-        if not (applied or self._lockstep):
-            applied = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
-        return core.step(y, y_m, lost, applied)
+        if self._lockstep:
+            return core.step(y, y_m, lost)
+        applied = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
+        return core.step(y, y_m, lost, commands.reported_over(lost + 1, stamp_ns) or applied)
 

@@ -23,6 +23,7 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.command_history import REMEMBERED, ReportUse, report_use
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
 from backlash_ros.nodes.declare import LiveParameters
@@ -30,6 +31,7 @@ from backlash_ros.nodes.diagnosis import OK, STATES, WARN, Finding, counts_of, v
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.estimate_saver import EstimateSaver
 from backlash_ros.nodes.events import emit
+from backlash_ros.nodes.inbox import Inbox
 from backlash_ros.nodes.lifecycle import ManagedNode
 from backlash_ros.nodes.messages import (
     DEPTH,
@@ -91,8 +93,9 @@ class ControllerNode(ManagedNode):
         self._reference = self.create_subscription(
             Float64, topics.REFERENCE, self._on_reference, KEPT if self._lockstep else 1
         )
-        if p.flag('estimator.use_applied_control'):
-            self.listen(Float64, topics.APPLIED_CONTROL, self._on_applied_control, DEPTH)
+        self._reports: Inbox | None = None
+        if report_use(p) is not ReportUse.NEVER:
+            self._reports = Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         offer_services(self, self)
@@ -214,6 +217,9 @@ class ControllerNode(ManagedNode):
             self.loop.take_applied(message.data, info['source_timestamp'])
 
     def _on_output(self, output: Output) -> None:
+        if self._reports is not None:
+            for report in self._reports.take_all():
+                self._on_applied_control(*report)
         loop = self.loop
         if loop is None or not self.active:
             return

@@ -101,6 +101,8 @@ def _declared(node: Node) -> dict[str, RosParameter]:
 
 
 def _ros_value(value: object) -> object:
+    if value == ():
+        return RosParameter.Type.DOUBLE_ARRAY  # declared and not set: ROS has no empty lists
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -116,11 +118,20 @@ def _constraints(parameter: Parameter) -> str:
 
 
 def _as_declared(changes: list[RosParameter]) -> list[RosParameter]:
-    """Turn whole numbers given for a float into floats, which rclpy alone would refuse."""
+    """Turn what rclpy alone would refuse into the declared type.
+
+    Whole numbers given for a float; true and false given for a word that may be 'true'.
+    """
     return [
-        RosParameter(change.name, value=float(change.value))
-        if change.type_ == RosParameter.Type.INTEGER
-        and change.name in BY_NAME and isinstance(BY_NAME[change.name].default, float)
-        else change
+        RosParameter(change.name, value=_in_type_of(BY_NAME[change.name], change))
+        if change.name in BY_NAME else change
         for change in changes
     ]
+
+
+def _in_type_of(parameter: Parameter, change: RosParameter) -> Any:
+    if change.type_ == RosParameter.Type.INTEGER and isinstance(parameter.default, float):
+        return float(change.value)
+    if change.type_ == RosParameter.Type.BOOL and 'true' in parameter.choices:
+        return str(change.value).lower()
+    return change.value

@@ -57,6 +57,7 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
         'std_m': e.std_m, 'std_c_r': e.std_c_r, 'std_c_l': e.std_c_l,
         'learning': loop.adapting, 'compensating': loop.compensating,
+        'using applied_control': loop.commands.uses_reports,
         # Above 1 the gap is crossed, without which nothing can be learned of it.
         'excitation: swing of v / gap': swing / gap if gap > 0.0 else swing,
         'rate [Hz]': rate,

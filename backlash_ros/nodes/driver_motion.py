@@ -21,6 +21,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.record_fit import MORE_DELAY, RecordFit, fit_record
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.nodes.command_history import ReportUse, report_use
 from backlash_ros.nodes.driver_findings import (
     FITS,
     UNKNOWN,
@@ -65,7 +66,8 @@ class Record:
 
 def applied_findings(heard: Heard, timing: Timing, p: Parameters) -> list[Finding]:
     """Whether applied_control, where it is published or asked for, is of use."""
-    wanted = p.flag('estimator.use_applied_control')
+    use = report_use(p)
+    wanted = use is ReportUse.ALWAYS
     subject = 'applied_control'
     if not heard.applied:
         return [Finding(
@@ -73,14 +75,14 @@ def applied_findings(heard: Heard, timing: Timing, p: Parameters) -> list[Findin
             'report v just before each y, or set estimator.use_applied_control: false',
         )] if wanted else []
     share = len(heard.applied) / len(timing.outputs)
-    if wanted and share < REPORTED:
+    if use is not ReportUse.NEVER and share < REPORTED:
         return [Finding(
             subject, WRONG, f'comes with {share:.0%} of the samples',
-            'report v just before each y',
+            'report v just before each y, or set estimator.use_applied_control: false',
         )]
     applied = _on_grid(heard.applied, timing)
     control = _on_grid(heard.controls, timing)
-    if wanted or control is None or applied is None:
+    if use is not ReportUse.NEVER or control is None or applied is None:
         return [Finding(subject, FITS, 'is published')]
     moved = _shifted_difference(applied, control, _lag(applied, control))
     swing = float(np.ptp(control))
@@ -224,8 +226,8 @@ def _mismatch(
 
 def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
     expected = p.integer('control.delay_samples')
-    if p.flag('estimator.use_applied_control'):
-        lag = 0
+    if report_use(p) is ReportUse.ALWAYS:
+        lag = 0  # the report already has it
     found = fit.delay + lag
     inside = expected - lag
     if 0 <= inside < len(fit.margins) and fit.margins[inside] <= DECISIVE:

@@ -15,6 +15,8 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+from backlash_ros.nodes.inbox import Polled
+
 # Services and events may wait so long.
 LOOK_NS = 50_000_000
 S_TO_NS = 1e9
@@ -33,6 +35,7 @@ class PromptExecutor(SingleThreadedExecutor):
         self._served_node = node
         # Whether the callback wants to know time stamp and number as well.
         self._subscriptions: dict[Subscription, bool] = {}
+        self._known: list[Subscription] = []  # the polled ones included
         self._guards: list[GuardCondition] = []
         self._wait_set: Any = None
         self._look_at_ns = 0  # after the messages
@@ -97,12 +100,15 @@ class PromptExecutor(SingleThreadedExecutor):
         """Make a wait set for what the node has now."""
         subscriptions = list(self._served_node.subscriptions)
         guards = list(self._served_node.guards)
-        if subscriptions == list(self._subscriptions) and guards == self._guards:
+        if subscriptions == self._known and guards == self._guards:
             return
-        self._subscriptions = {each: _wants_info(each.callback) for each in subscriptions}
-        self._guards = guards
+        self._subscriptions = {
+            each: _wants_info(each.callback) for each in subscriptions
+            if not isinstance(each.callback_group, Polled)
+        }
+        self._known, self._guards = subscriptions, guards
         self._wait_set = rclpy_implementation.WaitSet(
-            len(subscriptions), len(guards), 0, 0, 0, 0, self._served_node.context.handle
+            len(self._subscriptions), len(guards), 0, 0, 0, 0, self._served_node.context.handle
         )
 
     def _call_timers(self) -> None:

@@ -179,10 +179,10 @@ def shipped_configs() -> Path:
 def write_config(parameters: Parameters, path: Path) -> None:
     """Write the complete set as a ROS 2 parameter file that every node accepts.
 
-    What is of bringup alone stands in a section of its own, and only if it is given: ROS 2 has
-    no empty lists.
+    What is of bringup alone stands in a section of its own, and only if it is given. Empty lists,
+    which ROS 2 does not have, are left out.
     """
-    common = [p for p in PARAMETERS if p.used_by != (BRINGUP,)]
+    common = [p for p in PARAMETERS if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
     own = [p for p in PARAMETERS if p not in common and parameters[p.name] != p.default]
     document = {EVERY_NODE: {'ros__parameters': _tree(parameters, common)}}
     if own:

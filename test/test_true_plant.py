@@ -1,0 +1,203 @@
+"""The G(z) of a simulated plant that differs from the known one."""
+
+from __future__ import annotations
+
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter
+from strategies import plants
+
+from backlash_ros.core.assembly import build_model, build_plant, build_true_model
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.true_plant import Alteration, altered_plant, delayed
+from backlash_ros.tools.configuration import effective_parameters
+
+PERIOD = 0.005
+NOTHING = {
+    'truth.numerator': [], 'truth.denominator': [], 'truth.delay_samples': -1,
+    'truth.scale_frequency': 1.0, 'truth.scale_damping': 1.0, 'truth.extra_lag': 0.0,
+    'truth.walk_std': 0.0,
+}
+
+
+def motor(frequency: float = 20.0, damping: float = 0.5) -> TransferFunction:
+    """The load of geared_motor.yaml by an independent discretisation."""
+    w = 2.0 * pi * frequency
+    numerator, denominator, _ = cont2discrete(
+        ([w * w], [1.0, 2.0 * damping * w, w * w]), PERIOD, 'zoh'
+    )
+    return TransferFunction(np.ravel(numerator).tolist(), denominator.tolist())
+
+
+def assert_equal(found: TransferFunction, expected: TransferFunction, tolerance: float) -> None:
+    np.testing.assert_allclose(found.numerator, expected.numerator, rtol=0.0, atol=tolerance)
+    np.testing.assert_allclose(found.denominator, expected.denominator, rtol=0.0, atol=tolerance)
+
+
+def step_response(model: TransferFunction, samples: int) -> NDArray[np.float64]:
+    return np.asarray(lfilter(model.numerator, model.denominator, np.ones(samples)))
+
+
+def continuous(model: TransferFunction) -> bool:
+    """Whether a G(s) of the same order has this response."""
+    poles = model.poles
+    return not np.any((poles.real <= 0.0) & (np.abs(poles.imag) < 1e-3))
+
+
+@pytest.mark.parametrize('factor', [0.5, 0.8, 0.98, 1.02, 1.2, 1.5])
+def test_scaled_frequency_is_the_motor_at_that_frequency(factor: float) -> None:
+    assert_equal(altered_plant(motor(), Alteration(frequency=factor)), motor(20.0 * factor), 1e-12)
+
+
+@pytest.mark.parametrize('damping', [0.1, 0.4, 0.6, 0.99, 1.0, 1.7])
+def test_scaled_damping_is_the_motor_with_that_damping(damping: float) -> None:
+    altered = altered_plant(motor(), Alteration(damping=damping / 0.5))
+    # Two poles that meet are known to the square root of the rounding error only.
+    assert_equal(altered, motor(damping=damping), 1e-12)
+
+
+def test_shipped_motor_is_altered_as_the_exact_one() -> None:
+    p = effective_parameters(Path('geared_motor.yaml'))
+    altered = p.replaced({'truth.scale_frequency': 1.2, 'truth.scale_damping': 1.2})
+    assert_equal(build_true_model(altered), motor(24.0, 0.6), 1e-9)
+
+
+def test_lag_of_whole_samples_is_a_pole_at_zero_for_each() -> None:
+    for samples in (1, 2):
+        expected = TransferFunction(
+            motor().numerator.tolist(), [*motor().denominator, *[0.0] * samples]
+        )
+        assert_equal(altered_plant(motor(), Alteration(lag=samples)), expected, 0.0)
+
+
+@given(plants(), st.sampled_from([2, 3]))
+def test_plant_with_scaled_frequency_takes_the_same_way_faster(
+    model: TransferFunction, factor: int,
+) -> None:
+    assume(continuous(model))
+    altered = altered_plant(model, Alteration(frequency=factor))
+    way, faster = step_response(model, 60 * factor)[::factor], step_response(altered, 60)
+    # An integrator keeps its velocity gain: there is less time for as much speed.
+    integrates = np.any(np.abs(model.poles - 1.0) < 1e-6)
+    expected = way / factor if integrates else way
+    np.testing.assert_allclose(faster, expected, rtol=0.0, atol=1e-7 * np.abs(way).max())
+
+
+@given(plants(), st.integers(0, 2), st.integers(1, 3))
+def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(
+    model: TransferFunction, whole: int, quarters: int,
+) -> None:
+    assume(continuous(model))
+    lagging = step_response(altered_plant(model, Alteration(lag=whole + 0.25 * quarters)), 60)
+    # A quarter of the frequency shows the response between the samples as well.
+    slow = step_response(altered_plant(model, Alteration(frequency=0.25)), 240)
+    if np.any(np.abs(model.poles - 1.0) < 1e-6):
+        slow = slow * 0.25
+    expected = np.append(np.zeros(whole + 1), slow[4 - quarters::4])[:60]
+    np.testing.assert_allclose(lagging, expected, rtol=0.0, atol=1e-7 * np.abs(slow).max())
+
+
+@given(plants(), st.floats(0.3, 3.0), st.floats(0.3, 3.0))
+def test_gain_at_rest_is_kept(model: TransferFunction, frequency: float, damping: float) -> None:
+    assume(continuous(model))
+    altered = altered_plant(model, Alteration(frequency, damping))
+    # Of an integrator, that of the velocity: its denominator is 0 at z = 1.
+    order = int(np.any(np.abs(model.poles - 1.0) < 1e-6))
+    gain, expected = (
+        float(np.polyval(m.numerator, 1.0) / np.polyval(np.polyder(m.denominator, order), 1.0))
+        for m in (altered, model)
+    )
+    assert gain == pytest.approx(expected, rel=1e-6, abs=1e-7 * np.abs(model.numerator).sum())
+
+
+def test_delay_stays_a_delay_whatever_the_frequency() -> None:
+    altered = altered_plant(delayed(motor(), 3), Alteration(frequency=1.2))
+    assert_equal(altered, delayed(motor(24.0), 3), 1e-12)
+
+
+def test_plant_that_no_continuous_one_has_is_refused_with_its_pole() -> None:
+    ringing = TransferFunction([1.0], [1.0, 0.25])
+    with pytest.raises(ParameterError, match=r'pole -0\.25.*negative real axis.*truth\.numerator'):
+        altered_plant(ringing, Alteration(frequency=1.2))
+    # Whole samples of dead time need no continuous plant.
+    assert altered_plant(ringing, Alteration(lag=2.0)).delay == 3
+
+
+def test_taps_of_a_delay_by_part_of_a_sample_are_refused() -> None:
+    taps = TransferFunction([0.07, 0.03], [1.0, -0.9, 0.0])
+    with pytest.raises(ParameterError, match='1 poles at 0 that are no delay by whole samples'):
+        altered_plant(taps, Alteration(frequency=1.2))
+
+
+def test_defaults_leave_a_run_as_it_is_to_the_last_bit() -> None:
+    values = {'output_noise_std': 1e-3, 'control.delay_samples': 2, 'seed': 5}
+    plain = build_plant(Parameters(values))
+    same = build_plant(Parameters({**values, **NOTHING}))
+    model = build_model(Parameters(values))
+    assert_equal(build_true_model(Parameters(values)), model, 0.0)
+    expected = step_response(model, 50)
+    for k in range(50):
+        y = plain.measure()
+        assert y == same.measure()
+        assert abs(y - 1.3 * 7.0 * expected[k]) < 0.01
+        plain.step(10.0)
+        same.step(10.0)
+
+
+def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() -> None:
+    known = Parameters({'control.delay_samples': 1})
+    p = known.replaced({
+        'truth.numerator': [0.3], 'truth.denominator': [1.0, -0.5, 0.06], 'truth.delay_samples': 3,
+    })
+    assert_equal(
+        build_true_model(p), TransferFunction([0.3], [1.0, -0.5, 0.06, 0.0, 0.0, 0.0]), 0.0
+    )
+    assert_equal(build_model(p), build_model(known), 0.0)
+    denominator = p.replaced({'truth.numerator': [], 'truth.denominator': [1.0, -2.8, 2.7, -0.9]})
+    assert build_true_model(denominator).numerator.max() == max(p.reals('plant.numerator'))
+
+
+def test_bad_truth_is_named_as_such() -> None:
+    with pytest.raises(ParameterError, match=r'truth\.numerator=.* of truth\.denominator'):
+        build_plant(Parameters({'truth.numerator': [1.0, 2.0], 'truth.denominator': [1.0, 0.5]}))
+
+
+def test_walk_of_u_is_one_and_leaves_the_noise_alone() -> None:
+    samples, std = 4000, 0.2
+    values = {'plant.numerator': [1.0], 'plant.denominator': [1.0, 0.0], 'backlash.c_r': 1e-9,
+              'backlash.c_l': -1e-9, 'output_noise_std': 1e-3, 'sample_period': PERIOD}
+
+    def outputs(**changes: float) -> NDArray[np.float64]:
+        plant = build_plant(Parameters({**values, **changes}))
+        y = []
+        for _ in range(samples):
+            y.append(plant.measure())
+            # The walk is a disturbance, and not the output of the backlash.
+            assert plant.step(0.0) == pytest.approx(0.0, abs=1e-8)
+        return np.array(y)
+
+    walk = outputs(**{'truth.walk_std': std}) - outputs()
+    assert walk[1] == pytest.approx(0.0, abs=1e-8)
+    steps = np.diff(walk[1:])
+    assert steps.std() == pytest.approx(std * PERIOD**0.5, rel=0.05)
+    assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 0.05
+
+
+def test_controller_is_told_nothing_of_the_truth() -> None:
+    p = effective_parameters(Path('geared_motor.yaml'), ['truth.scale_frequency=1.5'])
+    loop = build_closed_loop(p.replaced({'estimator.law': 'fixed'}))
+    plain = build_closed_loop(p.replaced({
+        'estimator.law': 'fixed', 'truth.scale_frequency': 1.0,
+    }))
+    run, told = loop.run(200), plain.run(200)
+    assert np.array_equal(run.column('v'), told.column('v'))
+    assert not np.allclose(run.column('y'), told.column('y'), atol=1e-3)
