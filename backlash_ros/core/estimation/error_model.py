@@ -31,6 +31,7 @@ LONGEST = 2000  # samples of the responses that are compared
 SETTLED = 8.0  # slowest time constants that these responses last
 MORE_TAPS = 2  # numerator taps of a G of low order beyond its moving poles: a sample of delay
 FREE_TAPS = 0.2  # spread of single taps, as a share of the largest one and of the uncertainty
+LEAK = 5e-3  # of an integrator per sample and per unit of the uncertainty
 NEGLIGIBLE = 1e-7  # share of the largest singular value of the responses that is rounding
 
 
@@ -38,7 +39,8 @@ class ErrorModel:
     """Filters F_i of a model G, and the prior of their coefficients.
 
     stable: denominator A of the stable poles of G, monic; delays (poles at 0) are left out. count:
-    number K of filters, 0 where G is exact. spread: factor L of the prior covariance of h at
+    number K of filters, 0 where G is exact. leak: deviation of that of an integrator at scale 1,
+    per sample. spread: factor L of the prior covariance of h at
     scale 1, L L' = cov(h), shape (K, K).
     """
 
@@ -48,6 +50,8 @@ class ErrorModel:
         self.gain = float(self.stable.sum())
         self.taps = len(moving)
         self.count = 2 + 2 * self.taps if uncertainty > 0.0 else 0
+        integrates = bool(np.any(np.abs(model.transfer_function.poles - 1.0) < ON_CIRCLE))
+        self.leak = LEAK * uncertainty if integrates else 0.0
         self.spread: Array = np.zeros((0, 0))
         # The same as a G of low order: spread of its taps and denominator (low_order.py).
         self.low_order_spread: Array = np.zeros((0, 0))

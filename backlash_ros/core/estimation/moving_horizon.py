@@ -375,7 +375,7 @@ class MovingHorizon:
         number = self._record.first + fit.length
         v, y = self._record.since(number)
         v, y = v[:4 * BLOCK[1]], y[:4 * BLOCK[1]]
-        rows = fit.columns(v)
+        rows = fit.columns(v, y)
         squares, outliers = fit.contradiction(rows, y, solution)
         valid = np.isfinite(y)
         if np.count_nonzero(outliers) <= FEW * np.count_nonzero(valid):

@@ -21,7 +21,7 @@ from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
-NOISE_WEIGHT = 5.0  # samples that the told noise level counts for
+NOISE_WEIGHT = 1.0  # samples that the told noise level counts for
 # Scales s of the error of G that are compared, besides none, in units of the spread of the prior.
 SCALES = np.geomspace(1e-4, 10.0, 21)
 SAME = 0.7  # ratio of scales that the grid does not tell apart

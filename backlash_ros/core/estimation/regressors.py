@@ -9,8 +9,10 @@ is linear. F is the free response of G from the state x0 before the first sample
 before the first engagement, and E the responses of (1 - z^-1) F_i G to p, in the coordinates in
 which the a_i are independent and of variance one a priori (error_model.py).
 
-Columns, in this order: x0 (n), u0, m, m c_r, m c_l, a (K), and once more K for the size of the
-first jump of p, which depends on the unknown start of p.
+An integrator of G that in truth leaks, 1/(1 - (1 - l) z^-1), adds -l sum y to first order.
+
+Columns, in this order: x0 (n), u0, m, m c_r, m c_l, a (K), l where G integrates, and once more K
+for the size of the first jump of p, which depends on the unknown start of p.
 """
 
 from __future__ import annotations
@@ -31,10 +33,14 @@ SIGNALS = 6  # that drive G: 1_H, v_a, -1_R, -1_L, p(k) - p(k-1), the first jump
 
 
 class Layout(NamedTuple):
-    """Where the unknowns stand. n: order of G. errors: K. jump: whether the first jump is there."""
+    """Where the unknowns stand.
+
+    n: order of G. errors: K. leak, jump: whether a leak and the first jump are there.
+    """
 
     n: int
     errors: int
+    leak: bool
     jump: bool
 
     @property
@@ -48,9 +54,14 @@ class Layout(NamedTuple):
         return slice(self.n + 1, self.n + 4)
 
     @property
+    def leaks(self) -> int:
+        """Where the leak stands."""
+        return self.base + self.errors
+
+    @property
     def unknowns(self) -> int:
         """Number p of all unknowns."""
-        return self.base + self.errors * (2 if self.jump else 1)
+        return self.base + self.errors * (2 if self.jump else 1) + int(self.leak)
 
 
 class Regressors:
@@ -58,7 +69,7 @@ class Regressors:
 
     def __init__(self, model: StateModel, error: ErrorModel, jump: bool) -> None:
         n = model.order
-        self.layout = Layout(n, error.count, jump and error.count > 0)
+        self.layout = Layout(n, error.count, error.leak > 0.0, jump and error.count > 0)
         self._model, self._error = model, error
         transfer = model.transfer_function
         self._numerator, self._denominator = transfer.numerator, transfer.denominator
@@ -67,9 +78,13 @@ class Regressors:
         self._states = np.zeros((n + SIGNALS, n))
         self._states[:n] = model.to_observer.T
         self._errors, self._jumps = ErrorFilter(error), ErrorFilter(error)
+        self._sum = self._y = 0.0  # of all y so far, and the newest one
 
-    def rows(self, labels: Labels) -> Array:
-        """Columns for the next samples, shape (N, p): how the outputs after them depend on all."""
+    def rows(self, labels: Labels, y: Array) -> Array:
+        """Columns for the next samples, shape (N, p): how the outputs after them depend on all.
+
+        y: measured after each of them, nan where lost, shape (N,).
+        """
         layout, n = self.layout, self.layout.n
         count, base = len(labels.v_a), layout.base
         signals = np.zeros((n + SIGNALS, count))
@@ -88,9 +103,21 @@ class Regressors:
         if layout.errors:
             spread, end = self._error.spread, base + layout.errors
             rows[:, base:end] = self._errors.filtered(answers[base]) @ spread
+            if layout.leak:
+                rows[:, end] = self._leak(y)
+                end += 1
             if layout.jump:
                 rows[:, end:] = self._jumps.filtered(answers[base + 1]) @ spread
         return rows
+
+    def _leak(self, y: Array) -> Array:
+        """Minus the sum of all y before, a lost one counting as the one before it."""
+        known = np.where(np.isfinite(y), np.arange(len(y)), -1)
+        np.maximum.accumulate(known, out=known)
+        filled = np.where(known < 0, self._y, y[known])
+        before: Array = np.cumsum(np.append(self._sum + self._y, filled))
+        self._sum, self._y = float(before[-2]), float(filled[-1])
+        return -before[:-1]
 
     def state_map(self) -> Array:
         """State of G after the samples so far in the coordinates of StateModel, shape (n, n + 4).

@@ -57,7 +57,7 @@ def fitted(
         fit = WindowFit(around, start, slope, reach)
         while fit.length < len(v):
             part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
-            fit.take(fit.columns(v[part]), y[part], weights[part])
+            fit.take(fit.columns(v[part], y[part]), y[part], weights[part])
             yield
         solution = fit.solve()
         result = Fitted(fit, solution)

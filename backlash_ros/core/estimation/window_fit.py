@@ -145,14 +145,17 @@ class WindowFit:
         weights[n + 1] = unit * (v_reach or 1.0)
         return weights
 
-    def columns(self, v: Array) -> Array:
-        """Columns for the next v (N,), applied one after the other; `take` is to follow."""
+    def columns(self, v: Array, y: Array) -> Array:
+        """Columns for the next v (N,), applied one after the other, and y (N,) after each.
+
+        `take` is to follow.
+        """
         play = self._play
         labels = labels_of(v, play.gap, play.p, play.side, play.v_a)
         self._advance(labels)
         self._highest = max(self._highest, float(v.max()))
         self._lowest = min(self._lowest, float(v.min()))
-        return self._regressors.rows(labels)
+        return self._regressors.rows(labels, y)
 
     def take(self, rows: Array, y: Array, weights: Array) -> None:
         """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
@@ -223,6 +226,8 @@ class WindowFit:
         """The solution for all samples so far."""
         layout, gap = self.layout, self.start.gap
         spreads: Array = np.ones(layout.errors)
+        if layout.leak:
+            spreads = np.append(spreads, self.around.error.leak / abs(self.slope))
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
