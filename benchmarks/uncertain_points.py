@@ -128,6 +128,10 @@ class Benchmark:
         ]
         notes = [f'swaps of G: {sum(r.swaps for r in swaps)} in {len(swaps)} of {len(jobs)} runs']
         notes += [
+            _note(r, f'v moves {r.worst_swap:.3g} times as much at the swap of G at '
+                  f'{r.worst_swap_s:.4g} s') for r in swaps if r.worst_swap > 1.0
+        ]
+        notes += [
             _note(r, f'error of y {ratio:.3g} times') for r, ratio in
             zip(results, ratios, strict=True) if not ratio <= FOLLOWING['worst']
         ]

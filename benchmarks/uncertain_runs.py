@@ -40,7 +40,8 @@ class Figures:
     wrong_s: longest time with status TRACKING and an error of more than WRONG deviations.
     following: RMS of y, before the sensor, against the delayed reference [unit of y].
     moving: share of the samples after RESTS_S in which v moves. swaps: of G; worst_swap: largest
-    move of v at one of them over the largest in the second before, nan without any.
+    move of v at one of them over the largest in the second before, nan without any, and when that
+    was [s].
     """
 
     name: str
@@ -54,6 +55,7 @@ class Figures:
     moving: float = 1.0
     swaps: int = 0
     worst_swap: float = nan
+    worst_swap_s: float = nan
     problem: str = ''
 
 
@@ -124,14 +126,15 @@ def _figures(
         normalised = np.abs(error) / deviations
     wrong = is_tracking & ~(normalised <= WRONG).all(axis=1)
     v = np.array(plant.v)
-    swaps, worst = _swaps(models, v, run.sample_period)
+    swaps, worst, worst_s = _swaps(models, v, run.sample_period)
     begin = round(RESTS_S / run.sample_period)
     return Figures(
         job.name, job.seed, errors, float(is_tracking[t >= ACQUIRED_S].mean()),
         normalised[learned & np.isfinite(deviations).all(axis=1)],
         _longest(wrong) * run.sample_period, Status(int(status[-1])),
         following(job.parameters, loop, np.array(plant.u)),
-        float(np.mean(np.diff(v[begin:]) != 0.0)) if len(v) > begin + 1 else nan, swaps, worst,
+        float(np.mean(np.diff(v[begin:]) != 0.0)) if len(v) > begin + 1 else nan,
+        swaps, worst, worst_s,
     )
 
 
@@ -152,11 +155,12 @@ def _longest(flags: NDArray[np.bool_]) -> int:
     return int(np.max(ends[1::2] - ends[::2], initial=0))
 
 
-def _swaps(models: list[object], v: Array, period_s: float) -> tuple[int, float]:
+def _swaps(models: list[object], v: Array, period_s: float) -> tuple[int, float, float]:
     moves = np.abs(np.diff(v, prepend=0.0))
     second = round(COUNTED / period_s)
     at = [k for k in range(1, len(models)) if models[k] is not models[k - 1]]
     ratios = [
         float(moves[k:k + SWAP].max() / max(moves[max(k - second, 0):k].max(), 1e-12)) for k in at
     ]
-    return len(at), max(ratios, default=nan)
+    worst = int(np.argmax(ratios)) if at else 0
+    return (len(at), ratios[worst], at[worst] * period_s) if at else (0, nan, nan)

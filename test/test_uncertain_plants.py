@@ -118,11 +118,12 @@ def test_longest_row_of_true_ones_is_found() -> None:
 def test_move_at_a_swap_is_compared_with_those_of_the_second_before() -> None:
     v = np.cumsum([5.0] + [1.0] * 9 + [3.0] + [1.0] * 10)
     old, new = object(), object()
-    assert _swaps([old] * 9 + [new] * 12, v, 0.2) == (1, 3.0)
-    assert _swaps([old] * 15 + [new] * 6, v, 0.2) == (1, pytest.approx(1.0 / 3.0))
-    count, worst = _swaps([old] * 21, v, 0.2)
+    assert _swaps([old] * 9 + [new] * 12, v, 0.2) == (1, 3.0, pytest.approx(1.8))
+    assert _swaps([old] * 15 + [new] * 6, v, 0.2) == (1, pytest.approx(1.0 / 3.0), 3.0)
+    assert _swaps([old] * 9 + [new] * 6 + [old] * 6, v, 0.2) == (2, 3.0, pytest.approx(1.8))
+    count, worst, when = _swaps([old] * 21, v, 0.2)
     assert count == 0
-    assert np.isnan(worst)
+    assert np.isnan([worst, when]).all()
 
 
 def positions(load: CoastingLoad, control: np.ndarray) -> np.ndarray:

@@ -189,7 +189,9 @@ class ControlLoop:
         if not self._begun:
             self._begun = True
             reported = commands.newest_report(stamp_ns)
-            core.start_from(reported if isfinite(reported) else self.v)
+            # A report beyond the limits would have the commands begin there.
+            within = min(max(reported, core.limits.low), core.limits.high)
+            core.start_from(within if isfinite(reported) else self.v)
             commands.begin(stamp_ns)
             return core.step(y, y_m)
         if self._lockstep:
