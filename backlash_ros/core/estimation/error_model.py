@@ -39,8 +39,8 @@ class ErrorModel:
     """Filters F_i of a model G, and the prior of their coefficients.
 
     stable: denominator A of the stable poles of G, monic; delays (poles at 0) are left out. count:
-    number K of filters, 0 where G is exact. leak: deviation of that of an integrator at scale 1,
-    per sample. spread: factor L of the prior covariance of h at
+    number K of filters, 0 where G is exact. leak: prior deviation of that of an integrator, per
+    sample. spread: factor L of the prior covariance of h at
     scale 1, L L' = cov(h), shape (K, K).
     """
 

@@ -2,9 +2,9 @@
 
     y = X_b b + X_e e + noise,  noise ~ N(0, sigma^2),  e ~ N(0, (s m)^2 I)
 
-b has no prior. sigma^2 is inverse gamma with few degrees of freedom around the told one; s is the
-one of the largest evidence. X is kept as the triangle of its QR decomposition, so that rows may
-come in pieces. All of it in closed form from one singular value decomposition of the error part.
+b has no prior. sigma^2 is inverse gamma with few degrees of freedom around the told one; all scales
+s of a grid are weighed by their evidence. X is kept as the triangle of its QR decomposition, so that
+rows may come in pieces. All of it in closed form from one singular value decomposition.
 
 Reference: A. Gelman et al., Bayesian Data Analysis, 3rd ed., ch. 14; the evidence for s: D. MacKay,
 Bayesian interpolation, Neural Computation 4 (1992) 415-447.
@@ -32,8 +32,8 @@ VAGUE = 1e-9  # weight of a prior, as a share of the norm of a column, that is n
 class Posterior:
     """mean: of b and e, shape (p,). cov: in units of sigma^2, shape (p, p). noise_std: sigma.
 
-    scale: s. evidence: log-likelihood of the data with b, e and sigma integrated out, comparable
-    between fits of the same data.
+    scale: the most likely s. evidence: log-likelihood of the data with b, e and sigma integrated
+    out, comparable between fits of the same data.
     """
 
     mean: Array
@@ -100,10 +100,17 @@ class Triangle:
         evidence[:-1][scales[:-1] < least_scale * SAME] = -np.inf
         evidence[1:][scales[1:] > most_scale / SAME] = -np.inf
         best = int(np.argmax(evidence))
-        ratio, share, noise_var = float(ratios[best, 0]), shrink[best], float(left[best]) / freedom
+        share = np.exp(evidence - evidence[best])
+        share /= share.sum()
+        noise_var = float(share @ left) / freedom
+        # The mixture over all scales: its mean, its mean covariance, and that of its means.
+        means = ratios * s * shrink * z
+        mean = share @ means
+        within = share @ (ratios * shrink * (left / (freedom * noise_var))[:, None])
+        between = (means - mean) * np.sqrt(share / noise_var)[:, None]
         back = weights[:, None] * vt.T
-        e = back @ (ratio * s * share * z)
-        root = back * np.sqrt(ratio * share)
+        e = back @ mean
+        root = back @ np.concatenate([np.diag(np.sqrt(within)), between.T], axis=1)
         through = inverse @ r[:base, base:size]
         spread = through @ root
         cov = np.empty((size, size))

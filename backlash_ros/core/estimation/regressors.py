@@ -11,7 +11,7 @@ which the a_i are independent and of variance one a priori (error_model.py).
 
 An integrator of G that in truth leaks, 1/(1 - (1 - l) z^-1), adds -l sum y to first order.
 
-Columns, in this order: x0 (n), u0, m, m c_r, m c_l, a (K), l where G integrates, and once more K
+Columns, in this order: x0 (n), u0, m, m c_r, m c_l, l where G integrates, a (K), and once more K
 for the size of the first jump of p, which depends on the unknown start of p.
 """
 
@@ -44,9 +44,14 @@ class Layout(NamedTuple):
     jump: bool
 
     @property
-    def base(self) -> int:
-        """Number of unknowns without those of the error model: x0, u0, theta."""
+    def driven(self) -> int:
+        """Number of unknowns that make the state of G: x0, u0, theta."""
         return self.n + 4
+
+    @property
+    def base(self) -> int:
+        """Number of unknowns without those of the error model: the state and the leak."""
+        return self.driven + int(self.leak)
 
     @property
     def theta(self) -> slice:
@@ -54,14 +59,9 @@ class Layout(NamedTuple):
         return slice(self.n + 1, self.n + 4)
 
     @property
-    def leaks(self) -> int:
-        """Where the leak stands."""
-        return self.base + self.errors
-
-    @property
     def unknowns(self) -> int:
         """Number p of all unknowns."""
-        return self.base + self.errors * (2 if self.jump else 1) + int(self.leak)
+        return self.base + self.errors * (2 if self.jump else 1)
 
 
 class Regressors:
@@ -86,7 +86,7 @@ class Regressors:
         y: measured after each of them, nan where lost, shape (N,).
         """
         layout, n = self.layout, self.layout.n
-        count, base = len(labels.v_a), layout.base
+        count, base, driven = len(labels.v_a), layout.base, layout.driven
         signals = np.zeros((n + SIGNALS, count))
         signals[n], signals[n + 1] = labels.held, labels.v_a
         np.negative(labels.right, out=signals[n + 2])
@@ -99,15 +99,14 @@ class Regressors:
         answers = np.empty((n + SIGNALS, count))
         answers[:, :-1], answers[:, -1] = late[:, 1:], self._states[:, 0]
         rows = np.empty((count, layout.unknowns))
-        rows[:, :base] = answers[:base].T
+        rows[:, :driven] = answers[:driven].T
+        if layout.leak:
+            rows[:, driven] = self._leak(y)
         if layout.errors:
             spread, end = self._error.spread, base + layout.errors
-            rows[:, base:end] = self._errors.filtered(answers[base]) @ spread
-            if layout.leak:
-                rows[:, end] = self._leak(y)
-                end += 1
+            rows[:, base:end] = self._errors.filtered(answers[driven]) @ spread
             if layout.jump:
-                rows[:, end:] = self._jumps.filtered(answers[base + 1]) @ spread
+                rows[:, end:] = self._jumps.filtered(answers[driven + 1]) @ spread
         return rows
 
     def _leak(self, y: Array) -> Array:
@@ -124,4 +123,4 @@ class Regressors:
 
         It depends on x0, u0, m, m c_r, m c_l; the error model has no part in it.
         """
-        return np.asarray(self._model.to_state @ self._states[:self.layout.base].T)
+        return np.asarray(self._model.to_state @ self._states[:self.layout.driven].T)

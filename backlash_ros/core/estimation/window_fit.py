@@ -135,13 +135,15 @@ class WindowFit:
         return max(self._highest - self._lowest, 0.0)
 
     def _vague(self, y_reach: float, v_reach: float) -> Array:
-        """Weights of a prior so wide that it only keeps the triangle regular."""
+        """Weights of priors that are no information, and that of a leak."""
         n, layout = self.layout.n, self.layout
         weights = np.zeros(layout.unknowns)
         told_std = self.around.told_std
         weights[:n] = told_std / (FAR * (y_reach + told_std))
         unit = VAGUE * step_norm(self.model)
-        weights[n:layout.base] = unit
+        weights[n:layout.driven] = unit
+        if layout.leak:
+            weights[layout.driven] = told_std / self.around.error.leak
         weights[n + 1] = unit * (v_reach or 1.0)
         return weights
 
@@ -226,8 +228,6 @@ class WindowFit:
         """The solution for all samples so far."""
         layout, gap = self.layout, self.start.gap
         spreads: Array = np.ones(layout.errors)
-        if layout.leak:
-            spreads = np.append(spreads, self.around.error.leak / abs(self.slope))
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
@@ -266,8 +266,9 @@ class WindowFit:
         posterior = solution.posterior
         by = self._regressors.state_map()
         variance = posterior.noise_std**2 * solution.inflation
-        base = self.layout.base
-        return by @ posterior.mean[:base], by @ posterior.cov[:base, :base] @ by.T * variance
+        known = self.layout.driven
+        cov = by @ posterior.cov[:known, :known] @ by.T
+        return by @ posterior.mean[:known], cov * variance
 
     def plausible(self, solution: Solution) -> bool:
         """Whether the error of G is one that its prior with the largest scale expects."""
