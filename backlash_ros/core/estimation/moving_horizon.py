@@ -79,7 +79,7 @@ class MovingHorizon:
     ) -> None:
         self.estimate = replace(initial, status=Status.ACQUIRING)
         self.model = model
-        self.outliers = 0
+        self.outliers = self.failed_fits = 0
         self.innovation = nan
         self._adapting = True
         self._pace = Pace()
@@ -96,7 +96,6 @@ class MovingHorizon:
         self._covariance: Array | None = None
         self._paused = False  # whether samples are left out, as nothing moves
         self._record = Record(CAPACITY)
-        self._task: Task | None = None
         self._begin_acquisition(initial if initial.learned else None)
         # Of the play operator, once it is known.
         self._p = self._u = nan
@@ -110,6 +109,7 @@ class MovingHorizon:
 
     def _begin_acquisition(self, inherited: Estimate | None) -> None:
         """Look for the backlash afresh; inherited: what is believed unless the samples deny it."""
+        self._task: Task | None = None
         self._current: Fitted | None = None
         self._inherited = inherited
         self._candidate: Prior | None = None  # what the last search found
@@ -266,6 +266,12 @@ class MovingHorizon:
                 next(self._task)
             except StopIteration:
                 self._task = None
+            except np.linalg.LinAlgError:
+                # Samples that leave nothing but rounding: others may be better.
+                self.failed_fits += 1
+                self._record.forget_before(self._record.end)
+                self._begin_acquisition(self.estimate if self._known else None)
+                return
             if timed:
                 now = perf_counter()
                 self._pace.note(now - before, budget_s)
@@ -429,9 +435,13 @@ class MovingHorizon:
         result = yield from fitted(
             v, y, around, start.with_gap(solution.gap, v), solution.m, self._pace
         )
-        result, around = yield from with_better_model(
-            v, y, around, result, self._pace
-        )
+        result, around = yield from with_better_model(v, y, around, result, self._pace)
+        if len(v) <= SEARCHED and around.prior is None:
+            # The gap of a short record may be one of several.
+            other = yield from searched(v, y, self._around, self._widest, self._pace)
+            if other is not None and self._usable(other[0]) is not None \
+                    and _evidence(other[0]) > _evidence(result):
+                result, around = other
         self._install(result, around, first)
 
     def _halve(self) -> Task:
@@ -652,6 +662,10 @@ def _prior_of(estimate: Estimate) -> Prior:
     std = np.array([estimate.std_m, estimate.std_c_r, estimate.std_c_l])
     std = np.maximum(std, 1e-9 * np.array([m, c_r - c_l, c_r - c_l]))
     return Prior(np.array([m, m * c_r, m * c_l]), jacobian @ np.diag(std**2) @ jacobian.T)
+
+
+def _evidence(result: Fitted) -> float:
+    return result.solution.posterior.evidence
 
 
 def _contradicts(solution: Solution, other: Prior) -> bool:

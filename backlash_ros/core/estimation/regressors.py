@@ -32,6 +32,13 @@ Array = NDArray[np.float64]
 SIGNALS = 6  # that drive G: 1_H, v_a, -1_R, -1_L, p(k) - p(k-1), the first jump of p
 
 
+def held(y: Array, before: float) -> Array:
+    """y (N,) with what was lost replaced by the value before it."""
+    known = np.where(np.isfinite(y), np.arange(len(y)), -1)
+    np.maximum.accumulate(known, out=known)
+    return np.where(known < 0, before, y[known])
+
+
 class Layout(NamedTuple):
     """Where the unknowns stand.
 
@@ -111,9 +118,7 @@ class Regressors:
 
     def _leak(self, y: Array) -> Array:
         """Minus the sum of all y before, a lost one counting as the one before it."""
-        known = np.where(np.isfinite(y), np.arange(len(y)), -1)
-        np.maximum.accumulate(known, out=known)
-        filled = np.where(known < 0, self._y, y[known])
+        filled = held(y, self._y)
         before: Array = np.cumsum(np.append(self._sum + self._y, filled))
         self._sum, self._y = float(before[-2]), float(filled[-1])
         return -before[:-1]

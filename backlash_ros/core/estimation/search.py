@@ -19,6 +19,7 @@ from backlash_ros.core.estimation.constants import GAPS, NO_GAP, STARTS, ZOOM
 from backlash_ros.core.estimation.error_model import ErrorModel
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.regression import NOISE_WEIGHT, SCALES
+from backlash_ros.core.estimation.regressors import held
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -81,10 +82,13 @@ class _Comparison:
         states = np.zeros((n + 1, n))
         states[:n] = model.to_observer.T
         common = self._filtered(inputs, states)
+        if error.leak:
+            before = np.append(0.0, np.cumsum(held(y, 0.0))[:-1])
+            common = np.vstack([common, before[self._kept] * self._root])
         self._basis = np.linalg.qr(common.T)[0]
         self._y = self._projected((y[self._kept] * self._root)[None, :])[0]
         self._energy = float(self._y @ self._y)
-        self._freedom = self.rows - (n + 1) + NOISE_WEIGHT
+        self._freedom = self.rows - len(common) + NOISE_WEIGHT
         self._told = NOISE_WEIGHT * told_std**2
         self.null = float(self._log_likelihood(self._energy + self._told))
 

@@ -26,6 +26,7 @@ from backlash_ros.core.state_model import StateModel
 Array = NDArray[np.float64]
 
 FAR = 1e3  # prior of x0, in units of the largest output and of the noise
+LINEAR = 0.05  # scale of the error of G up to which the response is linear in it
 SETTLING = 64  # samples over which the size of a column is told
 
 
@@ -282,7 +283,7 @@ class WindowFit:
     def wants_another_model(self, solution: Solution) -> bool:
         """Whether the error of G is more than chance: then a G of low order may take it over."""
         layout, posterior = self.layout, solution.posterior
-        if posterior.scale == 0.0:
+        if posterior.scale < LINEAR:
             return False
         part = slice(layout.base, layout.base + layout.errors)
         error, cov = posterior.mean[part], posterior.cov[part, part] * posterior.noise_std**2
