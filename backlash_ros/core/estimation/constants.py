@@ -9,6 +9,8 @@ BLOCK_SHARE = 16  # ... and in between: one block for so many samples of the rec
 GROWTH = 1.4  # of the record, after which all of it is fitted anew
 MOVED = 0.5  # standard deviations of the gap after which all of it is fitted anew
 
+WALKS = (0.003, 0.01, 0.03, 0.1, 0.3)  # walks of u over the record, in m times the gap
+
 # --- the search
 FIRST_SEARCH = 20  # samples before the first search
 SEARCH_GROWTH = 1.25  # of the record between two searches, until there is an estimate

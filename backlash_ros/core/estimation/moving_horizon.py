@@ -52,6 +52,7 @@ from backlash_ros.core.estimation.relabelling import (
     fitted,
     searched,
     with_better_model,
+    with_walk,
 )
 from backlash_ros.core.estimation.window_fit import Around, Prior, Solution, Start, weights_of
 from backlash_ros.core.state_model import StateModel
@@ -313,7 +314,7 @@ class MovingHorizon:
         first = max(record.first, end - SEARCHED)
         record.forget_before(first)
         v, y = record.since(first)
-        around = self._around._replace(prior=None, most=inf)
+        around = self._around._replace(prior=None, most=inf, walk=0.0)
         found = yield from searched(v, y, around, self._widest, self._pace)
         if self._inherited is not None:
             half = len(v) // 2
@@ -350,7 +351,7 @@ class MovingHorizon:
         current = self._current
         # G is no worse known than it was: it does not explain whatever has happened.
         most = TOLD if current is None else current.solution.posterior.scale
-        alone = self._around._replace(prior=None, most=most)
+        alone = self._around._replace(prior=None, most=most, walk=0.0)
         around = alone._replace(prior=prior)
         gap = inherited.c_r - inherited.c_l
         start = Start(gap, float(v[0]) + 0.5 * gap)
@@ -436,6 +437,7 @@ class MovingHorizon:
             v, y, around, start.with_gap(solution.gap, v), solution.m, self._pace
         )
         result, around = yield from with_better_model(v, y, around, result, self._pace)
+        result, around = yield from with_walk(v, y, around, result, self._pace)
         if len(v) <= SEARCHED and around.prior is None:
             # The gap of a short record may be one of several.
             other = yield from searched(v, y, self._around, self._widest, self._pace)
@@ -458,7 +460,7 @@ class MovingHorizon:
         if half < RECOVERED:
             return
         v, y = record.since(record.first)
-        around = self._around._replace(prior=None, most=inf)
+        around = self._around._replace(prior=None, most=inf, walk=0.0)
         start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
         newer = yield from fitted(v[half:], y[half:], around, start, solution.m, self._pace)
         whole = Prior(solution.theta, np.zeros((3, 3)))
@@ -472,7 +474,7 @@ class MovingHorizon:
         current, since = self._current, self._contradicted_from
         assert current is not None
         assert since is not None
-        record, around = self._record, self._around._replace(prior=None, most=inf)
+        record, around = self._record, self._around._replace(prior=None, most=inf, walk=0.0)
         bound = AS_GOOD * current.solution.posterior.noise_std
         end = record.end
         self._next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])

@@ -70,6 +70,25 @@ class Triangle:
         rows[:, where] = root
         self.append(rows, root @ mean, 0.0)
 
+    def with_prior(self, where: slice, std: float, told_std: float) -> tuple[Triangle, float]:
+        """The same with independent priors of these unknowns, and what that adds to the evidence.
+
+        std: their deviation, around 0.
+        """
+        size = len(self.r) - 1
+        sigma = sqrt(
+            (float(self.r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2)
+            / (max(self.count - size, 0.0) + NOISE_WEIGHT)
+        )
+        count = where.stop - where.start
+        rows = np.zeros((count, size))
+        rows[:, where] = np.eye(count) * (sigma / std)
+        other = Triangle(np.zeros(size))
+        other.r, other.count = self.r, self.count
+        other.append(rows, np.zeros(count), 0.0)
+        known = np.abs(np.diag(other.r)[where])
+        return other, count * log(sigma / std) - float(np.log(known).sum())
+
     def posterior(
         self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,
         most_scale: float,

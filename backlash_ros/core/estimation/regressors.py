@@ -11,8 +11,11 @@ which the a_i are independent and of variance one a priori (error_model.py).
 
 An integrator of G that in truth leaks, 1/(1 - (1 - l) z^-1), adds -l sum y to first order.
 
-Columns, in this order: x0 (n), u0, m, m c_r, m c_l, l where G integrates, a (K), and once more K
-for the size of the first jump of p, which depends on the unknown start of p.
+A disturbance of u that walks is a sum of ramps, one after the other, with independent heights.
+
+Columns, in this order: x0 (n), u0, m, m c_r, m c_l, l where G integrates, the heights of the ramps
+where u walks, a (K), and once more K for the size of the first jump of p, which depends on the
+unknown start of p.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
 
+RAMPS = 12  # of a walk within a record
 SIGNALS = 6  # that drive G: 1_H, v_a, -1_R, -1_L, p(k) - p(k-1), the first jump of p
 
 
@@ -42,23 +46,31 @@ def held(y: Array, before: float) -> Array:
 class Layout(NamedTuple):
     """Where the unknowns stand.
 
-    n: order of G. errors: K. leak, jump: whether a leak and the first jump are there.
+    n: order of G. errors: K. leak, jump: whether a leak and the first jump are there. ramps: how
+    many there are.
     """
 
     n: int
     errors: int
     leak: bool
     jump: bool
+    ramps: int
 
     @property
     def driven(self) -> int:
-        """Number of unknowns that make the state of G: x0, u0, theta."""
+        """Number of unknowns that make the state of G without a walk: x0, u0, theta."""
         return self.n + 4
 
     @property
+    def walk(self) -> slice:
+        """Heights of the ramps."""
+        first = self.driven + int(self.leak)
+        return slice(first, first + self.ramps)
+
+    @property
     def base(self) -> int:
-        """Number of unknowns without those of the error model: the state and the leak."""
-        return self.driven + int(self.leak)
+        """Number of unknowns without those of the error model."""
+        return self.driven + int(self.leak) + self.ramps
 
     @property
     def theta(self) -> slice:
@@ -72,17 +84,23 @@ class Layout(NamedTuple):
 
 
 class Regressors:
-    """Makes the columns for samples that come in pieces, one piece after the other."""
+    """Makes the columns for samples that come in pieces, one piece after the other.
 
-    def __init__(self, model: StateModel, error: ErrorModel, jump: bool) -> None:
+    ramp: samples that each ramp of a walk takes, 0 where u does not walk.
+    """
+
+    def __init__(self, model: StateModel, error: ErrorModel, jump: bool, ramp: int = 0) -> None:
         n = model.order
-        self.layout = Layout(n, error.count, error.leak > 0.0, jump and error.count > 0)
+        self.layout = Layout(
+            n, error.count, error.leak > 0.0, jump and error.count > 0, RAMPS if ramp else 0
+        )
+        self._ramp, self._count = ramp, 0
         self._model, self._error = model, error
         transfer = model.transfer_function
         self._numerator, self._denominator = transfer.numerator, transfer.denominator
         # One filter for all: x0 are states, the others inputs. lfilter keeps the state of the
         # observer form.
-        self._states = np.zeros((n + SIGNALS, n))
+        self._states = np.zeros((n + SIGNALS + self.layout.ramps, n))
         self._states[:n] = model.to_observer.T
         self._errors, self._jumps = ErrorFilter(error), ErrorFilter(error)
         self._sum = self._y = 0.0  # of all y so far, and the newest one
@@ -94,21 +112,25 @@ class Regressors:
         """
         layout, n = self.layout, self.layout.n
         count, base, driven = len(labels.v_a), layout.base, layout.driven
-        signals = np.zeros((n + SIGNALS, count))
+        signals = np.zeros((len(self._states), count))
         signals[n], signals[n + 1] = labels.held, labels.v_a
         np.negative(labels.right, out=signals[n + 2])
         np.negative(labels.left, out=signals[n + 3])
         signals[n + 4], signals[n + 5] = labels.moves, labels.jump
+        if layout.ramps:
+            signals[n + SIGNALS:] = self.ramps(self._count, count)
+        self._count += count
         # A filter without direct feedthrough answers a sample late; its last state is the rest.
         late, self._states = lfilter(
             self._numerator, self._denominator, signals, zi=self._states
         )
-        answers = np.empty((n + SIGNALS, count))
+        answers = np.empty_like(signals)
         answers[:, :-1], answers[:, -1] = late[:, 1:], self._states[:, 0]
         rows = np.empty((count, layout.unknowns))
         rows[:, :driven] = answers[:driven].T
         if layout.leak:
             rows[:, driven] = self._leak(y)
+        rows[:, layout.walk] = answers[n + SIGNALS:].T
         if layout.errors:
             spread, end = self._error.spread, base + layout.errors
             rows[:, base:end] = self._errors.filtered(answers[driven]) @ spread
@@ -123,9 +145,24 @@ class Regressors:
         self._sum, self._y = float(before[-2]), float(filled[-1])
         return -before[:-1]
 
-    def state_map(self) -> Array:
-        """State of G after the samples so far in the coordinates of StateModel, shape (n, n + 4).
+    def ramps(self, first: int, count: int) -> Array:
+        """The ramps over so many samples from number `first` on, shape (ramps, count)."""
+        begins = self._ramp * np.arange(self.layout.ramps)[:, None]
+        samples = np.arange(first + 1, first + count + 1)
+        return np.asarray(np.clip((samples - begins) / max(self._ramp, 1), 0.0, 1.0))
 
-        It depends on x0, u0, m, m c_r, m c_l; the error model has no part in it.
+    @property
+    def heights(self) -> Array:
+        """How far each ramp has risen after the samples so far, shape (ramps,)."""
+        return self.ramps(self._count - 1, 1)[:, 0]
+
+    def state_map(self) -> Array:
+        """State of G after the samples so far in the coordinates of StateModel, shape (n, base).
+
+        The error model has no part in it.
         """
-        return np.asarray(self._model.to_state @ self._states[:self.layout.driven].T)
+        layout, to_state = self.layout, self._model.to_state
+        by = np.zeros((layout.n, layout.base))
+        by[:, :layout.driven] = to_state @ self._states[:layout.driven].T
+        by[:, layout.walk] = to_state @ self._states[layout.n + SIGNALS:].T
+        return by

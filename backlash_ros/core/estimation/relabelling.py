@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED
+from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED, GROWTH, NO_GAP, WALKS
 from backlash_ros.core.estimation.low_order import OutputError, low_order
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.search import Candidate, search
@@ -54,7 +54,7 @@ def fitted(
     reach = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
     best: Fitted | None = None
     for _ in range(ITERATIONS):
-        fit = WindowFit(around, start, slope, reach)
+        fit = WindowFit(around, start, slope, reach, int(GROWTH * len(v)))
         while fit.length < len(v):
             part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
             fit.take(fit.columns(v[part], y[part]), y[part], weights[part])
@@ -143,6 +143,30 @@ def with_better_model(
         if gained < around.error.count:
             break
     return result, around
+
+
+def with_walk(
+    v: Array, y: Array, around: Around, result: Fitted, pace: Pace,
+) -> Generator[None, None, tuple[Fitted, Around]]:
+    """Let a disturbance of u walk where the residual hints at it and the evidence is for it."""
+    solution = result.solution
+    if not solution.m > 0.0 or (solution.correlation == 0.0 and around.walk == 0.0):
+        return result, around
+    start = result.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
+    still = around._replace(walk=0.0)
+    if around.walk > 0.0:
+        result = yield from fitted(v, y, still, start, solution.m, pace)
+    size = solution.m * max(solution.gap, NO_GAP * result.fit.swing)
+    tried = still._replace(walk=size)
+    walking = yield from fitted(v, y, tried, start, solution.m, pace)
+    evidence = [
+        walking.fit.solve(share * size).posterior.evidence for share in WALKS
+    ]
+    best = int(np.argmax(evidence))
+    if evidence[best] <= result.solution.posterior.evidence:
+        return result, still
+    around = still._replace(walk=WALKS[best] * size)
+    return (yield from fitted(v, y, around, walking.fit.start, solution.m, pace)), around
 
 
 def _allowed(model: TransferFunction) -> bool:

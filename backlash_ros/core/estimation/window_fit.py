@@ -7,7 +7,7 @@ gap, so that labels made anew with it are a Gauss-Newton step (relabelling.py).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import inf, sqrt
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from backlash_ros.core.estimation.crossings import Crossings, crossings_of
 from backlash_ros.core.estimation.error_model import ErrorModel
 from backlash_ros.core.estimation.play import Labels, labels_of
 from backlash_ros.core.estimation.regression import VAGUE, Posterior, Triangle
-from backlash_ros.core.estimation.regressors import Regressors
+from backlash_ros.core.estimation.regressors import RAMPS, Regressors
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -63,7 +63,8 @@ class Around(NamedTuple):
 
     model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that
     of the error of the G that was told, once this one was moved to where the data want it: it is no
-    better known for that. most: largest scale that is believed.
+    better known for that. most: largest scale that is believed. walk: deviation by which a
+    disturbance of u walks over the record [unit of u], 0 for none.
     """
 
     model: StateModel
@@ -72,6 +73,7 @@ class Around(NamedTuple):
     prior: Prior | None = None
     scale: float = 0.0
     most: float = inf
+    walk: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -109,15 +111,18 @@ class Solution:
 class WindowFit:
     """Takes in samples and solves for all unknowns.
 
-    slope: about m, for the prior of the error of G. reach: largest |y| and |v|.
+    slope: about m, for the prior of the error of G. reach: largest |y| and |v|. samples: how many
+    are expected, for a walk.
     """
 
     def __init__(
         self, around: Around, start: Start, slope: float, reach: tuple[float, float],
+        samples: int = 0,
     ) -> None:
         self.around, self.start, self.slope, self.reach = around, start, slope, reach
         self.model = around.model
-        self._regressors = Regressors(around.model, around.error, jump=start.side == 0)
+        ramp = -(-samples // RAMPS) if around.walk > 0.0 else 0
+        self._regressors = Regressors(around.model, around.error, start.side == 0, ramp)
         self.layout = self._regressors.layout
         self.length = 0  # samples
         self.reversals = 0
@@ -146,6 +151,7 @@ class WindowFit:
         if layout.leak:
             weights[layout.driven] = told_std / self.around.error.leak
         weights[n + 1] = unit * (v_reach or 1.0)
+        weights[layout.walk] = unit
         return weights
 
     def columns(self, v: Array, y: Array) -> Array:
@@ -225,17 +231,22 @@ class WindowFit:
         motion = sqrt(solution.correlation) * solution.rms
         return motion / scale if scale > 0.0 else inf
 
-    def solve(self) -> Solution:
-        """The solution for all samples so far."""
+    def solve(self, walk: float | None = None) -> Solution:
+        """The solution for all samples so far. walk: instead of that of `around`."""
         layout, gap = self.layout, self.start.gap
         spreads: Array = np.ones(layout.errors)
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
-        posterior = self._triangle.posterior(
+        triangle, offset = self._triangle, 0.0
+        if layout.ramps:
+            step = (walk or self.around.walk) / sqrt(layout.ramps)
+            triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
+        posterior = triangle.posterior(
             layout.base, self.slope, spreads, self.around.told_std, self.around.scale,
             self.around.most,
         )
+        posterior = replace(posterior, evidence=posterior.evidence + offset)
         residual = self.residual(posterior)
         squares = float(residual @ residual)
         count = self._triangle.count
@@ -244,18 +255,27 @@ class WindowFit:
             lag = float(residual[1:] @ residual[:-1]) / squares
             correlation = max(0.0, lag - 3.0 / sqrt(count))
         inflation = 1.0 - correlation + count * correlation
-        theta = posterior.mean[layout.theta]
-        cov = posterior.cov[layout.theta, layout.theta] * (posterior.noise_std**2 * inflation)
+        now = self._theta_now()
+        theta = now @ posterior.mean
+        cov = now @ posterior.cov @ now.T * (posterior.noise_std**2 * inflation)
         m = float(theta[0])
         held = float(posterior.mean[layout.n])
         start = self.start.p
         if self.start.side == 0 and m != 0.0:
-            start = (held + float(theta[1])) / m
+            start = (held + float(posterior.mean[layout.n + 2])) / m
         return Solution(
             posterior, theta, cov, crossings_of(theta, cov),
             float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
             inflation, sqrt(squares / max(count, 1.0)),
         )
+
+    def _theta_now(self) -> Array:
+        """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""
+        layout = self.layout
+        now = np.zeros((3, layout.unknowns))
+        now[:, layout.theta] = np.eye(3)
+        now[1:, layout.walk] = -self._regressors.heights
+        return now
 
     def residual(self, posterior: Posterior, since: int = 0) -> Array:
         """Weighted y minus its fit from sample `since` on; 0 where y was lost."""
@@ -267,7 +287,7 @@ class WindowFit:
         posterior = solution.posterior
         by = self._regressors.state_map()
         variance = posterior.noise_std**2 * solution.inflation
-        known = self.layout.driven
+        known = self.layout.base
         cov = by @ posterior.cov[:known, :known] @ by.T
         return by @ posterior.mean[:known], cov * variance
 
@@ -293,9 +313,11 @@ class WindowFit:
         """u as the fit has it, shape (N,). v: the samples taken in."""
         start, n = self.start, self.layout.n
         labels = labels_of(v, start.gap, start.p, start.side, start.v_a)
-        held, m, right, left = solution.posterior.mean[n:n + 4]
+        mean = solution.posterior.mean
+        held, m, right, left = mean[n:n + 4]
+        walked = mean[self.layout.walk] @ self._regressors.ramps(0, len(v))
         return np.asarray(
-            labels.held * held + labels.v_a * m - labels.right * right - labels.left * left
+            labels.held * held + labels.v_a * m - labels.right * right - labels.left * left + walked
         )
 
 
