@@ -86,6 +86,7 @@ class MovingHorizon:
         self._pace = Pace()
         self._bounds = bounds
         self._drift = np.array(drift_std) * sample_period**0.5
+        self._drifts = any(drift_std)
         self._told = model
         self._around = Around(
             model, build_error_model(model, uncertainty), max(noise_std, SMALLEST_NOISE)
@@ -189,7 +190,7 @@ class MovingHorizon:
     def set_noise(self, noise_std: float, drift_std: Array) -> None:
         """Take another first guess of the noise; whatever was learned stays."""
         self._around = self._around._replace(told_std=max(noise_std, SMALLEST_NOISE))
-        self._drift = drift_std
+        self._drift, self._drifts = drift_std, bool(drift_std.any())
 
     # --- at every sample ------------------------------------------------------------------------
 
@@ -301,7 +302,7 @@ class MovingHorizon:
         if abs(solution.gap - current.fit.start.gap) > MOVED * solution.std_gap \
                 and length >= self._moved_at:
             return self._refit()
-        aged = solution.correlation > 0.0 or self._drifted_away(solution, length)
+        aged = solution.correlation > 0.0 or self._drifts_more(solution, length)
         if aged and record.end >= self._next_try:
             return self._halve()
         return None
@@ -457,7 +458,7 @@ class MovingHorizon:
         fit, solution = current
         self._next_try = record.end + max(fit.length // 4, BLOCK[1])
         half = fit.length // 2
-        if half < RECOVERED:
+        if half < BLOCK[1]:
             return
         v, y = record.since(record.first)
         around = self._around._replace(prior=None, most=inf, walk=0.0)
@@ -465,7 +466,7 @@ class MovingHorizon:
         newer = yield from fitted(v[half:], y[half:], around, start, solution.m, self._pace)
         whole = Prior(solution.theta, np.zeros((3, 3)))
         if self._usable(newer, REPLACING) is not None and (
-            _contradicts(newer.solution, whole) or self._drifted_away(newer.solution, half)
+            _contradicts(newer.solution, whole) or self._drifts_more(newer.solution, half)
         ):
             self._install(newer, around, record.first + half)
 
@@ -549,6 +550,8 @@ class MovingHorizon:
     def _publish(self) -> None:
         assert self._current is not None
         found = self._usable(self._current)
+        if found is not None and self._too_early(self._current, found):
+            found = None
         if found is None:
             self._reason = Status.INCONSISTENT
             if self._observer is None:
@@ -564,6 +567,16 @@ class MovingHorizon:
                 self.estimate.status,
             )
         self._follow_state()
+
+    def _too_early(self, result: Fitted, found: Crossings) -> bool:
+        """Whether a short record, begun after a change of the plant, is still worse than nothing.
+
+        A rough estimate is better than none, but not than one that held.
+        """
+        if result.fit.length >= UNDECIDED or self._covariance is None:
+            return False
+        wider = np.any(np.diag(found.cov) > np.diag(self._covariance))
+        return bool(wider) and self._usable(result, REPLACING) is None
 
     def _follow_state(self) -> None:
         """Let play operator and observer stand where the fit says that the plant stands."""
@@ -626,10 +639,10 @@ class MovingHorizon:
         else:
             self._reason = Status.ACQUIRING
 
-    def _drifted_away(self, solution: Solution, samples: int) -> bool:
-        """Whether the mean drift over so many samples is more than what is not known anyway."""
+    def _drifts_more(self, solution: Solution, samples: int) -> bool:
+        """Whether drift over so many samples is more than the noise leaves unknown."""
         found = solution.crossings
-        if found is None or not self._drift.any():
+        if found is None or not self._drifts:
             return False
         return bool(np.any(self._drift**2 * (samples / 3.0) > np.diag(found.cov)))
 
