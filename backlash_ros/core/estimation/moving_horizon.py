@@ -458,7 +458,7 @@ class MovingHorizon:
         fit, solution = current
         self._next_try = record.end + max(fit.length // 4, BLOCK[1])
         half = fit.length // 2
-        if half < BLOCK[1]:
+        if half < RECOVERED:
             return
         v, y = record.since(record.first)
         around = self._around._replace(prior=None, most=inf, walk=0.0)
@@ -642,7 +642,7 @@ class MovingHorizon:
     def _drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""
         found = solution.crossings
-        if found is None or not self._drifts:
+        if found is None or not self._drifts or samples < BLOCK[1]:
             return False
         return bool(np.any(self._drift**2 * (samples / 3.0) > np.diag(found.cov)))
 
