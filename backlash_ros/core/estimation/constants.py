@@ -10,6 +10,7 @@ GROWTH = 1.4  # of the record, after which all of it is fitted anew
 MOVED = 0.5  # standard deviations of the gap after which all of it is fitted anew
 
 WALKS = (0.003, 0.01, 0.03, 0.1, 0.3)  # walks of u over the record, in m times the gap
+SLOW = 100  # samples that u takes at least to walk: what is faster is motion
 
 # --- the search
 FIRST_SEARCH = 20  # samples before the first search

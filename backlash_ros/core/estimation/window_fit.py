@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import GATE
+from backlash_ros.core.estimation.constants import GATE, SLOW
 from backlash_ros.core.estimation.crossings import Crossings, crossings_of
 from backlash_ros.core.estimation.error_model import ErrorModel
 from backlash_ros.core.estimation.play import Labels, labels_of
@@ -121,7 +121,7 @@ class WindowFit:
     ) -> None:
         self.around, self.start, self.slope, self.reach = around, start, slope, reach
         self.model = around.model
-        ramp = -(-samples // RAMPS) if around.walk > 0.0 else 0
+        ramp = max(-(-samples // RAMPS), SLOW) if around.walk > 0.0 else 0
         self._regressors = Regressors(around.model, around.error, start.side == 0, ramp)
         self.layout = self._regressors.layout
         self.length = 0  # samples
