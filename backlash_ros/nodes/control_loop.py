@@ -81,7 +81,7 @@ class ControlLoop:
     def take_reference(self, y_m: float) -> bool:
         """Take in a reference; an absurd one is counted and the last one holds."""
         if not plausible(y_m):
-            self.statistics.dropped += 1
+            self.statistics.note_bad_reference()
             return False
         self.y_m = y_m
         return True
@@ -100,6 +100,7 @@ class ControlLoop:
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """The same for a sample that was counted already, with the reference that belongs to it."""
         statistics = self.statistics
+        statistics.note_arrival(output.stamp_ns)
         if not arrival.is_sample:
             statistics.extra += 1
             return None
@@ -107,7 +108,7 @@ class ControlLoop:
         self._note_missing(arrival)
         if not plausible(output.y):
             # A sensor that has nothing to say is as good as silent.
-            statistics.dropped += 1
+            statistics.note_bad_output()
             self._missing += 1
             return None
         self.heard_at = time.monotonic()
@@ -119,7 +120,7 @@ class ControlLoop:
         step = self._step_core(output.y, y_m, output.stamp_ns)
         self.send(step.v)
         statistics.note(
-            step.v, self.core.inverse.limited, (time.time_ns() - output.sent_ns) * 1e-9
+            output.y, step.v, self.core.inverse.limited, (time.time_ns() - output.sent_ns) * 1e-9
         )
         self.last = step
         return step

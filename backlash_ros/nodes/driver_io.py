@@ -73,6 +73,12 @@ class DriverIo:
         self._publisher: Publisher | None = None
 
     @property
+    def publisher(self) -> Publisher:
+        """That of v, once it is advertised."""
+        assert self._publisher is not None
+        return self._publisher
+
+    @property
     def listeners(self) -> int:
         """How many subscribers v has."""
         return 0 if self._publisher is None else self._publisher.get_subscription_count()
@@ -129,8 +135,7 @@ class DriverIo:
 
     def wait_until_received(self, timeout_s: float) -> None:
         """Wait until the driver has confirmed the newest v, or the timeout is over."""
-        assert self._publisher is not None
-        self._publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
+        self.publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
 
     def _row(self, names: list[str], count: int) -> int:
         """Row of the joint, -1 where it is missing."""

@@ -48,6 +48,12 @@ class ReferenceNode(ProcessNode):
             self._sample_period, begins_with_output=listeners > 0, now_s=time.monotonic(),
             own_clock=not self._io.simulated_time,
         )
+        name = self.resolve_topic_name
+        self.log.info(
+            f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
+            f'{p.word("waveform")}, sample_period {self._sample_period:g} s'
+            + (f'; waits for {listeners} subscribers of {topics.REFERENCE}' if listeners else '')
+        )
         self.call_when(
             lambda: self._output.get_subscription_count() >= listeners, self._start,
             f'{listeners} subscribers of {topics.REFERENCE}',
