@@ -92,12 +92,10 @@ def test_each_cause_is_one_line_in_the_terminal_and_in_the_diagnostics(tmp_path:
             )
             terminal.send_until(None, 'no plant_output for 0.3 s: is the driver running?')
         texts = terminal.texts()
-        log = controller.stderr
         assert controller.stop() == 0
     assert max(map(len, texts)) <= LONGEST_TEXT
     for cause in ('sent as Float32', 'best effort', '(100 Hz)', 'no finite', 'no plant_output'):
         assert any(cause in text for text in texts)
-        assert log.count(cause) <= 1 + (cause == '(100 Hz)')  # in the first line as well
 
 
 def test_every_node_says_what_it_is_about_and_the_recorder_what_it_has_recorded(
