@@ -31,6 +31,7 @@ from backlash_ros.loopback import prefer_loopback
 from backlash_ros.nodes.declare import declare_parameters
 from backlash_ros.nodes.goodbye import exit_at_the_latest
 from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.unused_sections import complaints
 from backlash_ros.stale_ports import remove_stale_ports
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
@@ -146,6 +147,10 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
             node = make_node()
         except (ParameterError, NameValidationException) as error:
             return _refuse(executable, str(error))
+        for complaint in complaints(
+            sys.argv[1:] if args is None else args, executable, node.get_fully_qualified_name()
+        ):
+            node.log.warning(complaint)
         signals.stop_at_arrival(node)
         code = FAILED  # unless the work comes to its end
         try:
