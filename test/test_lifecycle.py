@@ -178,6 +178,15 @@ def test_estimates_are_saved_on_request_or_the_reason_is_told(tmp_path: Path) ->
         assert nowhere.stop() == 0
 
 
+def test_saving_without_a_file_says_what_to_do(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        answer = Asked(driver).trigger('save_estimates')
+        assert not answer.success
+        assert 'start with -p estimates.file:=PATH, or set it while unconfigured' in answer.message
+        assert controller.stop() == 0
+
+
 def another(world: RosWorld, file: str) -> tuple[Any, PacedDriver]:
     return controller_and_driver(world, **{'estimates.file': file, 'estimates.save_period': 0.0})
 

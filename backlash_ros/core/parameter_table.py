@@ -235,3 +235,16 @@ PARAMETERS: tuple[Parameter, ...] = (
 )
 
 BY_NAME: dict[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def as_yaml(value: Value) -> str:
+    """A value as it stands in a YAML file or after -p NAME:=."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return '[' + ', '.join(map(as_yaml, value)) + ']'
+    if isinstance(value, str):
+        return value or "''"
+    if abs(value) == inf:
+        return '.inf' if value > 0 else '-.inf'
+    return f'{value:g}' if isinstance(value, float) and value == float(f'{value:g}') else str(value)

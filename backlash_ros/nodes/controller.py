@@ -87,8 +87,12 @@ class ControllerNode(ManagedNode):
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._to_zero: Timer | None = None  # sends the commands of on_timeout
         self._io.advertise()
-        self._signals = LabelledArrayPublisher(self, topics.SIGNALS, topics.SIGNAL_LABELS)
-        self._estimates = LabelledArrayPublisher(self, topics.ESTIMATES, topics.ESTIMATE_LABELS)
+        self._signals = LabelledArrayPublisher(
+            self, topics.of_node(topics.SIGNALS), topics.SIGNAL_LABELS
+        )
+        self._estimates = LabelledArrayPublisher(
+            self, topics.of_node(topics.ESTIMATES), topics.ESTIMATE_LABELS
+        )
         self._diagnostics = DiagnosticsPublisher(
             self, p.word('io.joint') or self._io.publisher.topic_name
         )

@@ -71,7 +71,9 @@ class PlantNode(ProcessNode):
         self._output_message, self._applied_message = Float64(), Float64()
         self._applied = self.create_publisher(Float64, topics.APPLIED_CONTROL, DEPTH)
         self._output = self.create_publisher(Float64, topics.PLANT_OUTPUT, DEPTH)
-        self._truth = LabelledArrayPublisher(self, topics.TRUTH, topics.TRUTH_LABELS)
+        self._truth = LabelledArrayPublisher(
+            self, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
+        )
         self._diagnostics = DiagnosticsPublisher(self, 'simulated plant')
         if self._lockstep:
             self._time = self.create_publisher(Clock, topics.CLOCK, KEPT)

@@ -26,7 +26,7 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.parameter_table import PARAMETERS
+from backlash_ros.core.parameter_table import PARAMETERS, as_yaml
 from backlash_ros.loopback import prefer_loopback
 from backlash_ros.nodes.declare import declare_parameters
 from backlash_ros.nodes.goodbye import exit_at_the_latest
@@ -140,7 +140,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
     if reason:
         return _refuse(executable, reason)
     try:
-        _parse_plain_arguments(executable, args)
+        _parse_plain_arguments(executable, make_node, args)
         for line in remove_stale_ports():
             print(f'{executable}: {line}', file=sys.stderr)
         try:
@@ -209,17 +209,25 @@ class _Parser(argparse.ArgumentParser):
                              '--ros-args -p NAME:=VALUE or --params-file FILE\n')
 
 
-def _parse_plain_arguments(executable: str, args: list[str] | None) -> None:
+def _parse_plain_arguments(
+    executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None,
+) -> None:
     """Refuse what is no argument of ROS; print help where asked for."""
     parser = _Parser(
         prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
-        description='Parameters:', formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog='\n'.join(
-            f'  {p.name} ({p.default}): {p.description}' for p in PARAMETERS
-            if executable in p.used_by
-        ),
+        description=sys.modules[make_node.__module__].__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter, epilog=_parameter_help(executable),
     )
     parser.parse_args(remove_ros_args(sys.argv[1:] if args is None else args))
+
+
+def _parameter_help(executable: str) -> str:
+    used = [p for p in PARAMETERS if executable in p.used_by]
+    return 'parameters, with their defaults (* may change in a running node):\n' + '\n'.join(
+        f'{"*" if p.live else " "} {p.name}: {as_yaml(p.default)}\n      {p.description}'
+        + (f' [{p.unit}]' if p.unit else '')
+        + (f' (one of {", ".join(p.choices)})' if p.choices else '') for p in used
+    )
 
 
 def _initialise(args: list[str] | None) -> str:
