@@ -31,15 +31,16 @@ class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
-    learned before. v: the newest command. silent: the driver was given up for the time being.
+    learned before. counter: goes on counting where another loop has ended. v: the newest command.
+    silent: the driver was given up for the time being.
     """
 
     def __init__(
         self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
-        inherited: Estimate | None,
+        inherited: Estimate | None, counter: SampleCounter,
     ) -> None:
         self.statistics = LoopStatistics()
-        self.counter = SampleCounter(p.real('sample_period'))
+        self.counter = counter
         self.commands = CommandHistory(p.real('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
         self.v = 0.0
@@ -168,7 +169,8 @@ class ControlLoop:
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
         self._anew = self._anew or arrival.anew
-        if not (self.silent or arrival.anew):
+        # What came before the first sample that is used was not lost: nobody listened.
+        if self._begun and not (self.silent or arrival.anew):
             self.statistics.lost += arrival.missing
             self.statistics.unsent += arrival.unsent
 

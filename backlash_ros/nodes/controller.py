@@ -41,6 +41,7 @@ from backlash_ros.nodes.messages import (
     LabelledArrayPublisher,
     stamp_ns_of,
 )
+from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import run
 
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -78,6 +79,11 @@ class ControllerNode(ManagedNode):
         self._period_ns = p.real('sample_period') * 1e9
         self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
+        # Whoever waits for the others begins with them; who does not may have been started anew.
+        self._counter = SampleCounter(
+            p.real('sample_period'),
+            from_zero=not self._lockstep and p.integer('wait_for_subscribers') > 0,
+        )
         self._saver = EstimateSaver(p.word('estimates.file'))
         self._saved_at = time.monotonic()
         self._queues: tuple[deque[Any], deque[Any], deque[Any]] = (deque(), deque(), deque())
@@ -142,7 +148,7 @@ class ControllerNode(ManagedNode):
     def configure(self) -> None:
         p = self._live.parameters
         inherited = load_estimate(p)
-        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited)
+        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited, self._counter)
         if inherited is not None:
             self.log.info(
                 f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
