@@ -14,7 +14,8 @@ Made from [parameter_table.py](../backlash_ros/core/parameter_table.py) by `make
 The nodes, `bringup` and `simulate` all read one YAML file:
 [paper_example.yaml](../config/paper_example.yaml) shows every group.
 `y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in
-a running node.
+a running node; all others of `controller`, but for `io.*`, `lockstep`, `autostart`,
+`wait_for_subscribers` and `estimator.use_applied_control`, while it is unconfigured.
 
 | name | default | unit | allowed | meaning | used by |
 |---|---|---|---|---|---|

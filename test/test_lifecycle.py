@@ -220,3 +220,36 @@ def test_live_parameters_change_together_or_not_at_all(tmp_path: Path) -> None:
         assert not refused.successful
         driver.run_until_known(0.05)
         assert controller.stop() == 0
+
+
+def test_all_but_the_interface_may_change_while_unconfigured(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {'autostart': False, 'sample_period': 0.5})
+        driver = PacedDriver(world.probe())
+        asked = Asked(driver)
+
+        def set_parameter(name: str, value: object) -> Any:
+            request = SetParametersAtomically.Request(
+                parameters=[Parameter(name, value=value).to_parameter_msg()]
+            )
+            return asked('set_parameters_atomically', SetParametersAtomically, request).result
+
+        assert set_parameter('sample_period', 0.01).successful
+        assert set_parameter('estimator.output_noise_std', 1e-3).successful
+        assert set_parameter('estimator.initial.m', 1.0).successful
+        assert set_parameter('estimates.file', str(file)).successful
+        refused = set_parameter('estimator.initial.c_r', 1e9)
+        assert 'must lie within' in refused.reason
+        assert 'read-only' in set_parameter('io.style', 'ros2_control').reason
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            assert asked.change(transition)
+        refused = set_parameter('sample_period', 0.02)
+        assert not refused.successful
+        assert 'is read-only while the node is configured: deactivate' in refused.reason
+        driver.run_until(lambda: driver.estimates, 'estimates')
+        assert driver.estimates[0].data[0] == 1.0
+        driver.learn()
+        assert asked.trigger('save_estimates').success
+        assert file.exists()
+        assert controller.stop() == 0

@@ -75,14 +75,11 @@ class ControllerNode(ManagedNode):
             self.log.warning(warning)
         self.loop: ControlLoop | None = None  # None while unconfigured
         self._lockstep = p.flag('lockstep')
-        self._give_way = GIVE_WAY * p.real('sample_period')
-        self._period_ns = p.real('sample_period') * 1e9
         self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
         # Whoever waits for the others begins with them; who does not may have been started anew.
-        self._counter = SampleCounter(
-            p.real('sample_period'),
-            from_zero=not self._lockstep and p.integer('wait_for_subscribers') > 0,
+        self._set_up(
+            p, from_zero=not self._lockstep and p.integer('wait_for_subscribers') > 0
         )
         self._saver = EstimateSaver(p.word('estimates.file'))
         self._saved_at = time.monotonic()
@@ -115,7 +112,9 @@ class ControllerNode(ManagedNode):
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         offer_services(self, self)
-        self._live = LiveParameters(self, p, build_controller, self._take_up)
+        self._live = LiveParameters(
+            self, p, build_controller, self._take_up, lambda: self.loop is None
+        )
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         if not self._lockstep:
             self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
@@ -300,8 +299,19 @@ class ControllerNode(ManagedNode):
         ))
 
     def _take_up(self, p: Parameters) -> None:
+        before, self.settings = self.settings, p
         if self.loop is not None:
             self.loop.take_up(p)
+            return
+        self._saver.file = p.word('estimates.file')
+        if p['sample_period'] != before['sample_period']:
+            self._set_up(p, from_zero=False)
+
+    def _set_up(self, p: Parameters, from_zero: bool) -> None:
+        """Take up what follows from the sample period."""
+        period = p.real('sample_period')
+        self._give_way, self._period_ns = GIVE_WAY * period, period * 1e9
+        self._counter = SampleCounter(period, from_zero)
 
     def _look_for_silence(self) -> None:
         loop = self.loop

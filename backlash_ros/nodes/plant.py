@@ -14,7 +14,9 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameter_table import PLANT
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.causes import TROUBLE, Finding, Level
+from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.loop_statistics import Lately
 from backlash_ros.nodes.messages import (
@@ -78,6 +80,7 @@ class PlantNode(ProcessNode):
         if self._lockstep:
             self._time = self.create_publisher(Clock, topics.CLOCK, KEPT)
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
+        LiveParameters(self, p, build_plant, self._take_up)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         name, outputs = self.resolve_topic_name, topics.PLANT_OUTPUT
         self.log.info(
@@ -104,6 +107,11 @@ class PlantNode(ProcessNode):
         self.log.info(
             f'{self._plant.sample} samples' + (f', {counts}' if counts else '')
         )
+
+    def _take_up(self, p: Parameters) -> None:
+        plant = build_plant(p)
+        plant.go_on_from(self._plant)
+        self._plant, self._loss = plant, p.real('output_loss')
 
     def _has_listeners(self) -> bool:
         wanted = self.settings.integer('wait_for_subscribers')

@@ -11,6 +11,9 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.parameter_table import REFERENCE
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.reference_signal import PERIODIC
+from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
@@ -34,6 +37,8 @@ class ReferenceNode(ProcessNode):
         super().__init__(REFERENCE)
         p = self.settings
         self._signal = build_reference(p)
+        self._offset_s = 0.0  # keeps the phase where the frequency changes
+        self._newest = 0  # sample that was published last
         self._sample_period = p.real('sample_period')
         self._lockstep = p.flag('lockstep')
         self._started = False
@@ -48,6 +53,7 @@ class ReferenceNode(ProcessNode):
             self._sample_period, begins_with_output=listeners > 0, now_s=time.monotonic(),
             own_clock=not self._io.simulated_time,
         )
+        LiveParameters(self, p, build_reference, self._take_up)
         name = self.resolve_topic_name
         self.log.info(
             f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
@@ -92,6 +98,16 @@ class ReferenceNode(ProcessNode):
                 # It is late, and y_m leaves as soon as it is there.
                 executor.spin_once(timeout_sec=min(remaining, LONGEST_SLEEP_S))
 
+    def _take_up(self, p: Parameters) -> None:
+        """Use another signal from the next sample on; a sine goes on without a jump."""
+        before, self._signal = self._signal, build_reference(p)
+        if self._signal.waveform in PERIODIC:
+            t = self._newest * self._sample_period
+            phase = before.frequency * (t + self._offset_s)
+            self._offset_s = phase / self._signal.frequency - t
+        else:
+            self._offset_s = 0.0
+
     def _start(self) -> None:
         self._started = True
         if self._lockstep:
@@ -109,7 +125,8 @@ class ReferenceNode(ProcessNode):
 
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.
-        self._message.data = self._signal(sample * self._sample_period)
+        self._newest = sample
+        self._message.data = self._signal(sample * self._sample_period + self._offset_s)
         self._output.publish(self._message)
 
 

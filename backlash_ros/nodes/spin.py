@@ -46,8 +46,13 @@ NAP_NS = 3_000_000
 class ProcessNode(Node):
     """A node that is the purpose of its process: parameters checked, then work until stopped."""
 
-    def __init__(self, executable: str, parameters_of: str = '') -> None:
-        """parameters_of: the executable whose parameters it reads. Raises ParameterError."""
+    def __init__(
+        self, executable: str, parameters_of: str = '', reconfigurable: bool = False,
+    ) -> None:
+        """parameters_of: the executable whose parameters it reads. Raises ParameterError.
+
+        reconfigurable: whether parameters may change while the node is unconfigured.
+        """
         try:
             super().__init__(executable, automatically_declare_parameters_from_overrides=True)
         except ValueError:
@@ -55,7 +60,9 @@ class ProcessNode(Node):
                 executable, None, 'has a parameter without a value', 'give it one or leave it out'
             ) from None
         self.log = Node.get_logger(self)
-        self.settings = declare_parameters(self, parameters_of or executable)
+        self.settings = declare_parameters(
+            self, parameters_of or executable, reconfigurable
+        )
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.stopping = False
         self.exit_code = DONE
