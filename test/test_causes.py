@@ -25,8 +25,8 @@ DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
 WELL = LoopFigures(
     0.005, TopicFigures('plant_output', peers=(DRIVER,)),
     TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
-    TopicFigures('control', peers=(DRIVER,)), status=Status.TRACKING, intervals_s=(0.005, 0.005),
-    used=600,
+    TopicFigures('control', peers=(DRIVER,)), status=Status.TRACKING,
+    intervals_s=(0.005, 0.005, 0.005), used=600,
 )
 INCONSISTENT = replace(WELL, status=Status.INCONSISTENT)
 
@@ -40,9 +40,9 @@ def reference_from(*peers: Peer) -> TopicFigures:
 
 
 CASES: list[tuple[dict[str, Any], Level, str]] = [
-    ({'intervals_s': (0.02, 0.02)}, Level.WARN,
+    ({'intervals_s': (0.02, 0.02, 0.02)}, Level.WARN,
      'plant_output comes at 50 Hz, sample_period is 0.005 s (200 Hz): correct one of them'),
-    ({'intervals_s': (0.0025, 0.0026)}, Level.WARN, 'plant_output comes at 385 Hz'),
+    ({'intervals_s': (0.0001, 0.0025, 0.0026)}, Level.WARN, 'plant_output comes at 400 Hz'),
     ({'late': 60}, Level.WARN, '10 % of control came too late: relieve the machine'),
     ({'lost': 66}, Level.WARN, '9.91 % of plant_output was lost on its way'),
     ({'lost': 66, 'unsent': 66}, Level.WARN, '9.91 % of plant_output was never sent'),
@@ -126,7 +126,7 @@ def test_the_model_is_blamed_where_nothing_else_is_known() -> None:
 
 
 @pytest.mark.parametrize('changes', [
-    {'late': 30}, {'lost': 30}, {'lost': 30, 'unsent': 30}, {'intervals_s': (0.02, 0.02)},
+    {'late': 30}, {'lost': 30}, {'lost': 30, 'unsent': 30}, {'intervals_s': (0.02, 0.02, 0.02)},
 ])
 def test_a_loop_that_is_merely_late_is_never_an_error(changes: dict[str, Any]) -> None:
     for status in Status:
@@ -144,12 +144,14 @@ def test_an_estimate_that_does_not_fit_stays_an_error_beside_other_causes(
 
 
 @pytest.mark.parametrize('intervals_s', [
-    (0.005, 0.0072),  # a third is lost
-    (0.0001, 0.005),  # messages come in pairs
-    (0.005, 0.0025),  # each is sent twice
-    (0.0053, 0.0054), (nan, nan),
+    (0.005, 0.0072, 0.01),  # a third is lost
+    (0.005, 0.008, 0.02),  # the driver stands still now and then
+    (0.0001, 0.0025, 0.005),  # each is sent twice
+    (0.0053, 0.0054, 0.0055), (nan, nan, nan),
 ])
-def test_losses_bursts_and_jitter_are_no_wrong_rate(intervals_s: tuple[float, float]) -> None:
+def test_losses_bursts_and_jitter_are_no_wrong_rate(
+    intervals_s: tuple[float, float, float],
+) -> None:
     assert first(replace(WELL, intervals_s=intervals_s)) == STATES[Status.TRACKING]
 
 

@@ -69,9 +69,9 @@ class LoopFigures:
     """What the controller knows of the last few seconds; counts are samples or messages.
 
     output, reference: with those who publish it. control: with those who receive it; rivals: who
-    else publishes it. intervals_s: median and mean of those between messages of y [s], nan while
-    they are not known. still: newest values of y in a row that are equal, and v_swing: how far v
-    has moved meanwhile, in gaps.
+    else publishes it. intervals_s: those between messages of y, low, mean and high, of which a
+    tenth is shorter and longer [s], nan while they are not known. still: newest values of y in a
+    row that are equal, and v_swing: how far v has moved meanwhile, in gaps.
     """
 
     sample_period: float
@@ -85,7 +85,7 @@ class LoopFigures:
     on_timeout: str = 'hold'
     referred: bool = True  # whether a y_m has come
     reference_silent_s: float = 0.0
-    intervals_s: tuple[float, float] = (nan, nan)
+    intervals_s: tuple[float, float, float] = (nan, nan, nan)
     used: int = 0
     without_reference: int = 0
     lost: int = 0
@@ -285,15 +285,13 @@ def _timing(f: LoopFigures) -> list[Finding]:
 def _wrong_rate(f: LoopFigures) -> float:
     """The rate of y [Hz] where it is not that of the model, else nan.
 
-    Losses and stalls lengthen the mean of the intervals, messages sent twice shorten the median:
-    the rate is wrong only where both are off to the same side.
+    Losses and stalls lengthen some of the intervals, messages sent twice shorten some: the rate is
+    wrong only where nearly all of them are off to the same side.
     """
-    shortest, longest = sorted(f.intervals_s)
-    if shortest > (1.0 + RATE_TOLERANCE) * f.sample_period:
-        return 1.0 / shortest
-    if 0.0 < longest < f.sample_period / (1.0 + RATE_TOLERANCE):
-        return 1.0 / longest
-    return nan
+    low, mean, high = f.intervals_s
+    slow = low > (1.0 + RATE_TOLERANCE) * f.sample_period
+    fast = high < f.sample_period / (1.0 + RATE_TOLERANCE)
+    return 1.0 / mean if (slow or fast) and mean > 0.0 else nan
 
 
 def _reference(f: LoopFigures) -> list[Finding]:

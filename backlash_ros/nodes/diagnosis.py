@@ -70,7 +70,7 @@ class Diagnosis:
             referred=isfinite(loop.y_m),
             reference_silent_s=timeout if overdue else 0.0,
             # In lockstep the outputs come as fast as the machine goes.
-            intervals_s=(nan, nan) if p.flag('lockstep') else statistics.intervals_s(),
+            intervals_s=(nan, nan, nan) if p.flag('lockstep') else statistics.intervals_s(),
             still=statistics.still,
             v_swing=statistics.still_swing / gap if gap > 0.0 else 0.0,
             **lately,
@@ -131,7 +131,7 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
     """Counts, estimates and what tells how well the loop runs."""
     statistics, e = loop.statistics, loop.estimate
     gap, swing = e.c_r - e.c_l, statistics.swing()
-    _, mean_s = statistics.intervals_s()
+    _, mean_s, _ = statistics.intervals_s()
     return {
         **counts_of(loop),
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,

@@ -70,12 +70,17 @@ class LoopStatistics:
         ordered = sorted(self.latencies)
         return ordered[min(int(share * len(ordered)), len(ordered) - 1)] * 1e3
 
-    def intervals_s(self) -> tuple[float, float]:
-        """Median and mean of the newest intervals between messages of y [s]; nan while few."""
+    def intervals_s(self) -> tuple[float, float, float]:
+        """Newest intervals between messages of y: low, mean and high [s]; nan while few.
+
+        A tenth of them is shorter than low, a tenth longer than high.
+        """
         intervals = sorted(later - earlier for earlier, later in pairwise(self._stamps_ns))
         if len(intervals) < FEWEST:
-            return nan, nan
-        return 1e-9 * intervals[len(intervals) // 2], 1e-9 * sum(intervals) / len(intervals)
+            return nan, nan, nan
+        tenth = len(intervals) // 10
+        mean = sum(intervals) / len(intervals)
+        return 1e-9 * intervals[tenth], 1e-9 * mean, 1e-9 * intervals[-1 - tenth]
 
     def swing(self) -> float:
         """Swing of v since the last call."""
