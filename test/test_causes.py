@@ -133,6 +133,12 @@ def test_a_loop_that_is_merely_late_is_never_an_error(changes: dict[str, Any]) -
         assert worst_level(replace(WELL, status=status, **changes)) == Level.WARN
 
 
+def test_lateness_is_no_excuse_for_a_contradiction_that_lasts() -> None:
+    findings = findings_of(replace(INCONSISTENT, late=30, inconsistent_s=10.0))
+    assert [finding.kind for finding in findings] == ['model', 'late']
+    assert findings[0].level == Level.ERROR
+
+
 @pytest.mark.parametrize('changes', [
     {'still': 200, 'v_swing': 2.0}, {'limited': 400}, {'output': output_from(DRIVER, OTHER)},
     {'late': 3},

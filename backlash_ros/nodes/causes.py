@@ -17,6 +17,8 @@ RATE_TOLERANCE = 0.1
 TROUBLE = 0.01
 LIMITED = 0.5  # share of limited commands that leaves too little motion
 STILL_SAMPLES = 20  # equal values of y in a row, while v moves on
+# A contradiction between y and G(z) that lasts longer is not put down to late or lost samples [s].
+PATIENCE_S = 3.0
 
 
 class Level(IntEnum):
@@ -80,6 +82,7 @@ class LoopFigures:
     control: TopicFigures = field(default_factory=lambda: TopicFigures('control'))
     rivals: tuple[str, ...] = ()
     status: Status | None = None  # None before the first command
+    inconsistent_s: float = 0.0  # how long that status has been INCONSISTENT
     adapting: bool = True
     silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not
     on_timeout: str = 'hold'
@@ -108,15 +111,19 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     """All that is to be said, the likeliest cause first; never empty.
 
     The model is blamed only where nothing else explains why y does not follow from v: an estimate
-    that is held while samples are late or lost is a warning about these.
+    that is held for a while because samples are late or lost is a warning about these.
     """
     causes = [
         *_unfit_peers(f), *_bad_numbers(f), *_second_senders(f), *_silence(f), *_timing(f),
         *_reference(f), *_actuator(f),
     ]
     state = _state(f, causes)
-    troubled = state.level != Level.OK
-    found = [*causes, state] if troubled or not causes else causes
+    found = causes
+    if state.kind == 'model':
+        late = [cause for cause in causes if cause.kind in LATENESS]
+        found = [cause for cause in causes if cause not in late] + [state, *late]
+    elif state.level != Level.OK or not causes:
+        found = [*causes, state]
     return [finding._replace(text=_short(finding.text)) for finding in found]
 
 
@@ -142,7 +149,9 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
     if f.status is None:
         # What is not there yet is among the causes; else all is about to begin.
         return Finding(Level.OK, 'begins', 'the loop begins')
-    if f.status == Status.INCONSISTENT and any(cause.kind in TIMING for cause in causes):
+    kinds = {cause.kind for cause in causes}
+    briefly = f.inconsistent_s < PATIENCE_S and not kinds.isdisjoint(LATENESS)
+    if f.status == Status.INCONSISTENT and (briefly or 'rate' in kinds):
         return Finding(
             Level.WARN, 'held', f'{f.output.name} does not follow from v while samples are late or '
             'lost: estimates held',
@@ -252,7 +261,7 @@ def _silence(f: LoopFigures) -> list[Finding]:
     return found
 
 
-TIMING = ('rate', 'late', 'lost', 'unsent')
+LATENESS = ('late', 'lost', 'unsent')
 
 
 def _timing(f: LoopFigures) -> list[Finding]:

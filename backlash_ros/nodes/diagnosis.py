@@ -10,6 +10,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.causes import Finding, Level, LoopFigures, Peer, findings_of
 from backlash_ros.nodes.control_loop import ControlLoop
@@ -30,6 +31,7 @@ class Diagnosis:
         self._node, self._io = node, io
         self._output_qos, self._reference_qos = output_qos, reference_qos
         self._lately = Lately()
+        self._consistent_at = time.monotonic()  # the newest look at which it was, or there was none
 
     def findings(
         self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
@@ -53,6 +55,9 @@ class Diagnosis:
             'bad_references': statistics.bad_references, 'limited': statistics.limited,
             'unreported': loop.commands.unreported,
         }, time.monotonic())
+        status = None if loop.last is None else loop.last.estimate.status
+        if status != Status.INCONSISTENT:
+            self._consistent_at = time.monotonic()
         gap = loop.estimate.c_r - loop.estimate.c_l
         timeout = p.real('timeout.reference')
         overdue = reference_at_s is not None and not p.flag('lockstep') \
@@ -63,7 +68,7 @@ class Diagnosis:
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
             publishers_of(node, topics.REFERENCE, Float64, self._reference_qos),
             subscribers_of(node, control, io.topics.control_type), rivals_of(node, control),
-            status=None if loop.last is None else loop.last.estimate.status,
+            status=status, inconsistent_s=time.monotonic() - self._consistent_at,
             adapting=loop.adapting,
             silent_s=p.real('timeout.plant_output') if loop.silent else 0.0,
             on_timeout=p.word('on_timeout'),
