@@ -47,7 +47,7 @@ def rivals_of(node: Node, topic: str) -> tuple[str, ...]:
 def _name(info: Any) -> str:
     # Programs without ROS have no node.
     if not info.node_name or info.node_name.startswith('_NODE_NAME_UNKNOWN'):
-        return 'a program without a node name'
+        return 'an unnamed node'
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
 
