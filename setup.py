@@ -19,7 +19,11 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}', ['README.md']),
         (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{PACKAGE}/examples', sorted(glob('examples/*.py'))),
+        (f'share/{PACKAGE}/docs', sorted(glob('docs/*.md'))),
+        (f'share/{PACKAGE}/docs/images', sorted(glob('docs/images/*.png'))),
     ],
     zip_safe=False,
     python_requires='>=3.10',

@@ -13,9 +13,16 @@ TRUTH = 'plant/truth'
 CLOCK = '/clock'
 DIAGNOSTICS = '/diagnostics'
 
-# `sample` counts the plant outputs from 0 and joins rows of different topics, lost messages or not.
+
+# `sample` counts the plant outputs, lost or not, and joins rows of different topics. It begins with
+# 0, or with the time in sample periods where the controller may have been started anew.
 ESTIMATE_LABELS = ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l', 'std_f', 'sample')
 SIGNAL_LABELS = (
     'y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'sample', 'latency_s',
 )
 TRUTH_LABELS = ('u', 'm', 'c_r', 'c_l', 'v', 'sample')
+
+
+def of_node(topic: str) -> str:
+    """The name under which its node publishes a topic, so that it follows the name of the node."""
+    return '~/' + topic.rpartition('/')[2]

@@ -1,4 +1,4 @@
-"""Measure the package: time of a controller step, latency through DDS, speed of simulations.
+"""Measure the package: time of a controller step, latency and rates through DDS, speed.
 
 `make bench` runs everything; `make bench ARGS='--only step'` a part of it.
 """
@@ -17,6 +17,7 @@ from pathlib import Path
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import loop_latency
+import reference_rate
 import step_times
 from loop_latency import LATENCY_HEADER, RATES_HZ
 from reporting import CHECK_HEADER, ROOT, Check, machine, markdown_table, text_table
@@ -88,6 +89,19 @@ def measure_latency(duration_s: float) -> list[Section]:
     return sections
 
 
+def measure_reference(duration_s: float) -> list[Section]:
+    """Messages of the reference per sample period."""
+    section = Section(
+        'Rate of the reference',
+        'Messages on reference, counted by a node that does nothing else, at a sample period of '
+        f'{1e3 * reference_rate.PERIOD_S:g} ms.', reference_rate.RATE_HEADER,
+    )
+    rates = reference_rate.measure_rates(duration_s)
+    section.rows = [[what, str(count), f'{share:.3f}'] for what, count, share in rates]
+    section.checks = reference_rate.rate_checks(rates)
+    return [section]
+
+
 def measure_lockstep(_: float) -> list[Section]:
     """Speed of lockstep."""
     section = Section(
@@ -112,8 +126,8 @@ def measure_simulation(_: float) -> list[Section]:
 
 
 PARTS: dict[str, Callable[[float], list[Section]]] = {
-    'step': measure_steps, 'latency': measure_latency, 'lockstep': measure_lockstep,
-    'simulate': measure_simulation,
+    'step': measure_steps, 'latency': measure_latency, 'reference': measure_reference,
+    'lockstep': measure_lockstep, 'simulate': measure_simulation,
 }
 
 

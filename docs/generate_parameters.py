@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 
-from backlash_ros.core.parameter_table import PARAMETERS, Parameter, Value
+from backlash_ros.core.parameter_table import PARAMETERS, Parameter, as_yaml
 
 PAGE = Path(__file__).with_name('parameters.md')
 HEAD = """# Parameters
@@ -14,7 +14,8 @@ Made from [parameter_table.py](../backlash_ros/core/parameter_table.py) by `make
 The nodes, `bringup` and `simulate` all read one YAML file:
 [paper_example.yaml](../config/paper_example.yaml) shows every group.
 `y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in
-a running node.
+a running node; all others of `controller`, but for `io.*`, `lockstep`, `autostart`,
+`wait_for_subscribers` and `estimator.use_applied_control`, while it is unconfigured.
 
 | name | default | unit | allowed | meaning | used by |
 |---|---|---|---|---|---|
@@ -28,20 +29,8 @@ def parameters_page() -> str:
 
 def _row(p: Parameter) -> str:
     users = ', '.join(p.used_by) + (', *live*' if p.live else '')
-    cells = (f'`{p.name}`', f'`{_value(p.default)}`', p.unit, _allowed(p), p.description, users)
+    cells = (f'`{p.name}`', f'`{as_yaml(p.default)}`', p.unit, _allowed(p), p.description, users)
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'
-
-
-def _value(value: Value) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return '[' + ', '.join(_value(element) for element in value) + ']'
-    if isinstance(value, str):
-        return value or "''"
-    if abs(value) == inf:
-        return '.inf' if value > 0 else '-.inf'
-    return f'{value:g}' if isinstance(value, float) and value == float(f'{value:g}') else str(value)
 
 
 def _allowed(p: Parameter) -> str:

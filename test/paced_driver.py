@@ -104,9 +104,11 @@ class PacedDriver:
         return next((s for s in reversed(statuses) if s.name == 'controller'), None)
 
     def says(self, words: str) -> bool:
-        """Whether the newest diagnostics hold these words."""
+        """Whether the newest diagnostics hold these words, be it as one finding of several."""
         status = self.status()
-        return status is not None and words in status.message
+        return status is not None and any(
+            words in text for text in (status.message, *(pair.value for pair in status.values))
+        )
 
     def text(self, key: str) -> str:
         """A value in the newest diagnostics as it stands there, empty without it."""

@@ -61,6 +61,11 @@ class NodeProcess:
         """What the node has logged."""
         return self._stderr.read_text()
 
+    @property
+    def stdout(self) -> str:
+        """What the node has printed."""
+        return self._stdout.read_text()
+
     def events(self, kind: str) -> list[dict[str, Any]]:
         """Events of this kind so far."""
         # The last piece may be a line that is still being written.
@@ -100,11 +105,11 @@ class NodeProcess:
 class Probe:
     """A node of the test: it publishes, and keeps what it hears."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, name: str = 'probe') -> None:
         remove_stale_ports()  # what tests that kill processes leave
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=domain)
-        self.node = Node('probe', context=self._context)
+        self.node = Node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
 

@@ -233,6 +233,34 @@ def test_bad_input_is_one_line_and_code_2(
     assert len(told.splitlines()) == 1
 
 
+def test_neither_this_node_nor_the_command_line_counts_as_a_listener(tmp_path: Path) -> None:
+    with bench(tmp_path) as beside:
+        probe = Probe(beside.domain)
+        watching = Probe(beside.domain, '_ros2cli_1')
+        output = probe.publisher('plant_output', Float64)
+        watching.collect('control', Float64)
+        process = beside.start('--duration', '2', '--ros-args', '-r', '__node:=looker')
+        try:
+            while process.poll() is None:
+                output.publish(Float64(data=1.0))
+                probe.spin(0.04)
+        finally:
+            process.kill()
+            watching.close()
+            probe.close()
+        told, _ = process.communicate()
+    (line,) = [line for line in told.splitlines() if line[2:].startswith('listener  ')
+               and line.startswith('✗')]
+    assert line.split('  ', 1)[1].strip() == 'nobody listens to control'
+
+
+def test_a_shipped_file_is_found_by_its_name(tmp_path: Path) -> None:
+    with bench(tmp_path) as beside:
+        code, told = beside.check('--config', 'geared_motor.yaml', '--wait', '0.1')
+    assert code == 1, told
+    assert 'nobody publishes plant_output' in told
+
+
 def test_what_a_file_holds_for_the_controller_alone_counts(tmp_path: Path) -> None:
     with bench(tmp_path) as beside:
         own = {'/controller': {'ros__parameters': {'control': {'min': 'nothing'}}}}

@@ -90,13 +90,13 @@ def test_misspelt_key_is_answered_with_the_nearest_one_and_the_file(config: Path
     written(config, '/**: {ros__parameters: {estimator: {lwa: lms}}}')
     with pytest.raises(ParameterError) as caught:
         load_config(config)
-    assert str(caught.value).startswith(f'{config}: estimator.lwa=')
+    assert str(caught.value).startswith(f'{config}: estimator.lwa is not a parameter: ')
     assert 'did you mean estimator.law?' in str(caught.value)
 
 
 def test_bad_value_is_answered_with_rule_and_file(config: Path) -> None:
     written(config, '/**: {ros__parameters: {sample_period: -1}}')
-    with pytest.raises(ParameterError, match=r'my\.yaml: sample_period=-1\.0 must be > 0 s'):
+    with pytest.raises(ParameterError, match=r'my\.yaml: sample_period=-1\.0 must be > 0 \[s\]'):
         load_config(config)
 
 
@@ -135,7 +135,7 @@ def test_section_of_a_node_goes_before_that_of_all(config: Path) -> None:
         ('/**: {ros__parameters: {seed: [}}', 'line 1:'),
         ('seed', 'must hold'),
         ('', 'must hold'),
-        ('/**: {ros__parameters: {5: 1}}', '5='),
+        ('/**: {ros__parameters: {5: 1}}', '5 is not a parameter'),
         ('/contoller: {ros__parameters: {seed: 1}}', 'did you mean /controller?'),
         ('/x/contoller: {ros__parameters: {seed: 1}}', 'did you mean /x/controller?'),
         ('/x/plant: {ros__parameters: {seed: 1}}', "there is no axis 'x': list it in"),

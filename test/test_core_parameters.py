@@ -25,12 +25,12 @@ def named(parameters: list[Parameter]) -> pytest.MarkDecorator:
 
 
 def refusal_of(name: str, value: object) -> str:
-    """The message, which must be one line that names parameter and value."""
+    """The message, which must be one line that names the parameter, and the value if it exists."""
     with pytest.raises(ParameterError) as refusal:
         Parameters({name: value})
     message = str(refusal.value)
     assert refusal.value.name == name
-    assert message.startswith(f'{name}=')
+    assert message.startswith(f'{name}=' if name in BY_NAME else f'{name} is not a parameter: ')
     assert '\n' not in message
     return message
 
@@ -237,7 +237,7 @@ def test_flag_is_true_or_false(parameter: Parameter) -> None:
 def test_message_names_parameter_value_rule_and_unit() -> None:
     with pytest.raises(ParameterError) as refusal:
         Parameters({'sample_period': -0.01})
-    assert str(refusal.value) == 'sample_period=-0.01 must be > 0 s'
+    assert str(refusal.value) == 'sample_period=-0.01 must be > 0 [s]'
 
 
 @pytest.mark.parametrize(

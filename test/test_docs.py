@@ -142,8 +142,11 @@ def test_command_exists_and_takes_its_arguments(words: list[str]) -> None:
     elif program == 'ros2':
         assert arguments[:2] == ['run', 'backlash_ros']
         assert arguments[2] in console_scripts()
-    elif program in ('rosdep', 'colcon', '.', 'export'):
+    elif program in ('rosdep', 'colcon', '.', 'export', 'cp') or '=' in program:
         assert program != 'colcon' or arguments[-1] == 'backlash_ros'
+        if program == 'cp':
+            shipped = arguments[0].removeprefix('$(ros2 pkg prefix --share backlash_ros)/')
+            assert (ROOT / shipped).is_file()
     elif program == '.venv/bin/python':
         # test_driver_examples.py runs them.
         assert arguments[0] == '-c' or (ROOT / arguments[0]).is_file()
@@ -202,3 +205,13 @@ def test_pages_do_not_speak_of_this_machine() -> None:
 def test_changelog_holds_the_version_or_what_is_forthcoming() -> None:
     text = (ROOT / 'CHANGELOG.rst').read_text()
     assert re.search(r'^(Forthcoming|\d+\.\d+\.\d+.*)\n-+$', text, re.MULTILINE)
+
+
+def test_terminals_of_the_readme_make_a_whole_loop_with_a_file_that_is_installed() -> None:
+    block = next(text for _, text in BLOCK.findall(README) if 'rosdep install' in text)
+    lines = block.splitlines()
+    # From Python 3.11 on, rosdep refuses the keys that come from pip otherwise.
+    assert lines[0].startswith('PIP_BREAK_SYSTEM_PACKAGES=1 rosdep install')
+    assert '$(ros2 pkg prefix --share backlash_ros)/config/geared_motor.yaml' in block
+    started = re.findall(r'ros2 run backlash_ros (\w+)', block)
+    assert {'controller', 'plant', 'reference', 'recorder'} <= set(started)

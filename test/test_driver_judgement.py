@@ -114,7 +114,21 @@ def test_samples_that_come_twice_are_told() -> None:
         m._replace(stamp_ns=m.stamp_ns + i * 1000, number=2 * m.number + i)
         for m in heard.outputs for i in (0, 1)
     ]
-    assert subjects(faults(heard)) == ['repeated samples']
+    (found,) = faults(heard)
+    assert found.subject == 'repeated samples'
+    assert 'came twice' in found.found
+
+
+def test_a_timer_that_catches_up_is_not_taken_for_a_relay() -> None:
+    heard = heard_from_driver()
+    # After every twentieth sample the timer was late and makes up for it at once.
+    heard.outputs = [
+        m._replace(stamp_ns=m.stamp_ns - int(0.9 * PERIOD_S * 1e9)) if k % 20 == 19 else m
+        for k, m in enumerate(heard.outputs)
+    ]
+    found = next(f for f in faults(heard) if f.subject == 'repeated samples')
+    assert 'right after the one before' in found.found
+    assert 'catching up' in found.cure
 
 
 def test_a_sensor_slower_than_the_driver_is_told() -> None:

@@ -227,9 +227,11 @@ def test_broken_sensor_holds_the_last_good_estimates_and_is_an_error(
         stuck = driver.y[-1]
         driver.sent = lambda k, y: [-y if broken == 'sign' else stuck]
         driver.run_until(lambda: driver.says('does not follow from v'), 'the contradiction')
-        status = driver.status()
-        assert status is not None
-        assert status.level == DiagnosticStatus.ERROR
+        # On a busy machine it may be put down to late samples at first.
+        driver.run_until(
+            lambda: (status := driver.status()) and status.level == DiagnosticStatus.ERROR,
+            'the error',
+        )
         assert driver.signals[-1].data[6] == Status.INCONSISTENT
         held = driver.estimate()
         driver.run(0.5)

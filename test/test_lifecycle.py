@@ -178,6 +178,15 @@ def test_estimates_are_saved_on_request_or_the_reason_is_told(tmp_path: Path) ->
         assert nowhere.stop() == 0
 
 
+def test_saving_without_a_file_says_what_to_do(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        answer = Asked(driver).trigger('save_estimates')
+        assert not answer.success
+        assert 'start with -p estimates.file:=PATH, or set it while unconfigured' in answer.message
+        assert controller.stop() == 0
+
+
 def another(world: RosWorld, file: str) -> tuple[Any, PacedDriver]:
     return controller_and_driver(world, **{'estimates.file': file, 'estimates.save_period': 0.0})
 
@@ -210,4 +219,37 @@ def test_live_parameters_change_together_or_not_at_all(tmp_path: Path) -> None:
         refused = change(sample_period=0.02)
         assert not refused.successful
         driver.run_until_known(0.05)
+        assert controller.stop() == 0
+
+
+def test_all_but_the_interface_may_change_while_unconfigured(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {'autostart': False, 'sample_period': 0.5})
+        driver = PacedDriver(world.probe())
+        asked = Asked(driver)
+
+        def set_parameter(name: str, value: object) -> Any:
+            request = SetParametersAtomically.Request(
+                parameters=[Parameter(name, value=value).to_parameter_msg()]
+            )
+            return asked('set_parameters_atomically', SetParametersAtomically, request).result
+
+        assert set_parameter('sample_period', 0.01).successful
+        assert set_parameter('estimator.output_noise_std', 1e-3).successful
+        assert set_parameter('estimator.initial.m', 1.0).successful
+        assert set_parameter('estimates.file', str(file)).successful
+        refused = set_parameter('estimator.initial.c_r', 1e9)
+        assert 'must lie within' in refused.reason
+        assert 'read-only' in set_parameter('io.style', 'ros2_control').reason
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            assert asked.change(transition)
+        refused = set_parameter('sample_period', 0.02)
+        assert not refused.successful
+        assert 'is read-only while the node is configured: deactivate' in refused.reason
+        driver.run_until(lambda: driver.estimates, 'estimates')
+        assert driver.estimates[0].data[0] == 1.0
+        driver.learn()
+        assert asked.trigger('save_estimates').success
+        assert file.exists()
         assert controller.stop() == 0

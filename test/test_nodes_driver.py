@@ -12,9 +12,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.diagnosis import STATES
 
 
 class Driver:
@@ -104,7 +102,3 @@ def test_non_finite_messages_are_counted_and_leave_the_control_alone(tmp_path: P
         assert controller.stop() == 0
         assert 'non-finite dropped: 4' in controller.stderr
         assert 'no plant_output for 0.3 s: is the driver running?' in controller.stderr
-
-
-def test_every_status_of_an_estimator_has_words_for_the_diagnostics() -> None:
-    assert set(STATES) == set(Status)

@@ -33,7 +33,7 @@ def test_bad_input_ends_a_node_with_one_line_and_exit_code_2(tmp_path: Path) -> 
         (tmp_path / f'{name}.yaml').write_text(text)
     (tmp_path / 'bag').mkdir()
     cases: list[tuple[str, list[str], str]] = [
-        ('controller', ['-p', 'sample_period:=-0.01'], 'sample_period=-0.01 must be > 0 s'),
+        ('controller', ['-p', 'sample_period:=-0.01'], 'sample_period=-0.01 must be > 0 [s]'),
         ('controller', ['-p', 'control.min:=2', '-p', 'control.max:=1'], 'control.min=2.0 must'),
         ('controller', ['-p', 'estimator.lawn:=lms'], 'did you mean estimator.law?'),
         ('controller', ['-p', 'estimator.use_applied_control:=sometimes'],
@@ -62,6 +62,31 @@ def test_bad_input_ends_a_node_with_one_line_and_exit_code_2(tmp_path: Path) -> 
         assert stderr.startswith(f'{node.executable}: ')
         assert (code, stderr.count('\n')) == (2, 1), stderr
         assert 'Traceback' not in stderr
+
+
+def test_help_says_what_the_node_is_and_its_parameters_as_in_a_file(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        node = world.start('controller', None, '--help')
+        assert node.wait() == 0
+        told = node.stdout
+    assert 'Node that learns the backlash and cancels it' in told
+    assert '* control.max: .inf\n      largest v [v]\n' in told
+    assert '  lockstep: false\n' in told
+    assert '  plant.numerator: [1e-05, 4e-05, 1e-05]\n' in told
+    for line in told.splitlines():
+        assert not line.endswith(':') or line.startswith(('options', 'parameters')), line
+        assert 'False' not in line
+
+
+def test_topics_follow_the_name_of_their_node(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        for name in ('controller', 'plant'):
+            world.start(name, None, '--ros-args', '-r', f'__node:=left_{name}')
+        probe = world.probe()
+        expected = {'/left_controller/estimates', '/left_controller/signals', '/left_plant/truth'}
+        probe.wait_until(
+            lambda: expected <= dict(probe.node.get_topic_names_and_types()).keys(), 'the topics'
+        )
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
@@ -125,5 +150,5 @@ def test_live_parameters_change_all_or_nothing_and_the_others_not_at_all(tmp_pat
         assert not fixed.successful
         assert 'read-only' in fixed.reason
         (out_of_bounds,) = change(probe, False, inverse__direction_band=-1.0)
-        assert out_of_bounds.reason == 'inverse.direction_band=-1.0 must be >= 0 u'
+        assert out_of_bounds.reason == 'inverse.direction_band=-1.0 must be >= 0 [u]'
         assert controller.stop() == 0

@@ -77,6 +77,9 @@ def test_installation_holds_what_ros2_run_and_the_tools_look_for(installation: P
     installed = {path.name: path.read_bytes() for path in share.glob('backlash_ros/config/*')}
     assert installed
     assert installed == {path.name: path.read_bytes() for path in ROOT.glob('config/*.yaml')}
+    for folder, pattern in (('examples', '*.py'), ('docs', '*.md'), ('docs/images', '*.png')):
+        beside = {path.name for path in (share / 'backlash_ros' / folder).glob(pattern)}
+        assert beside == {path.name for path in (ROOT / folder).glob(pattern)} != set()
     executables = installation / 'lib' / 'backlash_ros'
     assert {path.name for path in executables.iterdir()} == EXECUTABLES
     assert all(os.access(path, os.X_OK) for path in executables.iterdir())

@@ -201,7 +201,8 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path, storage:
         assert reason.endswith(f'ros2 run backlash_ros recorder --repair {bag}')
         probe.wait_until(
             lambda: any(
-                status.level == DiagnosticStatus.ERROR and status.message == reason
+                status.level == DiagnosticStatus.ERROR
+                and reason in [pair.value for pair in status.values]
                 for message in diagnostics for status in message.status
             ), 'the error in the diagnostics',
         )

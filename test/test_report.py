@@ -50,13 +50,14 @@ def multi_array(labels: tuple[str, ...], values: list[float]) -> bytes:
 
 def rows_of(
     run: RunRecord, labels: tuple[str, ...], skipped: frozenset[int], prefix: str = '',
+    first: int = 1,
 ) -> Iterator[tuple[int, bytes]]:
-    """Sample count and message of each row, sample 0 having been missed by the recorder."""
+    """Number and message of each row, whose samples are counted from `first`."""
     for k in range(run.samples):
         if k in skipped:
             continue
         known = dict(zip(COLUMNS, run.rows[k].tolist(), strict=True))
-        known |= {'sample': float(k + 1), 'latency_s': LATENCY_S, 'std_f': nan}
+        known |= {'sample': float(k + first), 'latency_s': LATENCY_S, 'std_f': nan}
         values = [known.get(prefix + label, known.get(label, nan)) for label in labels]
         yield k, multi_array(labels, values)
 
@@ -233,20 +234,6 @@ def empty_bag(path: Path, run: RunRecord) -> None:
     write_bag(path, RunRecord(run.rows[:0], run.sample_period))
 
 
-def twice_bag(path: Path, run: RunRecord) -> None:
-    write_bag(path, RunRecord(run.rows[:1], run.sample_period))
-    other = path.with_name('other')
-    with Writer(other, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        for topic, labels in ((topics.SIGNALS, topics.SIGNAL_LABELS),
-                              (topics.ESTIMATES, topics.ESTIMATE_LABELS)):
-            connection = writer.add_connection(f'/{topic}', MULTI_ARRAY, typestore=TYPES)
-            for _, raw in itertools.chain(rows_of(run, labels, frozenset()),
-                                          rows_of(run, labels, frozenset())):
-                writer.write(connection, 0, raw)
-    path.rename(path.with_name('unused'))
-    other.rename(path)
-
-
 def empty_folder(path: Path, run: RunRecord) -> None:
     path.mkdir()
 
@@ -258,7 +245,6 @@ def empty_folder(path: Path, run: RunRecord) -> None:
         (broken_bag, 'is damaged (File end magic is invalid.), and nothing of it can be read'),
         (other_bag, 'holds no controller/signals, only /chatter'),
         (empty_bag, 'holds no message of /controller/signals'),
-        (twice_bag, 'the node was started twice'),
         (empty_folder, 'holds no bag, no record.npz and no samples.csv'),
     ],
 )

@@ -6,15 +6,18 @@ import json
 import signal
 import subprocess
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from builtin_interfaces.msg import Time
+from lifecycle_msgs.msg import Transition
 from paced_driver import NOISE, TRUTH, PacedDriver, controller_and_driver
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_processes import NodeProcess, ros_world, wait_until
 from rosgraph_msgs.msg import Clock
+from test_lifecycle import Asked
 
 from backlash_ros import topics
 
@@ -194,3 +197,27 @@ def _catches(node: NodeProcess, number: signal.Signals) -> bool:
     status = Path(f'/proc/{node.process.pid}/status').read_text()
     caught = next(line for line in status.splitlines() if line.startswith('SigCgt'))
     return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
+
+
+def test_no_sample_number_is_used_twice_whoever_is_started_anew(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        # They are never sent, so that the count is ahead of the numbers of the driver.
+        driver.sent = lambda k, y: [] if k % 3 == 0 else [y]
+        asked = Asked(driver)
+        driver.run(1.0)
+        for transition in (
+            Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP,
+            Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE,
+        ):
+            assert asked.change(transition)
+        rows = len(driver.signals)
+        driver.run_until(lambda: len(driver.signals) > rows + 20, 'the loop after a cleanup')
+        controller.kill()
+        rows = len(driver.signals)
+        again = world.start('controller', {'estimator.output_noise_std': NOISE})
+        driver.run_until(lambda: len(driver.signals) > rows + 20, 'the second controller')
+        assert again.stop() == 0
+    column = topics.SIGNAL_LABELS.index('sample')
+    samples = [row.data[column] for row in driver.signals]
+    assert all(later > earlier for earlier, later in pairwise(samples))

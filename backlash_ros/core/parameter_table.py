@@ -118,7 +118,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('pole_placement.filter_pole', 0.6,
               'pole_placement: pole of the filters of u_d and y', low=0.0, high=0.999),
     Parameter('inverse.caution', 1.0,
-              'tracking: standard deviations by which the crossings are shrunk', low=0.0,
+              'tracking: standard deviations by which the crossings are shrunk',
+              low=0.0, high=100.0,
               live=True),
     Parameter('fixed.doubt', 0.0,
               'fixed: how much of the motion of u the given constants may get wrong', low=0.0),
@@ -143,18 +144,20 @@ PARAMETERS: tuple[Parameter, ...] = (
               choices=('hold', 'zero', 'ramp'), live=True),
     Parameter('timeout.plant_output', 0.5,
               'longest silence of plant_output before on_timeout is done, 0 for never', 's',
-              low=0.0, live=True),
+              low=0.0, high=3600.0, live=True),
     Parameter('timeout.reference', 1.0,
-              'longest silence of reference before it is reported, 0 for never', 's', low=0.0,
+              'longest silence of reference before it is reported, 0 for never', 's',
+              low=0.0, high=3600.0,
               live=True),
     Parameter('timeout.ramp', 0.5,
-              'longest ramp at the end; a v that is not at zero by then is held', 's', low=0.0,
+              'longest ramp at the end; a v that is not at zero by then is held', 's',
+              low=0.0, high=3600.0,
               live=True),
     Parameter('estimates.file', '', 'file that learned estimates are saved in, empty for none'),
     Parameter('estimates.load', False, 'begin with the estimates in estimates.file, if it exists'),
     Parameter('estimates.save_period', 10.0,
               'time between two savings while running, 0 to save on request and at the end only',
-              's', low=0.0, live=True),
+              's', low=0.0, high=86400.0, live=True),
     Parameter('io.style', 'native',
               'native: Float64 on plant_output and control; ros2_control: JointState on '
               'joint_states and Float64MultiArray on forward_command_controller/commands',
@@ -166,22 +169,25 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('io.best_effort', False,
               'listen to a driver that publishes best effort, which may lose messages',
               used_by=(CONTROLLER, REFERENCE, RECORDER)),
-    Parameter('backlash.m', 1.3, 'simulated slope', 'u/v', low=0.0, above=True, used_by=(PLANT,)),
-    Parameter('backlash.c_r', 3.0, 'simulated right crossing', 'v', used_by=(PLANT,)),
-    Parameter('backlash.c_l', -3.0, 'simulated left crossing', 'v', used_by=(PLANT,)),
+    Parameter('backlash.m', 1.3, 'simulated slope', 'u/v', low=0.0, above=True,
+              used_by=(PLANT,), live=True),
+    Parameter('backlash.c_r', 3.0, 'simulated right crossing', 'v', used_by=(PLANT,), live=True),
+    Parameter('backlash.c_l', -3.0, 'simulated left crossing', 'v', used_by=(PLANT,), live=True),
     Parameter('backlash.initial_u', 0.0, 'simulated u held at the start', 'u', used_by=(PLANT,)),
     Parameter('backlash.rate', (0.0, 0.0, 0.0), 'simulated wear of m, c_r, c_l', '1/s', length=3,
-              used_by=(PLANT,)),
+              used_by=(PLANT,), live=True),
     Parameter('backlash.jump_time', 0.0, 'time at which backlash.jump is added', 's', low=0.0,
-              used_by=(PLANT,)),
+              used_by=(PLANT,), live=True),
     Parameter('backlash.jump', (0.0, 0.0, 0.0), 'simulated step of m, c_r, c_l', length=3,
-              used_by=(PLANT,)),
-    Parameter('output_noise_std', 0.0, 'simulated noise on y', 'y', low=0.0, used_by=(PLANT,)),
+              used_by=(PLANT,), live=True),
+    Parameter('output_noise_std', 0.0, 'simulated noise on y', 'y', low=0.0,
+              used_by=(PLANT,), live=True),
     Parameter('output_quantum', 0.0, 'simulated resolution of y, 0 for none', 'y', low=0.0,
-              used_by=(PLANT,)),
+              used_by=(PLANT,), live=True),
     Parameter('output_loss', 0.0, 'simulated share of y that never arrives', low=0.0, high=0.99,
-              used_by=(PLANT,)),
-    Parameter('input_disturbance', 0.0, 'simulated constant added to u', 'u', used_by=(PLANT,)),
+              used_by=(PLANT,), live=True),
+    Parameter('input_disturbance', 0.0, 'simulated constant added to u', 'u',
+              used_by=(PLANT,), live=True),
     Parameter('truth.numerator', (), 'numerator of the simulated G(z), empty: plant.numerator',
               used_by=(PLANT,), may_be_empty=True),
     Parameter('truth.denominator', (),
@@ -207,17 +213,18 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('samples', 0, 'outputs to simulate, 0 for no end', low=0, used_by=(PLANT,)),
     Parameter('waveform', 'sine', 'shape of y_m',
               choices=('sine', 'step', 'square', 'triangle', 'multisine', 'chirp', 'file'),
-              used_by=(REFERENCE,)),
-    Parameter('amplitude', 10.0, 'amplitude of y_m', 'y_m', low=0.0, used_by=(REFERENCE,)),
+              used_by=(REFERENCE,), live=True),
+    Parameter('amplitude', 10.0, 'amplitude of y_m', 'y_m', low=0.0,
+              used_by=(REFERENCE,), live=True),
     Parameter('frequency', 12.6, 'frequency of y_m (chirp: the last one)', 'rad/s', low=0.0,
-              above=True, used_by=(REFERENCE,)),
+              above=True, used_by=(REFERENCE,), live=True),
     Parameter('frequency_start', 0.63, 'first frequency of a chirp', 'rad/s', low=0.0, above=True,
-              used_by=(REFERENCE,)),
+              used_by=(REFERENCE,), live=True),
     Parameter('sweep_time', 10.0, 'duration of a chirp', 's', low=0.0, above=True,
-              used_by=(REFERENCE,)),
-    Parameter('bias', 0.0, 'constant added to y_m', 'y_m', used_by=(REFERENCE,)),
+              used_by=(REFERENCE,), live=True),
+    Parameter('bias', 0.0, 'constant added to y_m', 'y_m', used_by=(REFERENCE,), live=True),
     Parameter('file', '', 'CSV with a row t,y_m per sample for waveform: file',
-              used_by=(REFERENCE,)),
+              used_by=(REFERENCE,), live=True),
     Parameter('storage', 'mcap', 'format of the bag', choices=('mcap', 'sqlite3'),
               used_by=(RECORDER,)),
     Parameter('bag', '', 'folder of the bag, must not exist yet; empty for none',
@@ -235,3 +242,16 @@ PARAMETERS: tuple[Parameter, ...] = (
 )
 
 BY_NAME: dict[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def as_yaml(value: Value) -> str:
+    """A value as it stands in a YAML file or after -p NAME:=."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return '[' + ', '.join(map(as_yaml, value)) + ']'
+    if isinstance(value, str):
+        return value or "''"
+    if abs(value) == inf:
+        return '.inf' if value > 0 else '-.inf'
+    return f'{value:g}' if isinstance(value, float) and value == float(f'{value:g}') else str(value)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from math import hypot, isfinite, isnan, sqrt
 from typing import cast
 
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.errors import UNTOLD, ParameterError
 from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter, Value
 
 NOISE = 'estimator.output_noise_std'
@@ -99,7 +99,7 @@ def check_names(names: Iterable[str]) -> None:
     for name in names:
         if name not in BY_NAME:
             near = difflib.get_close_matches(name, BY_NAME, n=1, cutoff=0.0)[0]
-            raise ParameterError(name, '...', 'is not a parameter', f'did you mean {near}?')
+            raise ParameterError(name, UNTOLD, 'is not a parameter', f'did you mean {near}?')
 
 
 def check_value(parameter: Parameter, value: object) -> Value:
@@ -190,7 +190,7 @@ def _real(parameter: Parameter, value: object) -> float:
         raise ParameterError(
             parameter.name, number, f'must be within ±{LARGEST:g}', 'choose another unit'
         )
-    unit = f' {parameter.unit}' if parameter.unit else ''
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
     if number < parameter.low or (parameter.above and number == parameter.low):
         sign = '>' if parameter.above else '>='
         raise ParameterError(parameter.name, number, f'must be {sign} {parameter.low:g}{unit}')

@@ -10,6 +10,8 @@ from backlash_ros.core.errors import ParameterError
 
 # Crest-friendly multisine: harmonics of the base frequency with Schroeder's phases.
 MULTISINE_HARMONICS = (1, 2, 3, 5)
+# Shapes of the phase alone, which go on where they are if the frequency changes.
+PERIODIC = ('sine', 'square', 'triangle', 'multisine')
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,12 @@ class SimulatedPlant:
         self._walk_rng = rng.spawn(1)[0] if self._walk_step > 0.0 else rng
         self._wears = any(self._extra.rate) or any(self._extra.jump)
 
+    def go_on_from(self, other: SimulatedPlant) -> None:
+        """Take over the state, the time and the source of noise of a plant with the same G(z)."""
+        self.sample, self._x, self._rng = other.sample, other._x, other._rng
+        self._walk, self._walk_rng = other._walk, other._walk_rng
+        self.backlash.u, self.backlash.region = other.backlash.u, other.backlash.region
+
     def measure(self) -> float:
         """y(k) as the sensor shows it; call it once per sample."""
         y = float(self._x[0])

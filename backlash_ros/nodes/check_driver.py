@@ -42,6 +42,7 @@ from backlash_ros.nodes.gentle_drive import GentleDrive, drive_range
 from backlash_ros.nodes.messages import DEPTH
 from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
+from backlash_ros.shipped import find_config
 
 EXECUTABLE = 'check_driver'
 UNFIT = 1
@@ -50,6 +51,7 @@ SETTLE_S = 1.0  # after which everybody should have found everybody
 REMIND_S = 3.0  # between two lines that say what is missing
 CONTROLLER_SECTIONS = ('/**/controller', 'controller', '/controller')
 NOT_OURS = {'/rosout', '/parameter_events'}
+COMMAND_LINE = '_ros2cli'  # how the nodes of `ros2 topic` are called
 
 
 class CheckDriverNode(ProcessNode):
@@ -130,8 +132,16 @@ class CheckDriverNode(ProcessNode):
         """Topics that have such endpoints, and their types."""
         return {
             topic: types for topic, types in self.get_topic_names_and_types()
-            if topic not in NOT_OURS and endpoints(topic)
+            if topic not in NOT_OURS and self._of_others(endpoints(topic))
         }
+
+    def _of_others(self, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
+        """Without those of this node, of the recorder and of `ros2 topic`."""
+        return [
+            info for info in endpoints
+            if info.node_name not in (self.get_name(), RECORDER)
+            and not info.node_name.startswith(COMMAND_LINE)
+        ]
 
     def _listen(self) -> None:
         """Subscribe the way that hears the driver, whatever its QoS."""
@@ -226,9 +236,9 @@ class CheckDriverNode(ProcessNode):
     def _look_at_graph(self) -> None:
         graph = self._graph
         outputs = self.get_publishers_info_by_topic(self._names[topics.PLANT_OUTPUT])
-        listeners = self.get_subscriptions_info_by_topic(self._names[topics.CONTROL])
-        bystanders = (self.get_name(), RECORDER)
-        listeners = [info for info in listeners if info.node_name not in bystanders]
+        listeners = self._of_others(
+            self.get_subscriptions_info_by_topic(self._names[topics.CONTROL])
+        )
         if self._limits is not None:
             others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
             # Once heard, a rival counts, even if it leaves.
@@ -326,7 +336,8 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
         prog=EXECUTABLE, description=__doc__,
         epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.',
     )
-    parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller')
+    parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
+                        'or the name of a shipped one')
     parser.add_argument('--duration', type=_positive, default=10.0, metavar='SECONDS',
                         help='how long to listen (default: 10)')
     parser.add_argument('--wait', type=_positive, default=10.0, metavar='SECONDS',
@@ -382,7 +393,9 @@ def main(args: list[str] | None = None) -> int:
     arguments = sys.argv[1:] if args is None else args
     options = parse_options(remove_ros_args(['', *arguments])[1:])
     with tempfile.TemporaryDirectory() as folder:
-        files = [] if options.config is None else parameter_files(options.config, Path(folder))
+        files = [] if options.config is None else parameter_files(
+            str(find_config(Path(options.config))), Path(folder)
+        )
         given = ['--ros-args'] if files else []
         for file in files:
             given += ['--params-file', file]

@@ -31,15 +31,16 @@ class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
-    learned before. v: the newest command. silent: the driver was given up for the time being.
+    learned before. counter: goes on counting where another loop has ended. v: the newest command.
+    silent: the driver was given up for the time being.
     """
 
     def __init__(
         self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
-        inherited: Estimate | None,
+        inherited: Estimate | None, counter: SampleCounter,
     ) -> None:
         self.statistics = LoopStatistics()
-        self.counter = SampleCounter(p.real('sample_period'))
+        self.counter = counter
         self.commands = CommandHistory(p.real('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
         self.v = 0.0
@@ -81,7 +82,7 @@ class ControlLoop:
     def take_reference(self, y_m: float) -> bool:
         """Take in a reference; an absurd one is counted and the last one holds."""
         if not plausible(y_m):
-            self.statistics.dropped += 1
+            self.statistics.note_bad_reference()
             return False
         self.y_m = y_m
         return True
@@ -100,6 +101,7 @@ class ControlLoop:
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """The same for a sample that was counted already, with the reference that belongs to it."""
         statistics = self.statistics
+        statistics.note_arrival(output.stamp_ns)
         if not arrival.is_sample:
             statistics.extra += 1
             return None
@@ -107,7 +109,7 @@ class ControlLoop:
         self._note_missing(arrival)
         if not plausible(output.y):
             # A sensor that has nothing to say is as good as silent.
-            statistics.dropped += 1
+            statistics.note_bad_output()
             self._missing += 1
             return None
         self.heard_at = time.monotonic()
@@ -119,7 +121,7 @@ class ControlLoop:
         step = self._step_core(output.y, y_m, output.stamp_ns)
         self.send(step.v)
         statistics.note(
-            step.v, self.core.inverse.limited, (time.time_ns() - output.sent_ns) * 1e-9
+            output.y, step.v, self.core.inverse.limited, (time.time_ns() - output.sent_ns) * 1e-9
         )
         self.last = step
         return step
@@ -167,7 +169,8 @@ class ControlLoop:
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
         self._anew = self._anew or arrival.anew
-        if not (self.silent or arrival.anew):
+        # What came before the first sample that is used was not lost: nobody listened.
+        if self._begun and not (self.silent or arrival.anew):
             self.statistics.lost += arrival.missing
             self.statistics.unsent += arrival.unsent
 

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from math import isfinite, nan
+from math import nan
 from typing import Any
 
 from rclpy.subscription import Subscription
@@ -23,12 +23,13 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.causes import Finding, Level
 from backlash_ros.nodes.command_history import REMEMBERED, ReportUse, report_use
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
 from backlash_ros.nodes.declare import LiveParameters
-from backlash_ros.nodes.diagnosis import OK, STATES, WARN, Finding, counts_of, values_of, worst
-from backlash_ros.nodes.driver_io import DriverIo, Output
+from backlash_ros.nodes.diagnosis import Diagnosis, counts_of, values_of, worst
+from backlash_ros.nodes.driver_io import DriverIo, Output, output_qos
 from backlash_ros.nodes.estimate_saver import EstimateSaver
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.inbox import Inbox
@@ -40,6 +41,7 @@ from backlash_ros.nodes.messages import (
     LabelledArrayPublisher,
     stamp_ns_of,
 )
+from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import run
 
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -73,10 +75,12 @@ class ControllerNode(ManagedNode):
             self.log.warning(warning)
         self.loop: ControlLoop | None = None  # None while unconfigured
         self._lockstep = p.flag('lockstep')
-        self._give_way = GIVE_WAY * p.real('sample_period')
-        self._period_ns = p.real('sample_period') * 1e9
         self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
+        # Whoever waits for the others begins with them; who does not may have been started anew.
+        self._set_up(
+            p, from_zero=not self._lockstep and p.integer('wait_for_subscribers') > 0
+        )
         self._saver = EstimateSaver(p.word('estimates.file'))
         self._saved_at = time.monotonic()
         self._queues: tuple[deque[Any], deque[Any], deque[Any]] = (deque(), deque(), deque())
@@ -86,9 +90,15 @@ class ControllerNode(ManagedNode):
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._to_zero: Timer | None = None  # sends the commands of on_timeout
         self._io.advertise()
-        self._signals = LabelledArrayPublisher(self, topics.SIGNALS, topics.SIGNAL_LABELS)
-        self._estimates = LabelledArrayPublisher(self, topics.ESTIMATES, topics.ESTIMATE_LABELS)
-        self._diagnostics = DiagnosticsPublisher(self)
+        self._signals = LabelledArrayPublisher(
+            self, topics.of_node(topics.SIGNALS), topics.SIGNAL_LABELS
+        )
+        self._estimates = LabelledArrayPublisher(
+            self, topics.of_node(topics.ESTIMATES), topics.ESTIMATE_LABELS
+        )
+        self._diagnostics = DiagnosticsPublisher(
+            self, p.word('io.joint') or self._io.publisher.topic_name
+        )
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         self._reference = self.create_subscription(
             Float64, topics.REFERENCE, self._on_reference, KEPT if self._lockstep else 1
@@ -96,15 +106,33 @@ class ControllerNode(ManagedNode):
         self._reports: Inbox | None = None
         if report_use(p) is not ReportUse.NEVER:
             self._reports = Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
+        self._diagnosis = Diagnosis(
+            self, self._io, output_qos(p, DEPTH), self._reference.qos_profile
+        )
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         offer_services(self, self)
-        self._live = LiveParameters(self, p, build_controller, self._take_up)
+        self._live = LiveParameters(
+            self, p, build_controller, self._take_up, lambda: self.loop is None
+        )
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         if not self._lockstep:
             self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
+        self._announce()
         if p.flag('autostart'):
             self.start()
+
+    def _announce(self) -> None:
+        """Say in the log what the node is about."""
+        p, output, control = self.settings, self._io.topics.output, self._io.topics.control
+        name, period = self.resolve_topic_name, p.real('sample_period')
+        self.log.info(
+            f'started: {name(output)} and {name(topics.REFERENCE)} in, {name(control)} out, '
+            f'sample_period {period:g} s ({1.0 / period:.4g} Hz); '
+            + (f'waits for {topics.REFERENCE} and {output}' if p.flag('autostart')
+               else 'autostart is false: waits for '
+                    f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
+        )
 
     @property
     def estimates_file(self) -> str:
@@ -119,7 +147,7 @@ class ControllerNode(ManagedNode):
     def configure(self) -> None:
         p = self._live.parameters
         inherited = load_estimate(p)
-        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited)
+        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited, self._counter)
         if inherited is not None:
             self.log.info(
                 f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
@@ -255,8 +283,6 @@ class ControllerNode(ManagedNode):
     def _follow_up(self, loop: ControlLoop, step: ControlStep, was_silent: bool) -> None:
         """Tell of a step."""
         self._publish_rows(loop, step)
-        if was_silent:
-            self.log.info(f'{self._io.topics.output} is back')
         if was_silent or step.estimate.status != self._told:
             self._told = step.estimate.status
             self._diagnose()
@@ -273,8 +299,19 @@ class ControllerNode(ManagedNode):
         ))
 
     def _take_up(self, p: Parameters) -> None:
+        before, self.settings = self.settings, p
         if self.loop is not None:
             self.loop.take_up(p)
+            return
+        self._saver.file = p.word('estimates.file')
+        if p['sample_period'] != before['sample_period']:
+            self._set_up(p, from_zero=False)
+
+    def _set_up(self, p: Parameters, from_zero: bool) -> None:
+        """Take up what follows from the sample period."""
+        period = p.real('sample_period')
+        self._give_way, self._period_ns = GIVE_WAY * period, period * 1e9
+        self._counter = SampleCounter(period, from_zero)
 
     def _look_for_silence(self) -> None:
         loop = self.loop
@@ -286,12 +323,7 @@ class ControllerNode(ManagedNode):
             return
         if time.monotonic() > loop.heard_at + timeout:
             loop.give_up()
-            action = self._live.parameters.word('on_timeout')
-            self.log.warning(
-                f'no {self._io.topics.output} for {timeout:g} s: is the driver running? '
-                f'on_timeout: {action}'
-            )
-            self._begin_ramp(loop, action)
+            self._begin_ramp(loop, self._live.parameters.word('on_timeout'))
             self._diagnose()
 
     def _begin_ramp(self, loop: ControlLoop, action: str) -> None:
@@ -326,42 +358,19 @@ class ControllerNode(ManagedNode):
             )
 
     def _diagnose(self) -> None:
-        values = values_of(self.loop) if self.loop is not None else {}
-        self._diagnostics.publish(*worst(self._findings()), values)
-
-    def _findings(self) -> list[Finding]:
-        loop, io = self.loop, self._io
+        loop = self.loop
         if loop is None:
-            return [(OK, 'unconfigured')]
+            self._diagnostics.publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), {})
+            return
+        values = values_of(loop)
         if not self.active:
-            return [(OK, 'inactive: no control is published')]
-        findings: list[Finding] = []
-        if self._driver is not None and self._driver.get_publisher_count() > 1:
-            findings.append((
-                WARN, f'{self._driver.get_publisher_count()} publishers of {io.topics.output}, '
-                'the first one is used: stop the others',
-            ))
-        if io.skipped:
-            findings.append((
-                WARN, f'{io.skipped} messages of {io.topics.output} without '
-                f'{self.settings.word("io.field")} of joint {self.settings.word("io.joint")!r}: '
-                f'set io.joint and io.field, the joints are {io.seen}',
-            ))
-        if loop.silent:
-            findings.append((WARN, f'no {io.topics.output}: is the driver running?'))
-        elif loop.last is None:
-            missing = io.topics.output if isfinite(loop.y_m) else topics.REFERENCE
-            findings.append((WARN, f'waiting for {missing}'))
-        else:
-            findings.append(STATES[loop.last.estimate.status])
-        timeout = self._live.parameters.real('timeout.reference')
-        if timeout > 0.0 and self._reference_at is not None and not self._lockstep \
-                and time.monotonic() > self._reference_at + timeout:
-            findings.append((
-                WARN, f'no {topics.REFERENCE} for more than {timeout:g} s, the last one is held: '
-                'publish it every sample, or set timeout.reference to 0',
-            ))
-        return findings
+            text = f'inactive: no {self._io.topics.control} is published'
+            self._diagnostics.publish(Finding(Level.OK, 'inactive', text), values)
+            return
+        findings, details = self._diagnosis.findings(
+            loop, self._live.parameters, self._reference_at
+        )
+        self._diagnostics.publish(worst(findings), {**details, **values})
 
 
 def main(args: list[str] | None = None) -> int:

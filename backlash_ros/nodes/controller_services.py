@@ -68,7 +68,8 @@ def offer_services(node: Node, served: Served) -> None:
         if loop is None:
             response.message = UNCONFIGURED
         elif not served.estimates_file:
-            response.message = 'estimates.file names no file: set it'
+            response.message = 'estimates.file is empty, so there is nowhere to save: start with ' \
+                '-p estimates.file:=PATH, or set it while unconfigured'
         elif not worth_saving(loop.estimate):
             response.message = 'nothing was learned yet'
         else:

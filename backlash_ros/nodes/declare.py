@@ -23,9 +23,19 @@ from backlash_ros.core.parameters import Parameters
 ROS_OWN = {'use_sim_time', 'start_type_description_service'}
 
 
-def declare_parameters(node: Node, executable: str) -> Parameters:
+# What decides on the topics and the life of a node stays as it was at its start.
+FIXED = (
+    'autostart', 'estimator.use_applied_control', 'io.best_effort', 'io.field', 'io.joint',
+    'io.style', 'lockstep', 'wait_for_subscribers',
+)
+
+
+def declare_parameters(
+    node: Node, executable: str, reconfigurable: bool = False,
+) -> Parameters:
     """Declare what the table says this executable uses; return the complete, checked set.
 
+    reconfigurable: whether all but the FIXED ones may change while the node is unconfigured.
     node: created with automatically_declare_parameters_from_overrides, the public way to learn
     which names were given: rclpy ignores a given name that nobody declares. Raises ParameterError.
     """
@@ -36,18 +46,19 @@ def declare_parameters(node: Node, executable: str) -> Parameters:
     for name in given:
         node.undeclare_parameter(name)
     node.declare_parameters('', [
-        (p.name, _ros_value(parameters[p.name]), describe(p))
+        (p.name, _ros_value(parameters[p.name]), describe(p, reconfigurable))
         for p in PARAMETERS if executable in p.used_by
     ], ignore_override=True)
     return parameters
 
 
-def describe(parameter: Parameter) -> ParameterDescriptor:
+def describe(parameter: Parameter, reconfigurable: bool = False) -> ParameterDescriptor:
     """What tools like rqt and `ros2 param describe` show."""
+    changes = parameter.live or (reconfigurable and parameter.name not in FIXED)
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         name=parameter.name, description=parameter.description + unit,
-        additional_constraints=_constraints(parameter), read_only=not parameter.live,
+        additional_constraints=_constraints(parameter), read_only=not changes,
     )
     if isfinite(parameter.low) and isfinite(parameter.high):
         if isinstance(parameter.default, float):
@@ -65,19 +76,26 @@ class LiveParameters:
     """Lets parameters change in a running node, all or nothing.
 
     check: raises ParameterError for a set that the node cannot take up. apply: takes it up.
+    is_free: whether those may change as well that are not live: the node is unconfigured.
     """
 
     def __init__(
         self, node: Node, parameters: Parameters, check: Callable[[Parameters], object],
-        apply: Callable[[Parameters], None],
+        apply: Callable[[Parameters], None], is_free: Callable[[], bool] = lambda: False,
     ) -> None:
         self.parameters = parameters
-        self._check, self._apply = check, apply
+        self._check, self._apply, self._is_free = check, apply, is_free
         node.add_pre_set_parameters_callback(_as_declared)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._post_set)
 
     def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
+        for change in changes:
+            if change.name in BY_NAME and not (BY_NAME[change.name].live or self._is_free()):
+                return SetParametersResult(successful=False, reason=(
+                    f'{change.name} is read-only while the node is configured: deactivate it and '
+                    'clean it up first'
+                ))
         try:
             self._check(self._with(changes))
         except ParameterError as error:

@@ -1,36 +1,121 @@
-"""What the controller says about its state in /diagnostics."""
+"""What the controller says about its state in /diagnostics: figures, findings, values."""
 
 from __future__ import annotations
 
-from diagnostic_msgs.msg import DiagnosticStatus
+import time
+from math import isfinite, isnan, nan
 
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.causes import Finding, Level, LoopFigures, Peer, findings_of
 from backlash_ros.nodes.control_loop import ControlLoop
+from backlash_ros.nodes.driver_io import DriverIo
+from backlash_ros.nodes.loop_statistics import Lately
+from backlash_ros.nodes.neighbours import publishers_of, rivals_of, subscribers_of
 
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-Finding = tuple[bytes, str]
 
-STATES: dict[Status, Finding] = {
-    Status.ACQUIRING: (OK, 'acquiring: the estimate still moves freely'),
-    Status.TRACKING: (OK, 'tracking'),
-    Status.NOT_EXCITED: (
-        WARN, 'frozen: v did not swing past the gap lately; move it wider',
-    ),
-    Status.NO_DATA: (WARN, 'frozen: plant_output is missing'),
-    Status.INCONSISTENT: (
-        ERROR,
-        'frozen: plant_output does not follow from v through G(z) and a backlash; '
-        'check the sensor, G(z), whether v is applied in time, estimator.output_noise_std '
-        'and estimator.bounds',
-    ),
-}
+class Diagnosis:
+    """Collects what is known of the loop and its neighbours, and says what is wrong with it.
+
+    output_qos, reference_qos: with which the controller listens.
+    """
+
+    def __init__(
+        self, node: Node, io: DriverIo, output_qos: QoSProfile, reference_qos: QoSProfile,
+    ) -> None:
+        self._node, self._io = node, io
+        self._output_qos, self._reference_qos = output_qos, reference_qos
+        self._lately = Lately()
+        self._consistent_at = time.monotonic()  # the newest look at which it was, or there was none
+
+    def findings(
+        self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
+    ) -> tuple[list[Finding], dict[str, object]]:
+        """What is to be said of an active loop, the likeliest cause first; details to it.
+
+        reference_at_s: when the newest y_m came, on the steady clock.
+        """
+        figures = self._figures(loop, p, reference_at_s)
+        findings = [*self._of_messages(p), *findings_of(figures)]
+        return findings, _details(findings, figures)
+
+    def _figures(
+        self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
+    ) -> LoopFigures:
+        statistics, io, node = loop.statistics, self._io, self._node
+        lately = self._lately.gained({
+            'used': statistics.used, 'without_reference': statistics.without_reference,
+            'lost': statistics.lost, 'unsent': statistics.unsent, 'late': loop.commands.late,
+            'bad_outputs': statistics.bad_outputs,
+            'bad_references': statistics.bad_references, 'limited': statistics.limited,
+            'unreported': loop.commands.unreported,
+        }, time.monotonic())
+        status = None if loop.last is None else loop.last.estimate.status
+        if status != Status.INCONSISTENT:
+            self._consistent_at = time.monotonic()
+        gap = loop.estimate.c_r - loop.estimate.c_l
+        timeout = p.real('timeout.reference')
+        overdue = reference_at_s is not None and not p.flag('lockstep') \
+            and 0.0 < timeout < time.monotonic() - reference_at_s
+        control = io.topics.control
+        return LoopFigures(
+            p.real('sample_period'),
+            publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
+            publishers_of(node, topics.REFERENCE, Float64, self._reference_qos),
+            subscribers_of(node, control, io.topics.control_type), rivals_of(node, control),
+            status=status, inconsistent_s=time.monotonic() - self._consistent_at,
+            adapting=loop.adapting,
+            silent_s=p.real('timeout.plant_output') if loop.silent else 0.0,
+            on_timeout=p.word('on_timeout'),
+            referred=isfinite(loop.y_m),
+            reference_silent_s=timeout if overdue else 0.0,
+            # In lockstep the outputs come as fast as the machine goes.
+            intervals_s=(nan, nan, nan) if p.flag('lockstep') else statistics.intervals_s(),
+            still=statistics.still,
+            v_swing=statistics.still_swing / gap if gap > 0.0 else 0.0,
+            **lately,
+        )
+
+    def _of_messages(self, p: Parameters) -> list[Finding]:
+        io = self._io
+        if not io.skipped:
+            return []
+        return [Finding(
+            Level.ERROR, 'joint', f'{io.topics.output} has no {p.word("io.field")} of joint '
+            f'{p.word("io.joint")!r}: set io.joint, io.field',
+        )]
+
+
+def _details(findings: list[Finding], figures: LoopFigures) -> dict[str, object]:
+    """All findings, and who is on the topics where that matters."""
+    details: dict[str, object] = {
+        f'finding {i}': finding.text for i, finding in enumerate(findings, start=1)
+    }
+    for topic, what in (
+        (figures.output, 'published by'), (figures.reference, 'published by'),
+        (figures.control, 'heard by'),
+    ):
+        details[f'{topic.name} {what}'] = _names(topic.peers)
+    if figures.rivals:
+        details[f'{figures.control.name} also published by'] = ', '.join(figures.rivals)
+    return details
+
+
+def _names(peers: tuple[Peer, ...]) -> str:
+    return ', '.join(
+        peer.name + (f' ({peer.kind}: does not fit)' if peer.unfit else '') for peer in peers
+    ) or 'nobody'
 
 
 def worst(findings: list[Finding]) -> Finding:
-    """The highest level, and all that was found, the worst first."""
-    ordered = sorted(findings, key=lambda finding: finding[0], reverse=True)
-    troubles = [text for level, text in ordered if level != OK]
-    return ordered[0][0], '; '.join(troubles or [ordered[0][1]])
+    """The likeliest cause at the highest level that was found: that of the whole node."""
+    first = next((finding for finding in findings if finding.level != Level.OK), findings[0])
+    return first._replace(level=max(finding.level for finding in findings))
 
 
 def counts_of(loop: ControlLoop) -> dict[str, int]:
@@ -50,8 +135,8 @@ def counts_of(loop: ControlLoop) -> dict[str, int]:
 def values_of(loop: ControlLoop) -> dict[str, object]:
     """Counts, estimates and what tells how well the loop runs."""
     statistics, e = loop.statistics, loop.estimate
-    rate, swing = statistics.since_last_look()
-    gap = e.c_r - e.c_l
+    gap, swing = e.c_r - e.c_l, statistics.swing()
+    _, mean_s, _ = statistics.intervals_s()
     return {
         **counts_of(loop),
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
@@ -60,7 +145,7 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
         'using applied_control': loop.commands.uses_reports,
         # Above 1 the gap is crossed, without which nothing can be learned of it.
         'excitation: swing of v / gap': swing / gap if gap > 0.0 else swing,
-        'rate [Hz]': rate,
+        'rate [Hz]': 0.0 if isnan(mean_s) or mean_s <= 0.0 else 1.0 / mean_s,
         'latency p50 [ms]': statistics.latency_ms(0.5),
         'latency p99 [ms]': statistics.latency_ms(0.99),
     }

@@ -85,7 +85,8 @@ class Timing:
     index: NDArray[np.intp]
     period_s: float
     missing: int
-    repeated: int
+    repeated: int  # with the value of the one before
+    early: int  # with another value, but long before they were due
     lateness: float  # of a period, exceeded by 1 % of the samples
     fits: bool  # the period is the one of the parameters
 
@@ -137,7 +138,7 @@ def _qos(graph: Graph, accepts_best_effort: bool) -> Finding:
 
 
 def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
-    """Sort out repetitions and count the samples; None where there are too few."""
+    """Sort out what came twice or early, and count the samples; None where there are too few."""
     outputs, repeated = _without_doubles(heard.outputs, sample_period_s)
     if len(outputs) < FEWEST_SAMPLES:
         return None
@@ -151,7 +152,7 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
             missing += arrival.missing
             index.append(counter.index)
             samples.append(message)
-    repeated += len(outputs) - len(samples)
+    early = len(outputs) - len(samples)
     outputs, stamps = samples, np.array([message.stamp_ns for message in samples], dtype=np.int64)
     numbers = np.array(index, dtype=np.intp) - index[0]
     slope, offset = np.polyfit(numbers, (stamps - stamps[0]) * 1e-9, 1)
@@ -164,7 +165,7 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
     period = float(slope) if steady else rough * 1e-9
     tolerance = PERIOD_TOLERANCE if steady else UNSTEADY_TOLERANCE
     return Timing(
-        outputs, numbers, period, missing, repeated, lateness,
+        outputs, numbers, period, missing, repeated, early, lateness,
         abs(period / sample_period_s - 1.0) <= tolerance,
     )
 
@@ -233,7 +234,12 @@ def _repetition(timing: Timing) -> Finding:
     if timing.repeated:
         return Finding(
             'repeated samples', WRONG, f'{timing.repeated} came twice',
-            'publish each sample once; take out the relay that doubles them',
+            'publish each sample once: take out what doubles them, a second timer or a relay',
+        )
+    if timing.early > LOSS * len(timing.outputs):
+        return Finding(
+            'repeated samples', WRONG, f'{timing.early} came right after the one before',
+            'let the timer of the driver leave out what it has missed instead of catching up',
         )
     share = _held_share(np.array([message.value for message in timing.outputs]))
     if share > HELD:

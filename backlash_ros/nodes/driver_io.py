@@ -60,6 +60,7 @@ class DriverIo:
     """What a node says to the driver and hears from it, in the messages that io.style names.
 
     skipped: messages without the joint. seen: the joints of the newest one of them.
+    simulated_time: whether stamps are those of /clock.
     """
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
@@ -68,8 +69,14 @@ class DriverIo:
         self.topics = STYLES[p.word('io.style')]
         self._joint, self._field = p.word('io.joint'), p.word('io.field')
         # On simulated time the stamps of the middleware, which are real time, say nothing.
-        self._simulated_time = bool(node.get_parameter('use_sim_time').value)
+        self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._publisher: Publisher | None = None
+
+    @property
+    def publisher(self) -> Publisher:
+        """That of v, once it is advertised."""
+        assert self._publisher is not None
+        return self._publisher
 
     @property
     def listeners(self) -> int:
@@ -79,14 +86,14 @@ class DriverIo:
     def now_ns(self) -> int:
         """Time on the clock of the stamps."""
         # time.time_ns() is the system clock of ROS, without the detour.
-        return self._node.get_clock().now().nanoseconds if self._simulated_time \
+        return self._node.get_clock().now().nanoseconds if self.simulated_time \
             else time.time_ns()
 
     def listen(self, hear: Callable[[Output], None], depth: int) -> Subscription:
         """Call hear with every y."""
         def hear_number(message: Float64, info: dict[str, Any]) -> None:
             sent_ns = info['source_timestamp']
-            stamp_ns = self.now_ns() if self._simulated_time else sent_ns
+            stamp_ns = self.now_ns() if self.simulated_time else sent_ns
             hear(Output(
                 message.data, stamp_ns, sent_ns, info['received_timestamp'],
                 info['publication_sequence_number'],
@@ -128,8 +135,7 @@ class DriverIo:
 
     def wait_until_received(self, timeout_s: float) -> None:
         """Wait until the driver has confirmed the newest v, or the timeout is over."""
-        assert self._publisher is not None
-        self._publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
+        self.publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
 
     def _row(self, names: list[str], count: int) -> int:
         """Row of the joint, -1 where it is missing."""

@@ -24,7 +24,7 @@ class ManagedNode(LifecycleNodeMixin, ProcessNode):
 
     def __init__(self, executable: str) -> None:
         """Raises ParameterError."""
-        ProcessNode.__init__(self, executable)
+        ProcessNode.__init__(self, executable, reconfigurable=True)
         LifecycleNodeMixin.__init__(self)
         self._refuse_what_does_not_fit()
 

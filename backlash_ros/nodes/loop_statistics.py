@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from math import inf, nan
 
 REMEMBERED = 1000  # latencies that p50 and p99 are taken of
+FEWEST, MOST = 20, 50  # intervals that the rate of y is taken of
+WINDOW_S = 3.0  # what counts as lately
 
 
 @dataclass
@@ -18,22 +21,47 @@ class LoopStatistics:
     lost: int = 0  # outputs that never arrived
     unsent: int = 0  # of these, the ones that the driver never published
     dropped: int = 0  # messages that held no finite number
+    bad_outputs: int = 0  # of these, the ones of y
+    bad_references: int = 0  # and of y_m
     extra: int = 0  # outputs that were repeated, too early, old or of a second driver
     interruptions: int = 0  # times that the driver was silent or began anew
     without_reference: int = 0  # outputs before the first y_m
     limited: int = 0  # commands that met a limit
+    still: int = 0  # newest values of y in a row that are equal
+    still_swing: float = 0.0  # how far v has moved meanwhile
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MOST + 1))
+    _y: float = nan
     _v_low: float = inf
     _v_high: float = -inf
-    _looked_at: float = field(default_factory=time.monotonic)
-    _used_before: int = 0
+    _still_low: float = inf
+    _still_high: float = -inf
 
-    def note(self, v: float, limited: bool, latency: float) -> None:
-        """Count a command."""
+    def note_arrival(self, stamp_ns: int) -> None:
+        """Note a message of y, whatever it is worth."""
+        self._stamps_ns.append(stamp_ns)
+
+    def note(self, y: float, v: float, limited: bool, latency: float) -> None:
+        """Count an output and the command that it brought."""
         self.used += 1
         self.limited += limited
         self.latencies.append(latency)
         self._v_low, self._v_high = min(v, self._v_low), max(v, self._v_high)
+        if y != self._y:
+            self._y, self.still, self._still_low, self._still_high = y, 0, v, v
+        self.still += 1
+        self._still_low, self._still_high = min(v, self._still_low), max(v, self._still_high)
+        self.still_swing = self._still_high - self._still_low
+
+    def note_bad_output(self) -> None:
+        """Count a y that is no number."""
+        self.dropped += 1
+        self.bad_outputs += 1
+
+    def note_bad_reference(self) -> None:
+        """Count a y_m that is no number."""
+        self.dropped += 1
+        self.bad_references += 1
 
     def latency_ms(self, share: float) -> float:
         """Latency that this share of the latest commands stayed below; nan without any."""
@@ -42,11 +70,35 @@ class LoopStatistics:
         ordered = sorted(self.latencies)
         return ordered[min(int(share * len(ordered)), len(ordered) - 1)] * 1e3
 
-    def since_last_look(self) -> tuple[float, float]:
-        """Rate of commands [Hz] and swing of v since the last call."""
-        now = time.monotonic()
-        passed = max(now - self._looked_at, 1e-9)
-        rate, swing = (self.used - self._used_before) / passed, self._v_high - self._v_low
-        self._looked_at, self._used_before = now, self.used
+    def intervals_s(self) -> tuple[float, float, float]:
+        """Newest intervals between messages of y: low, mean and high [s]; nan while few.
+
+        A tenth of them is shorter than low, a tenth longer than high.
+        """
+        intervals = sorted(later - earlier for earlier, later in pairwise(self._stamps_ns))
+        if len(intervals) < FEWEST:
+            return nan, nan, nan
+        tenth = len(intervals) // 10
+        mean = sum(intervals) / len(intervals)
+        return 1e-9 * intervals[tenth], 1e-9 * mean, 1e-9 * intervals[-1 - tenth]
+
+    def swing(self) -> float:
+        """Swing of v since the last call."""
+        swing = max(self._v_high - self._v_low, 0.0)
         self._v_low, self._v_high = inf, -inf
-        return rate, max(swing, 0.0)
+        return swing
+
+
+class Lately:
+    """What counters have gained within the last WINDOW_S, or a little more."""
+
+    def __init__(self) -> None:
+        self._looks: deque[tuple[float, Mapping[str, int]]] = deque()
+
+    def gained(self, counts: Mapping[str, int], now_s: float) -> dict[str, int]:
+        """Take in the counters as they are now [s] and return what each has gained lately."""
+        while len(self._looks) > 1 and self._looks[1][0] <= now_s - WINDOW_S:
+            self._looks.popleft()
+        before = self._looks[0][1] if self._looks else {}
+        self._looks.append((now_s, counts))
+        return {name: count - before.get(name, 0) for name, count in counts.items()}

@@ -15,6 +15,8 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
+from backlash_ros.nodes.causes import Finding, Level
+from backlash_ros.nodes.level_log import LevelLog
 
 # Deep enough that a recorder which is held up for a second misses nothing.
 DEPTH = 1000
@@ -53,25 +55,44 @@ class LabelledArrayPublisher:
 
 
 class DiagnosticsPublisher:
-    """Publishes the state of one node to /diagnostics."""
+    """Publishes the state of one node to /diagnostics, and its changes to the log.
 
-    def __init__(self, node: Node) -> None:
+    hardware_id: what the node has to do with. logs: False for a node that says itself what has
+    changed.
+    """
+
+    def __init__(self, node: Node, hardware_id: str, logs: bool = True) -> None:
         self._node = node
         self._publisher = node.create_publisher(
             DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=without_events()
         )
-        self._status = DiagnosticStatus(name=node.get_fully_qualified_name().strip('/'))
+        self._status = DiagnosticStatus(
+            name=node.get_fully_qualified_name().strip('/'), hardware_id=hardware_id
+        )
         self._message = DiagnosticArray(status=[self._status])
+        self._log = LevelLog(self._write) if logs else None
 
-    def publish(self, level: bytes, text: str, values: Mapping[str, object]) -> None:
-        """level: of DiagnosticStatus. text: what is going on, and what to do if it is wrong."""
-        self._status.level, self._status.message = level, text
+    def publish(self, finding: Finding, values: Mapping[str, object]) -> None:
+        """finding: what is going on, and what to do if it is wrong. values: details to it."""
+        self._status.level, self._status.message = bytes([finding.level]), finding.text
         self._status.values = [
             KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
             for key, value in values.items()
         ]
         self._message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(self._message)
+        if self._log is not None:
+            self._log.take(finding, time.monotonic())
+
+    def _write(self, level: Level, text: str) -> None:
+        # rclpy remembers a severity for each place in the code.
+        log = Node.get_logger(self._node)
+        if level == Level.OK:
+            log.info(text)
+        elif level == Level.WARN:
+            log.warning(text)
+        else:
+            log.error(text)
 
 
 def clock_message(stamp_ns: int) -> Clock:

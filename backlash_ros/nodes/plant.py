@@ -8,14 +8,17 @@ from math import isfinite
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameter_table import PLANT
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.causes import TROUBLE, Finding, Level
+from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.events import emit
+from backlash_ros.nodes.loop_statistics import Lately
 from backlash_ros.nodes.messages import (
     DEPTH,
     KEPT,
@@ -30,6 +33,7 @@ from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
 DIAGNOSTICS_PERIOD_S = 1.0
 # Share of a period after which it is too late to publish an output: it would look like the next.
 LATEST = 0.75
+LATE, MISSED, NOT_FINITE = 'late controls', 'missed outputs', 'non-finite controls dropped'
 
 
 class PlantNode(ProcessNode):
@@ -63,17 +67,28 @@ class PlantNode(ProcessNode):
         self._latest_ns = 0
         self._outputs = 0  # published
         self._newest = 0  # samples up to the newest of these outputs
-        self._counts = {'late controls': 0, 'missed outputs': 0, 'non-finite controls dropped': 0}
+        self._counts = {LATE: 0, MISSED: 0, NOT_FINITE: 0}
+        self._lately = Lately()
         self._truth_rows: list[tuple[float, ...]] = []
         self._output_message, self._applied_message = Float64(), Float64()
         self._applied = self.create_publisher(Float64, topics.APPLIED_CONTROL, DEPTH)
         self._output = self.create_publisher(Float64, topics.PLANT_OUTPUT, DEPTH)
-        self._truth = LabelledArrayPublisher(self, topics.TRUTH, topics.TRUTH_LABELS)
-        self._diagnostics = DiagnosticsPublisher(self)
+        self._truth = LabelledArrayPublisher(
+            self, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
+        )
+        self._diagnostics = DiagnosticsPublisher(self, 'simulated plant')
         if self._lockstep:
             self._time = self.create_publisher(Clock, topics.CLOCK, KEPT)
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
+        LiveParameters(self, p, build_plant, self._take_up)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
+        name, outputs = self.resolve_topic_name, topics.PLANT_OUTPUT
+        self.log.info(
+            f'started: {name(topics.CONTROL)} in, {name(outputs)} out, '
+            f'sample_period {self._sample_period:g} s ({1.0 / self._sample_period:.4g} Hz)'
+            + (f'; waits for {wanted} subscribers of {outputs}' if (
+                wanted := p.integer('wait_for_subscribers')) else '')
+        )
         self.call_when(
             self._has_listeners, self._start, f'subscribers of {topics.PLANT_OUTPUT}'
         )
@@ -93,6 +108,11 @@ class PlantNode(ProcessNode):
             f'{self._plant.sample} samples' + (f', {counts}' if counts else '')
         )
 
+    def _take_up(self, p: Parameters) -> None:
+        plant = build_plant(p)
+        plant.go_on_from(self._plant)
+        self._plant, self._loss = plant, p.real('output_loss')
+
     def _has_listeners(self) -> bool:
         wanted = self.settings.integer('wait_for_subscribers')
         # One of several is a recorder, which wants to hear everything.
@@ -110,7 +130,7 @@ class PlantNode(ProcessNode):
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
         v = message.data
         if not isfinite(v):
-            self._counts['non-finite controls dropped'] += 1
+            self._counts[NOT_FINITE] += 1
             return
         self._v_before, self._v, self._heard = self._v, v, True
         self._arrived_ns = arrival_ns(info['received_timestamp'])
@@ -131,8 +151,8 @@ class PlantNode(ProcessNode):
         """Real time: simulate up to this tick and publish y; return whether to go on."""
         passed = tick - self._tick
         if self._expecting and self._heard:
-            self._counts['late controls'] += 1
-        self._counts['missed outputs'] += max(passed - 1, 0)
+            self._counts[LATE] += 1
+        self._counts[MISSED] += max(passed - 1, 0)
         self._tick = tick
         self._latest_ns = due_ns + int(LATEST * self._sample_period * 1e9)
         # Of the intervals that ended while the process was held up, some were over before v came.
@@ -166,7 +186,7 @@ class PlantNode(ProcessNode):
         if self._lockstep:
             self._time.publish(clock_message(round(sample * self._sample_period * 1e9)))
         elif time.monotonic_ns() > self._latest_ns:
-            self._counts['missed outputs'] += 1
+            self._counts[MISSED] += 1
             return False
         self._expecting = True
         self._output.publish(self._output_message)
@@ -191,12 +211,31 @@ class PlantNode(ProcessNode):
             })
 
     def _diagnose(self) -> None:
-        troubled = any(self._counts.values())
+        counts = {'samples': self._plant.sample, **self._counts}
         self._diagnostics.publish(
-            DiagnosticStatus.WARN if troubled else DiagnosticStatus.OK,
-            'the loop is too slow for its sample period' if troubled else 'running',
-            {'samples': self._plant.sample, **self._counts},
+            _finding(self._lately.gained(counts, time.monotonic())), counts
         )
+
+
+def _finding(lately: dict[str, int]) -> Finding:
+    """What the counts of the last few seconds say."""
+    samples = max(lately['samples'], 1)
+    late, missed = lately[LATE] / samples, lately[MISSED] / samples
+    if lately[NOT_FINITE]:
+        text = f'{lately[NOT_FINITE]} {topics.CONTROL} messages lately were no finite number: ' \
+               'the old one holds'
+        return Finding(Level.WARN, 'bad controls', text)
+    if missed > TROUBLE:
+        return Finding(
+            Level.WARN, 'missed', f'{missed:.2%} of {topics.PLANT_OUTPUT} was left out: '
+            'the machine is too slow for sample_period',
+        )
+    if late > TROUBLE:
+        return Finding(
+            Level.WARN, 'late', f'{late:.2%} of {topics.CONTROL} came too late or not at all: '
+            'is the controller slow or gone?',
+        )
+    return Finding(Level.OK, 'running', 'running')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -15,7 +15,7 @@ from math import nan
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from rosbags.interfaces import Connection
@@ -27,6 +27,7 @@ from backlash_ros.bags.content import CURE
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.core.parameter_table import RECORDER
 from backlash_ros.nodes.bag import Bag, RecordingError
+from backlash_ros.nodes.causes import Finding, Level
 from backlash_ros.nodes.driver_io import STYLES, output_qos
 from backlash_ros.nodes.events import ENABLED, emit
 from backlash_ros.nodes.messages import DiagnosticsPublisher, stamp_ns_of
@@ -136,8 +137,9 @@ class RecorderNode(ProcessNode):
         self._progress = Progress()
         if p.word('bag'):
             self._open_bag(p.word('bag'), p.word('storage'))
+            self.log.info(f"started: records to {p.word('bag')} ({p.word('storage')})")
         else:
-            self.log.info('nothing is recorded: the parameter bag names no folder')
+            self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
         self._driver = STYLES[p.word('io.style')]
         wanted = (*NEEDED_PUBLISHERS, self._driver.control)
@@ -165,7 +167,11 @@ class RecorderNode(ProcessNode):
             idle = idle + 1 if received == self._received else 0
 
     def finish(self) -> None:
-        self._with_bag(Bag.close)
+        bag = self._bag
+        if self._with_bag(Bag.close) and bag is not None:
+            self.log.info(
+                f'recorded {bag.saved} messages of {bag.saved_ns * 1e-9:.1f} s to {bag.path}'
+            )
         for channel in self._channels:
             if channel.missed:
                 self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
@@ -188,7 +194,7 @@ class RecorderNode(ProcessNode):
                 'the installed version of rosbags cannot be flushed: a crash of the recorder or a '
                 'power cut loses everything. Install the version that requirements/run.txt names'
             )
-        self._diagnostics = DiagnosticsPublisher(self)
+        self._diagnostics = DiagnosticsPublisher(self, path, logs=False)
         self.create_timer(
             FLUSH_PERIOD_S, lambda: self._with_bag(Bag.flush), clock=self.steady_clock
         )
@@ -258,10 +264,13 @@ class RecorderNode(ProcessNode):
         if self._diagnostics is None:
             return
         if self._bag is None:
-            self._diagnostics.publish(DiagnosticStatus.ERROR, self.failure, {})
+            text = 'recording stopped, all else goes on: see reason'
+            self._diagnostics.publish(
+                Finding(Level.ERROR, 'stopped', text), {'reason': self.failure}
+            )
             return
         folder = self._bag.path
-        self._diagnostics.publish(DiagnosticStatus.OK, f'recording to {folder}', {
+        self._diagnostics.publish(Finding(Level.OK, 'recording', f'recording to {folder}'), {
             'saved messages': self._bag.saved, 'free on the disk [MB]': _free_megabytes(folder),
         })
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from math import inf
 
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
@@ -12,23 +11,24 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.parameter_table import REFERENCE
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.reference_signal import PERIODIC
+from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
 from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.reference_pace import ReferencePace
 from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import ProcessNode, run
 
-# plant_output counts as silent after this; then the own clock takes over.
-SILENT_PERIODS, SHORTEST_SILENCE_S = 3.0, 0.1
-LONGEST_SLEEP_S = 0.05  # so that the end of the process is noticed
+LONGEST_SLEEP_S = 0.05  # so that signals and requests are noticed
 
 
 class ReferenceNode(ProcessNode):
     """Publishes y_m for the sample that comes next.
 
-    plant_output is the sampling clock: with y(k), y_m of sample k+1 leaves and is there in time.
-    Where no output comes, y_m goes on by the own clock; a node that waits for its subscribers
+    plant_output is the sampling clock, see ReferencePace; a node that waits for its subscribers
     stays at y_m(0) before the first output, so that the run begins at t = 0. In lockstep y_m
     leaves once per tick of /clock.
     """
@@ -37,19 +37,29 @@ class ReferenceNode(ProcessNode):
         super().__init__(REFERENCE)
         p = self.settings
         self._signal = build_reference(p)
+        self._offset_s = 0.0  # keeps the phase where the frequency changes
+        self._newest = 0  # sample that was published last
         self._sample_period = p.real('sample_period')
         self._lockstep = p.flag('lockstep')
         self._started = False
         self._io = DriverIo(self, p)
         self._counter = SampleCounter(self._sample_period)
-        self._sample = 0  # the one that comes next
-        self._heard_at = -inf  # on the steady clock [s]
         self._message = Float64()
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, KEPT if self._lockstep else DEPTH
         )
         listeners = p.integer('wait_for_subscribers')
-        self._waits = listeners > 0
+        self._pace = ReferencePace(
+            self._sample_period, begins_with_output=listeners > 0, now_s=time.monotonic(),
+            own_clock=not self._io.simulated_time,
+        )
+        LiveParameters(self, p, build_reference, self._take_up)
+        name = self.resolve_topic_name
+        self.log.info(
+            f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
+            f'{p.word("waveform")}, sample_period {self._sample_period:g} s'
+            + (f'; waits for {listeners} subscribers of {topics.REFERENCE}' if listeners else '')
+        )
         self.call_when(
             lambda: self._output.get_subscription_count() >= listeners, self._start,
             f'{listeners} subscribers of {topics.REFERENCE}',
@@ -69,23 +79,34 @@ class ReferenceNode(ProcessNode):
         In between the process sleeps: woken by each output it would take the processor from the
         controller, which has to answer it.
         """
-        period = self._sample_period
-        silence = max(SILENT_PERIODS * period, SHORTEST_SILENCE_S)
-        due = time.monotonic()
+        pace = self._pace
         while not self.stopping:
-            remaining = due - time.monotonic()
-            if remaining > 0.0:
-                time.sleep(min(remaining, LONGEST_SLEEP_S))
+            now = time.monotonic()
+            remaining = max(pace.look_s(now) - now, 0.0)
+            if not pace.listens(now):
+                if remaining < LONGEST_SLEEP_S:
+                    time.sleep(remaining)
+                else:
+                    executor.spin_once(timeout_sec=LONGEST_SLEEP_S)
                 continue
             executor.spin_once(timeout_sec=0.0)  # the newest output
-            self._publish(self._sample)
             now = time.monotonic()
-            if now <= self._heard_at + silence:
-                due = max(self._heard_at + 1.5 * period, now)
-            else:
-                due = max(due + period, now)
-                if self._counter.index >= 0 or not self._waits:
-                    self._sample += 1
+            sample = pace.sample_to_send(now)
+            if sample is not None:
+                self._publish(sample)
+            elif pace.listens(now):
+                # It is late, and y_m leaves as soon as it is there.
+                executor.spin_once(timeout_sec=min(remaining, LONGEST_SLEEP_S))
+
+    def _take_up(self, p: Parameters) -> None:
+        """Use another signal from the next sample on; a sine goes on without a jump."""
+        before, self._signal = self._signal, build_reference(p)
+        if self._signal.waveform in PERIODIC:
+            t = self._newest * self._sample_period
+            phase = before.frequency * (t + self._offset_s)
+            self._offset_s = phase / self._signal.frequency - t
+        else:
+            self._offset_s = 0.0
 
     def _start(self) -> None:
         self._started = True
@@ -99,18 +120,13 @@ class ReferenceNode(ProcessNode):
         self._publish(round(stamp_ns_of(message) * 1e-9 / self._sample_period))
 
     def _on_output(self, output: Output) -> None:
-        before = self._counter.index
-        if not self._counter.count(output.stamp_ns, output.sequence).is_sample:
-            return
-        if before < 0 and self._waits:
-            self._sample = self._counter.index + 1
-        else:
-            self._sample += self._counter.index - before if before >= 0 else 1
-        self._heard_at = arrival_ns(output.received_ns) * 1e-9
+        if self._counter.count(output.stamp_ns, output.sequence).is_sample:
+            self._pace.hear(self._counter.index, arrival_ns(output.received_ns) * 1e-9)
 
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.
-        self._message.data = self._signal(sample * self._sample_period)
+        self._newest = sample
+        self._message.data = self._signal(sample * self._sample_period + self._offset_s)
         self._output.publish(self._message)
 
 

@@ -50,12 +50,15 @@ class SampleCounter:
     sample k-1. The larger count is believed. A sender that does not keep time, like one that
     answers each control at once, is counted by number alone as long as it is not late.
 
-    index: of the newest sample, -1 before the first. Where messages are numbered, it is the count
-    of the sender, which begins with 1. due_ns: when that sample was due at the sender.
+    index: of the newest sample, -1 before the first. due_ns: when that sample was due at the
+    sender. from_zero: the first index is the count of the sender, which begins with 1, where
+    messages are numbered, else 0. Otherwise it is the time of the first sample in periods, so that
+    who is started anew goes on where the one before has ended, and no index is used twice.
     """
 
-    def __init__(self, sample_period_s: float) -> None:
+    def __init__(self, sample_period_s: float, from_zero: bool = True) -> None:
         self.index, self.due_ns = -1, 0.0
+        self._from_zero = from_zero
         self._period_ns = sample_period_s * 1e9
         self._sequence = 0  # of the newest sample
         self._repeated = 0  # of the newest message that followed it too early to be a sample
@@ -67,7 +70,10 @@ class SampleCounter:
         """Take in a message and say what it is."""
         numbered = sequence != UNNUMBERED
         if self.index < 0:
-            self.index = max(sequence - 1, 0) if numbered else 0
+            if not self._from_zero:
+                self.index = round(stamp_ns / self._period_ns)
+            else:
+                self.index = max(sequence - 1, 0) if numbered else 0
             self._begin(stamp_ns, sequence)
             return Arrival(is_sample=True)
         period = self._period_ns

@@ -26,11 +26,12 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.parameter_table import PARAMETERS
+from backlash_ros.core.parameter_table import PARAMETERS, as_yaml
 from backlash_ros.loopback import prefer_loopback
 from backlash_ros.nodes.declare import declare_parameters
 from backlash_ros.nodes.goodbye import exit_at_the_latest
 from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.unused_sections import complaints
 from backlash_ros.stale_ports import remove_stale_ports
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
@@ -45,8 +46,13 @@ NAP_NS = 3_000_000
 class ProcessNode(Node):
     """A node that is the purpose of its process: parameters checked, then work until stopped."""
 
-    def __init__(self, executable: str, parameters_of: str = '') -> None:
-        """parameters_of: the executable whose parameters it reads. Raises ParameterError."""
+    def __init__(
+        self, executable: str, parameters_of: str = '', reconfigurable: bool = False,
+    ) -> None:
+        """parameters_of: the executable whose parameters it reads. Raises ParameterError.
+
+        reconfigurable: whether parameters may change while the node is unconfigured.
+        """
         try:
             super().__init__(executable, automatically_declare_parameters_from_overrides=True)
         except ValueError:
@@ -54,7 +60,9 @@ class ProcessNode(Node):
                 executable, None, 'has a parameter without a value', 'give it one or leave it out'
             ) from None
         self.log = Node.get_logger(self)
-        self.settings = declare_parameters(self, parameters_of or executable)
+        self.settings = declare_parameters(
+            self, parameters_of or executable, reconfigurable
+        )
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.stopping = False
         self.exit_code = DONE
@@ -139,13 +147,17 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
     if reason:
         return _refuse(executable, reason)
     try:
-        _parse_plain_arguments(executable, args)
+        _parse_plain_arguments(executable, make_node, args)
         for line in remove_stale_ports():
             print(f'{executable}: {line}', file=sys.stderr)
         try:
             node = make_node()
         except (ParameterError, NameValidationException) as error:
             return _refuse(executable, str(error))
+        for complaint in complaints(
+            sys.argv[1:] if args is None else args, executable, node.get_fully_qualified_name()
+        ):
+            node.log.warning(complaint)
         signals.stop_at_arrival(node)
         code = FAILED  # unless the work comes to its end
         try:
@@ -204,17 +216,25 @@ class _Parser(argparse.ArgumentParser):
                              '--ros-args -p NAME:=VALUE or --params-file FILE\n')
 
 
-def _parse_plain_arguments(executable: str, args: list[str] | None) -> None:
+def _parse_plain_arguments(
+    executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None,
+) -> None:
     """Refuse what is no argument of ROS; print help where asked for."""
     parser = _Parser(
         prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
-        description='Parameters:', formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog='\n'.join(
-            f'  {p.name} ({p.default}): {p.description}' for p in PARAMETERS
-            if executable in p.used_by
-        ),
+        description=sys.modules[make_node.__module__].__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter, epilog=_parameter_help(executable),
     )
     parser.parse_args(remove_ros_args(sys.argv[1:] if args is None else args))
+
+
+def _parameter_help(executable: str) -> str:
+    used = [p for p in PARAMETERS if executable in p.used_by]
+    return 'parameters, with their defaults (* may change in a running node):\n' + '\n'.join(
+        f'{"*" if p.live else " "} {p.name}: {as_yaml(p.default)}\n      {p.description}'
+        + (f' [{p.unit}]' if p.unit else '')
+        + (f' (one of {", ".join(p.choices)})' if p.choices else '') for p in used
+    )
 
 
 def _initialise(args: list[str] | None) -> str:

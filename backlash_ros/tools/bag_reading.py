@@ -16,6 +16,7 @@ from backlash_ros import topics
 from backlash_ros.bags.content import CURE, BagError, is_being_written
 from backlash_ros.bags.remains import open_remains, visible_damage
 from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.tools.bag_sections import WHOLE, Span, Table, choose, choose_namespace
 from backlash_ros.tools.errors import InputError
 
 LABELS = {
@@ -41,13 +42,15 @@ class BagRun:
 
     latency_s: arrival of y(k) to departure of v(k), shape (N,), nan where unknown.
     unpaired: samples left out because only one of signals and estimates was recorded. damage:
-    what is wrong with the bag and the cure, empty if it is complete.
+    what is wrong with the bag and the cure, empty if it is complete. notes: what else is in the
+    bag, a sentence each.
     """
 
     run: RunRecord
     latency_s: NDArray[np.float64]
     unpaired: int
     damage: str = ''
+    notes: tuple[str, ...] = ()
 
 
 @dataclass
@@ -62,32 +65,30 @@ class _Content:
         self.messages.setdefault(name, []).append((stamp_ns, message))
 
 
-@dataclass
-class _Table:
-    """Messages of one array topic: columns by label, and a stamp [ns] for each row."""
-
-    columns: dict[str, NDArray[np.float64]] = field(default_factory=dict)
-    stamps: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-    @property
-    def sample(self) -> NDArray[np.int64]:
-        return self.columns['sample'].astype(np.int64)
-
-
-def read_bag(path: Path, sample_period: float | None = None) -> BagRun:
+def read_bag(
+    path: Path, sample_period: float | None = None, span: Span = WHOLE, axis: str = '',
+) -> BagRun:
     """Join the signals, estimates and truth of a bag on their sample count.
 
     t = (sample - first) * sample_period; None takes the median distance of the stamps. A gap in
     the count is a lost sample. Of a bag that was never closed, or is damaged, what is left is
-    read, and nothing is changed. Raises InputError, in one line, for a bag that cannot be read or
-    holds no run.
+    read, and nothing is changed. Where the controller was started anew, it is what the last one
+    did within the span. axis: of several, empty for the first one. Raises InputError, in one line,
+    for a bag that cannot be read or holds no run.
     """
     content = _read_content(path)
     try:
-        tables = {topic: _find_table(path, content, topic) for topic in LABELS}
+        tables, note = _find_tables(path, content, axis)
     except InputError as error:
         raise InputError(f'{error}; {content.damage}' if content.damage else str(error)) from None
-    signals, estimates = tables[topics.SIGNALS], tables[topics.ESTIMATES]
+    signals, others, restart = choose(
+        tables[topics.SIGNALS],
+        {topic: table for topic, table in tables.items() if topic != topics.SIGNALS}, span,
+    )
+    tables = {topics.SIGNALS: signals, **others}
+    estimates = others[topics.ESTIMATES]
+    if not signals.stamps.size:
+        raise InputError(f'{path}: holds no sample between --from and --to')
     count, of_signals, of_estimates = np.intersect1d(
         signals.sample, estimates.sample, assume_unique=True, return_indices=True
     )
@@ -105,12 +106,13 @@ def read_bag(path: Path, sample_period: float | None = None) -> BagRun:
     lost = int(heard[-1] - heard[0]) + 1 - heard.size
     latency = signals.columns['latency_s'][of_signals]
     return BagRun(
-        RunRecord(rows, sample_period, lost), latency, heard.size - count.size, content.damage
+        RunRecord(rows, sample_period, lost), latency, heard.size - count.size, content.damage,
+        tuple(text for text in (note, restart) if text),
     )
 
 
 def _fill_truth(
-    rows: NDArray[np.float64], count: NDArray[np.int64], truth: _Table,
+    rows: NDArray[np.float64], count: NDArray[np.int64], truth: Table,
 ) -> None:
     """Fill in u where it was recorded, and the true backlash, of which the newest holds on.
 
@@ -118,14 +120,37 @@ def _fill_truth(
     """
     if truth.stamps.size == 0:
         return
-    _, here, there = np.intersect1d(
-        count, truth.sample, assume_unique=True, return_indices=True
-    )
+    sample = truth.sample + _offset(rows[:, COLUMNS.index('v')], count, truth)
+    _, here, there = np.intersect1d(count, sample, assume_unique=True, return_indices=True)
     rows[here, COLUMNS.index('u')] = truth.columns['u'][there]
-    order = np.argsort(truth.sample)
-    newest = np.searchsorted(truth.sample[order], count, side='right') - 1
+    order = np.argsort(sample)
+    newest = np.searchsorted(sample[order], count, side='right') - 1
     for name, label in TRUE_BACKLASH.items():
         rows[:, COLUMNS.index(name)] = truth.columns[label][order[np.maximum(newest, 0)]]
+
+
+def _offset(v: NDArray[np.float64], count: NDArray[np.int64], truth: Table) -> int:
+    """Count of the controller less that of the plant for the same sample.
+
+    A controller that was started later counts otherwise. Then the same v tells the same sample.
+    """
+    if np.intersect1d(count, truth.sample).size:
+        return 0
+    commands, of_commands = _told_once(v)
+    applied, of_applied = _told_once(truth.columns['v'])
+    _, here, there = np.intersect1d(commands, applied, return_indices=True)
+    if not here.size:
+        return 0
+    offsets, times = np.unique(
+        count[of_commands[here]] - truth.sample[of_applied[there]], return_counts=True
+    )
+    return int(offsets[np.argmax(times)])
+
+
+def _told_once(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Values that occur once, and where."""
+    unique, rows, times = np.unique(values, return_index=True, return_counts=True)
+    return unique[times == 1], rows[times == 1]
 
 
 def _median_period(
@@ -197,24 +222,32 @@ def _read_remains(path: Path, reason: str) -> _Content:
     return content
 
 
-def _find_table(path: Path, content: _Content, topic: str) -> _Table:
-    names = sorted(name for name in content.names if f'/{name}'.endswith(f'/{topic}'))
-    if len(names) > 1:
-        raise InputError(f'{path}: holds several runs: {", ".join(names)}')
-    if not names:
-        if topic == topics.TRUTH:
-            return _Table()  # a real plant does not know its truth
-        heard = ', '.join(sorted(content.names)) or 'nothing'
-        raise InputError(f'{path}: holds no {topic}, only {heard}')
-    return _tabulate(path, names[0], LABELS[topic], content.messages.get(names[0], []))
+def _find_tables(path: Path, content: _Content, axis: str) -> tuple[dict[str, Table], str]:
+    """The array topics of one axis, and what other axes there are."""
+    tables, about = {}, ''
+    for topic, labels in LABELS.items():
+        names = sorted(name for name in content.names if f'/{name}'.endswith(f'/{topic}'))
+        name, note = choose_namespace(names, axis) if names else ('', '')
+        if topic == topics.SIGNALS:
+            about = note
+            axis = axis or name.strip('/').split('/')[0] if note else axis
+        if name:
+            tables[topic] = _tabulate(path, name, labels, content.messages.get(name, []))
+        elif topic == topics.TRUTH:
+            tables[topic] = Table()  # a real plant does not know its truth
+        else:
+            heard = ', '.join(sorted(content.names)) or 'nothing'
+            of_axis = f' of axis {axis}' if axis else ''
+            raise InputError(f'{path}: holds no {topic}{of_axis}, only {heard}')
+    return tables, about
 
 
 def _tabulate(
     path: Path, topic: str, labels: Sequence[str], messages: Sequence[tuple[int, Any]],
-) -> _Table:
+) -> Table:
     if not messages:
         if f'/{topic}'.endswith(f'/{topics.TRUTH}'):
-            return _Table()
+            return Table()
         raise InputError(f'{path}: holds no message of {topic}')
     given = [dimension.label for dimension in messages[0][1].layout.dim] or list(labels)
     missing = set(labels) - set(given)
@@ -224,6 +257,4 @@ def _tabulate(
         raise InputError(f'{path}: {topic} has a message without a value for each label')
     values = np.array([message.data for _, message in messages], dtype=np.float64)
     columns: Mapping[str, NDArray[np.float64]] = dict(zip(given, values.T, strict=True))
-    if np.unique(columns['sample']).size != len(values):
-        raise InputError(f'{path}: {topic} counts a sample twice: the node was started twice')
-    return _Table(dict(columns), np.array([stamp for stamp, _ in messages], dtype=np.int64))
+    return Table(dict(columns), np.array([stamp for stamp, _ in messages], dtype=np.int64))

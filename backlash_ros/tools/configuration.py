@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +9,12 @@ from typing import Any
 
 import yaml
 
+from backlash_ros import shipped
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import BRINGUP, BY_NAME, PARAMETERS, Parameter, Value
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.files import write_atomically
+from backlash_ros.shipped import DEFAULT_CONFIG
 from backlash_ros.tools.errors import InputError
 from backlash_ros.tools.parameter_file import (
     AXES,
@@ -23,9 +23,6 @@ from backlash_ros.tools.parameter_file import (
     no_such_axis,
     read_parameter_file,
 )
-
-PACKAGE = 'backlash_ros'
-DEFAULT_CONFIG = 'paper_example.yaml'
 
 
 class _Dumper(yaml.SafeDumper):
@@ -151,25 +148,12 @@ def parse_value(name: str, text: str) -> object:
 
 def find_config(config: Path | None) -> Path:
     """Path of a configuration file: as given, or else among the shipped ones by name."""
-    if config is None:
-        return shipped_configs() / DEFAULT_CONFIG
-    if not config.exists() and config.parent == Path():
-        shipped = shipped_configs() / config.name
-        if shipped.exists():
-            return shipped
-    return config
+    return shipped_configs() / DEFAULT_CONFIG if config is None else shipped.find_config(config)
 
 
 def shipped_configs() -> Path:
-    """Folder of the shipped YAML files, wherever this package was installed."""
-    # The source tree first: beside the code that runs lies the configuration written for it.
-    places = [Path(__file__).resolve().parents[2] / 'config']
-    try:
-        ament_index = importlib.import_module('ament_index_python.packages')
-        places.append(Path(ament_index.get_package_share_directory(PACKAGE)) / 'config')
-    except (ImportError, LookupError, OSError):
-        pass  # no ament index here, or the package is not in it
-    places.append(Path(sys.prefix) / 'share' / PACKAGE / 'config')
+    """Folder of the shipped YAML files; raises InputError."""
+    places = shipped.config_folders()
     for place in places:
         if (place / DEFAULT_CONFIG).is_file():
             return place

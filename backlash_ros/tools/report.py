@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from backlash_ros.tools.analysis import (
     interesting_parts,
 )
 from backlash_ros.tools.bag_reading import read_bag
+from backlash_ros.tools.bag_sections import WHOLE, Span
 from backlash_ros.tools.command_line import OptionParser, run_tool
 from backlash_ros.tools.configuration import effective_parameters, load_config, write_config
 from backlash_ros.tools.drawing import png
@@ -58,6 +60,7 @@ class Source:
     latency_s: Array | None = None
     warnings: tuple[str, ...] = ()
     damage: str = ''  # of the bag it was read from
+    notes: tuple[str, ...] = ()  # what else is in the bag
 
 
 def report_bag(bag: Path, out: Path, parameters: Parameters | None) -> dict[str, Any]:
@@ -75,9 +78,12 @@ def report_run(run: RunRecord, out: Path, parameters: Parameters) -> dict[str, A
     return _write(Source(run, parameters), out)
 
 
-def _from_bag(bag: Path, parameters: Parameters | None) -> Source:
-    found = read_bag(bag, parameters.real('sample_period') if parameters else None)
-    warnings = []
+def _from_bag(
+    bag: Path, parameters: Parameters | None, span: Span = WHOLE, axis: str = '',
+) -> Source:
+    period = parameters.real('sample_period') if parameters else None
+    found = read_bag(bag, period, span, axis)
+    warnings = [f'The bag: {note}.' for note in found.notes]
     if found.damage:
         warnings.append(f'The bag {found.damage}')
     if found.unpaired:
@@ -90,12 +96,15 @@ def _from_bag(bag: Path, parameters: Parameters | None) -> Source:
             f'The sample period of {found.run.sample_period:.6g} s was taken from the stamps of '
             'the bag: no parameters were given.'
         )
-    return Source(found.run, parameters, found.latency_s, tuple(warnings), found.damage)
+    return Source(
+        found.run, parameters, found.latency_s, tuple(warnings), found.damage, found.notes
+    )
 
 
 def _tell_damage(source: Source) -> None:
-    if source.damage:
-        print(f'report: warning: {source.damage}', file=sys.stderr)
+    for text in (source.damage, *source.notes):
+        if text:
+            print(f'report: warning: {text}', file=sys.stderr)
 
 
 def _write(source: Source, out: Path) -> dict[str, Any]:
@@ -172,10 +181,13 @@ def draw(source: Source, summary: dict[str, Any]) -> Iterable[Picture]:
     )
 
 
-def open_source(path: Path, config: Path | None = None) -> Source:
+def open_source(
+    path: Path, config: Path | None = None, span: Span = WHOLE, axis: str = '',
+) -> Source:
     """Read a bag, a folder of results, record.npz or samples.csv; raises InputError.
 
-    config: parameters of the run; None looks for parameters.yaml beside it.
+    config: parameters of the run; None looks for parameters.yaml beside it. span, axis: the part
+    that is wanted, where there are several.
     """
     if not path.exists():
         raise InputError(f'{path}: does not exist')
@@ -183,7 +195,7 @@ def open_source(path: Path, config: Path | None = None) -> Source:
     if path.is_dir():
         for folder in (path, path / BAG):
             if is_bag(folder):
-                return _from_bag(folder, parameters)
+                return _from_bag(folder, parameters, span, axis)
         if (path / RECORD).is_file():
             path = path / RECORD
         elif (path / SAMPLES).is_file():
@@ -191,11 +203,24 @@ def open_source(path: Path, config: Path | None = None) -> Source:
         else:
             raise InputError(f'{path}: holds no bag, no {RECORD} and no {SAMPLES}')
     if path.suffix == '.npz':
-        return Source(read_record(path), parameters)
+        return Source(_part(read_record(path), span), parameters)
     if path.suffix != '.csv':
         raise InputError(f'{path}: is no bag folder, no results folder and no {SAMPLES}')
     run = read_samples(path, parameters.real('sample_period') if parameters else None)
-    return Source(_with_truth(run, path.parent / SUMMARY, parameters), parameters)
+    run = _part(_with_truth(run, path.parent / SUMMARY, parameters), span)
+    return Source(run, parameters)
+
+
+def _part(run: RunRecord, span: Span) -> RunRecord:
+    """The rows of the span, their time counted from its first one."""
+    if span == WHOLE:
+        return run
+    t = run.column('t')
+    rows = run.rows[(t >= span.from_s) & (t < span.to_s)].copy()
+    if not len(rows):
+        raise InputError('there is no sample between --from and --to')
+    rows[:, COLUMNS.index('t')] -= rows[0, COLUMNS.index('t')]
+    return RunRecord(rows, run.sample_period, run.lost_samples)
 
 
 def _parameters_beside(path: Path) -> Parameters | None:
@@ -240,8 +265,18 @@ def _report(args: Sequence[str] | None) -> None:
         '--out', type=Path, metavar='DIR',
         help='folder of the results (default: results/<UTC time>, and results/latest points at it)',
     )
+    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
+                        help='leave out what was before this time [s]')
+    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
+                        help='leave out what was from this time [s] on')
+    parser.add_argument('--axis', default='', metavar='NAME',
+                        help='of a bag with several: the one to report (default: the first)')
     options = parser.parse_args(args)
-    source = open_source(options.path.resolve(), options.config)
+    if not options.from_s < options.to_s:
+        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+    source = open_source(
+        options.path.resolve(), options.config, Span(options.from_s, options.to_s), options.axis
+    )
     if source.run.samples == 0:
         raise InputError(f'{options.path}: holds no sample')
     _tell_damage(source)

@@ -1,0 +1,341 @@
+"""Why the loop is not well: from what the controller has counted to causes, the likeliest first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from math import isfinite, nan
+from typing import NamedTuple
+
+from backlash_ros.core.estimation.protocol import Status
+
+LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
+# Share by which the rate of y may differ from that of the model.
+RATE_TOLERANCE = 0.1
+# Share of late, lost or bad samples from which on the loop is told to suffer from them, and an
+# estimate that does not fit the data is put down to them.
+TROUBLE = 0.01
+LIMITED = 0.5  # share of limited commands that leaves too little motion
+STILL_SAMPLES = 20  # equal values of y in a row, while v moves on
+# A contradiction between y and G(z) that lasts longer is not put down to late or lost samples [s].
+PATIENCE_S = 3.0
+
+
+class Level(IntEnum):
+    """How bad it is, in the numbers of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+
+
+class Finding(NamedTuple):
+    """One line of what goes on. kind: the same word for the same cause, whatever its figures.
+
+    lasting: worth a line of the log only once it has lasted, as it passes by itself as a rule.
+    """
+
+    level: Level
+    kind: str
+    text: str
+    lasting: bool = False
+
+
+class Peer(NamedTuple):
+    """Another publisher or subscriber of a topic; unfit: why no message passes, empty if it does.
+
+    kind: its message type without the package. unfit is one of '', 'type', 'reliability', 'qos'.
+    """
+
+    name: str
+    kind: str
+    unfit: str = ''
+
+
+@dataclass(frozen=True)
+class TopicFigures:
+    """A topic of the loop: its name, the wanted type without the package, who else is on it."""
+
+    name: str
+    kind: str = 'Float64'
+    peers: tuple[Peer, ...] = ()
+
+    @property
+    def heard(self) -> list[Peer]:
+        """Those whose messages pass."""
+        return [peer for peer in self.peers if not peer.unfit]
+
+
+@dataclass(frozen=True)
+class LoopFigures:
+    """What the controller knows of the last few seconds; counts are samples or messages.
+
+    output, reference: with those who publish it. control: with those who receive it; rivals: who
+    else publishes it. intervals_s: those between messages of y, low, mean and high, of which a
+    tenth is shorter and longer [s], nan while they are not known. still: newest values of y in a
+    row that are equal, and v_swing: how far v has moved meanwhile, in gaps.
+    """
+
+    sample_period: float
+    output: TopicFigures = field(default_factory=lambda: TopicFigures('plant_output'))
+    reference: TopicFigures = field(default_factory=lambda: TopicFigures('reference'))
+    control: TopicFigures = field(default_factory=lambda: TopicFigures('control'))
+    rivals: tuple[str, ...] = ()
+    status: Status | None = None  # None before the first command
+    inconsistent_s: float = 0.0  # how long that status has been INCONSISTENT
+    adapting: bool = True
+    silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not
+    on_timeout: str = 'hold'
+    referred: bool = True  # whether a y_m has come
+    reference_silent_s: float = 0.0
+    intervals_s: tuple[float, float, float] = (nan, nan, nan)
+    used: int = 0
+    without_reference: int = 0
+    lost: int = 0
+    unsent: int = 0
+    late: int = 0
+    bad_outputs: int = 0
+    bad_references: int = 0
+    limited: int = 0
+    unreported: int = 0
+    still: int = 0
+    v_swing: float = 0.0
+
+    @property
+    def heard(self) -> int:
+        """Samples that have come, whatever they were worth."""
+        return self.used + self.without_reference + self.bad_outputs
+
+
+def findings_of(f: LoopFigures) -> list[Finding]:
+    """All that is to be said, the likeliest cause first; never empty.
+
+    The model is blamed only where nothing else explains why y does not follow from v: an estimate
+    that is held for a while because samples are late or lost is a warning about these.
+    """
+    causes = [
+        *_unfit_peers(f), *_bad_numbers(f), *_second_senders(f), *_silence(f), *_timing(f),
+        *_reference(f), *_actuator(f),
+    ]
+    state = _state(f, causes)
+    found = causes
+    if state.kind == 'model':
+        late = [cause for cause in causes if cause.kind in LATENESS]
+        found = [cause for cause in causes if cause not in late] + [state, *late]
+    elif state.level != Level.OK or not causes:
+        found = [*causes, state]
+    return [finding._replace(text=_short(finding.text)) for finding in found]
+
+
+STATES: dict[Status, Finding] = {
+    Status.ACQUIRING: Finding(Level.OK, 'acquiring', 'learning: the estimates still move freely'),
+    Status.TRACKING: Finding(Level.OK, 'learned', 'learned: the estimates agree with the data'),
+    Status.NOT_EXCITED: Finding(
+        Level.WARN, 'not excited',
+        'estimates held: v did not swing past the gap lately; move it wider',
+    ),
+    Status.NO_DATA: Finding(Level.WARN, 'no data', 'estimates held: plant_output is missing'),
+    Status.INCONSISTENT: Finding(
+        Level.ERROR, 'model',
+        'plant_output does not follow from v through G(z): check G(z), the sensor, the actuator',
+    ),
+}
+HELD = Finding(
+    Level.OK, 'adaptation off', 'estimates held as ~/freeze_adaptation asked; v is still answered'
+)
+
+
+def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
+    if f.status is None:
+        # What is not there yet is among the causes; else all is about to begin.
+        return Finding(Level.OK, 'begins', 'the loop begins')
+    kinds = {cause.kind for cause in causes}
+    briefly = f.inconsistent_s < PATIENCE_S and not kinds.isdisjoint(LATENESS)
+    if f.status == Status.INCONSISTENT and (briefly or 'rate' in kinds):
+        return Finding(
+            Level.WARN, 'held', f'{f.output.name} does not follow from v while samples are late or '
+            'lost: estimates held',
+        )
+    if not f.adapting and f.status != Status.INCONSISTENT:
+        return HELD
+    return STATES[f.status]
+
+
+def _unfit_peers(f: LoopFigures) -> list[Finding]:
+    """Those who are there but not heard."""
+    found = []
+    for topic in (f.output, f.reference):
+        for peer in topic.peers:
+            if peer.unfit == 'type':
+                text = f'{topic.name} is sent as {peer.kind}, {topic.kind} is wanted: ' \
+                       f'change {peer.name}'
+            elif peer.unfit == 'reliability':
+                cure = 'set io.best_effort to true' if topic is f.output else 'publish it reliable'
+                text = f'{topic.name} is sent best effort, which does not arrive: {cure}'
+            elif peer.unfit:
+                text = f'{topic.name} of {peer.name} does not arrive: its QoS does not fit'
+            else:
+                continue
+            found.append(Finding(Level.ERROR, f'{topic.name} {peer.unfit}', text))
+    for peer in f.control.peers:
+        if peer.unfit == 'type':
+            found.append(Finding(
+                Level.ERROR, 'control type', f'{f.control.name} is a {f.control.kind}, but '
+                f'{peer.name} wants {peer.kind}: change it',
+            ))
+        elif peer.unfit:
+            found.append(Finding(
+                Level.ERROR, 'control qos',
+                f'{f.control.name} does not reach {peer.name}: its QoS does not fit',
+            ))
+    return found
+
+
+def _bad_numbers(f: LoopFigures) -> list[Finding]:
+    found = []
+    heard = f.heard
+    if f.bad_outputs > TROUBLE * heard:
+        found.append(Finding(
+            Level.ERROR if f.used == 0 else Level.WARN, 'bad outputs',
+            f'{_percent(f.bad_outputs, heard)} of {f.output.name} is no finite number: '
+            'check the sensor',
+        ))
+    if f.bad_references:
+        found.append(Finding(
+            Level.WARN, 'bad references',
+            f'{f.bad_references} {f.reference.name} messages lately were no finite number: '
+            'the last good one holds',
+        ))
+    return found
+
+
+def _second_senders(f: LoopFigures) -> list[Finding]:
+    found = []
+    if f.rivals:
+        found.append(Finding(
+            Level.WARN, 'rivals', f'{1 + len(f.rivals)} publishers of {f.control.name}, '
+            f'also {f.rivals[0]}: stop one',
+        ))
+    senders = len(f.output.heard)
+    if senders > 1:
+        found.append(Finding(
+            Level.WARN, 'second driver', f'{senders} publishers of {f.output.name}, the first one '
+            'is used: stop the others',
+        ))
+    senders = len(f.reference.heard)
+    if senders > 1:
+        found.append(Finding(
+            Level.WARN, 'second reference', f'{senders} publishers of {f.reference.name} '
+            'take turns: stop all but one',
+        ))
+    return found
+
+
+def _silence(f: LoopFigures) -> list[Finding]:
+    """What does not come, unless it is known by now why."""
+    found = []
+    if f.silent_s > 0.0:
+        found.append(Finding(
+            Level.WARN, 'silent', f'no {f.output.name} for {f.silent_s:g} s: is the driver '
+            f'running? on_timeout: {f.on_timeout}',
+        ))
+        return found
+    if f.status is None:
+        for topic, missing, starter in (
+            (f.output, f.heard == 0, 'start the driver'),
+            (f.reference, not f.referred and f.bad_references == 0, 'start one'),
+        ):
+            if not missing or any(peer.unfit for peer in topic.peers):
+                continue
+            why = f'{topic.heard[0].name} is there but sends none' if topic.heard \
+                else f'nobody publishes it, {starter}'
+            found.append(Finding(
+                Level.WARN, f'waiting for {topic.name}', f'waiting for {topic.name}: {why}',
+                lasting=True,
+            ))
+    elif not f.control.peers:
+        found.append(Finding(
+            Level.WARN, 'unheard', f'nobody listens to {f.control.name}: is it the name that the '
+            'driver uses?', lasting=True,
+        ))
+    return found
+
+
+LATENESS = ('late', 'lost', 'unsent')
+
+
+def _timing(f: LoopFigures) -> list[Finding]:
+    found = []
+    rate = _wrong_rate(f)
+    if isfinite(rate):
+        found.append(Finding(
+            Level.WARN, 'rate', f'{f.output.name} comes at {rate:.3g} Hz, sample_period is '
+            f'{f.sample_period:g} s ({1.0 / f.sample_period:.3g} Hz): correct one of them',
+        ))
+    if f.late > TROUBLE * f.used:
+        found.append(Finding(
+            Level.WARN, 'late', f'{_percent(f.late, f.used)} of {f.control.name} came too late: '
+            'relieve the machine or lengthen sample_period', lasting=True,
+        ))
+    due = f.heard + f.lost
+    if f.unsent > TROUBLE * due and not any(finding.kind == 'rate' for finding in found):
+        found.append(Finding(
+            Level.WARN, 'unsent', f'{_percent(f.unsent, due)} of {f.output.name} was never sent '
+            'or much too late: is the driver held up?', lasting=True,
+        ))
+    if f.lost - f.unsent > TROUBLE * due:
+        found.append(Finding(
+            Level.WARN, 'lost', f'{_percent(f.lost - f.unsent, due)} of {f.output.name} was lost '
+            'on its way: check the network', lasting=True,
+        ))
+    return found
+
+
+def _wrong_rate(f: LoopFigures) -> float:
+    """The rate of y [Hz] where it is not that of the model, else nan.
+
+    Losses and stalls lengthen some of the intervals, messages sent twice shorten some: the rate is
+    wrong only where nearly all of them are off to the same side.
+    """
+    low, mean, high = f.intervals_s
+    slow = low > (1.0 + RATE_TOLERANCE) * f.sample_period
+    fast = high < f.sample_period / (1.0 + RATE_TOLERANCE)
+    return 1.0 / mean if (slow or fast) and mean > 0.0 else nan
+
+
+def _reference(f: LoopFigures) -> list[Finding]:
+    if f.reference_silent_s <= 0.0:
+        return []
+    return [Finding(
+        Level.WARN, 'reference silent', f'no {f.reference.name} for more than '
+        f'{f.reference_silent_s:g} s, the last one is held: publish it every sample',
+    )]
+
+
+def _actuator(f: LoopFigures) -> list[Finding]:
+    found = []
+    if f.still >= STILL_SAMPLES and f.v_swing > 1.0:
+        found.append(Finding(
+            Level.WARN, 'still', f'{f.output.name} stands still while v swings over '
+            f'{f.v_swing:.3g} gaps: check sensor and actuator',
+        ))
+    held = f.status in (Status.INCONSISTENT, Status.NOT_EXCITED)
+    if held and f.limited > LIMITED * f.used:
+        found.append(Finding(
+            Level.WARN, 'limited', f'v is limited in {_percent(f.limited, f.used)} of the samples: '
+            'widen control.min, max or rate_max',
+        ))
+    if f.unreported > TROUBLE * f.used:
+        found.append(Finding(
+            Level.WARN, 'unreported', f'{_percent(f.unreported, f.used)} of the samples came '
+            'without applied_control just before them',
+        ))
+    return found
+
+
+def _percent(count: int, of: int) -> str:
+    return f'{100.0 * count / max(of, 1):.3g} %'
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT - 1] + '…'

@@ -1,0 +1,188 @@
+"""What the controller says is wrong with the loop, from figures alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from math import nan
+from typing import Any
+
+import pytest
+
+from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.nodes.causes import (
+    LONGEST_TEXT,
+    STATES,
+    Finding,
+    Level,
+    LoopFigures,
+    Peer,
+    TopicFigures,
+    findings_of,
+)
+
+DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
+WELL = LoopFigures(
+    0.005, TopicFigures('plant_output', peers=(DRIVER,)),
+    TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
+    TopicFigures('control', peers=(DRIVER,)), status=Status.TRACKING,
+    intervals_s=(0.005, 0.005, 0.005), used=600,
+)
+INCONSISTENT = replace(WELL, status=Status.INCONSISTENT)
+
+
+def output_from(*peers: Peer) -> TopicFigures:
+    return TopicFigures('plant_output', peers=peers)
+
+
+def reference_from(*peers: Peer) -> TopicFigures:
+    return TopicFigures('reference', peers=peers)
+
+
+CASES: list[tuple[dict[str, Any], Level, str]] = [
+    ({'intervals_s': (0.02, 0.02, 0.02)}, Level.WARN,
+     'plant_output comes at 50 Hz, sample_period is 0.005 s (200 Hz): correct one of them'),
+    ({'intervals_s': (0.0001, 0.0025, 0.0026)}, Level.WARN, 'plant_output comes at 400 Hz'),
+    ({'late': 60}, Level.WARN, '10 % of control came too late: relieve the machine'),
+    ({'lost': 66}, Level.WARN, '9.91 % of plant_output was lost on its way'),
+    ({'lost': 66, 'unsent': 66}, Level.WARN, '9.91 % of plant_output was never sent'),
+    ({'rivals': ('/b/controller',)}, Level.WARN,
+     '2 publishers of control, also /b/controller: stop one'),
+    ({'output': output_from(DRIVER, OTHER)}, Level.WARN, '2 publishers of plant_output'),
+    ({'reference': reference_from(DRIVER, OTHER)}, Level.WARN, '2 publishers of reference'),
+    ({'output': output_from(Peer('/driver', 'Float32', 'type')), 'status': None, 'used': 0},
+     Level.ERROR, 'plant_output is sent as Float32, Float64 is wanted: change /driver'),
+    ({'output': output_from(Peer('/driver', 'Float64', 'reliability')), 'status': None, 'used': 0},
+     Level.ERROR, 'plant_output is sent best effort, which does not arrive: set io.best_effort'),
+    ({'reference': reference_from(Peer('/r', 'Float64', 'reliability')), 'status': None},
+     Level.ERROR, 'reference is sent best effort, which does not arrive: publish it reliable'),
+    ({'reference': reference_from(Peer('/r', 'Float64', 'qos')), 'status': None},
+     Level.ERROR, 'reference of /r does not arrive: its QoS does not fit'),
+    ({'control': TopicFigures('control', peers=(Peer('/driver', 'Float32', 'type'),))},
+     Level.ERROR, 'control is a Float64, but /driver wants Float32'),
+    ({'control': TopicFigures('control', peers=(Peer('/driver', 'Float64', 'qos'),))},
+     Level.ERROR, 'control does not reach /driver: its QoS does not fit'),
+    ({'bad_outputs': 600, 'used': 0}, Level.ERROR,
+     '100 % of plant_output is no finite number: check the sensor'),
+    ({'bad_outputs': 60}, Level.WARN, '9.09 % of plant_output is no finite number'),
+    ({'bad_references': 3, 'referred': False, 'status': None, 'used': 0,
+      'without_reference': 600}, Level.WARN, '3 reference messages lately were no finite number'),
+    ({'silent_s': 0.5}, Level.WARN, 'no plant_output for 0.5 s: is the driver running? '
+     'on_timeout: hold'),
+    ({'status': None, 'used': 0, 'output': output_from()}, Level.WARN,
+     'waiting for plant_output: nobody publishes it, start the driver'),
+    ({'status': None, 'used': 0}, Level.WARN,
+     'waiting for plant_output: /driver is there but sends none'),
+    ({'status': None, 'used': 0, 'without_reference': 600, 'referred': False,
+      'reference': reference_from()}, Level.WARN,
+     'waiting for reference: nobody publishes it, start one'),
+    ({'reference_silent_s': 1.0}, Level.WARN, 'no reference for more than 1 s'),
+    ({'control': TopicFigures('control')}, Level.WARN, 'nobody listens to control'),
+    ({'still': 200, 'v_swing': 2.0}, Level.WARN, 'plant_output stands still while v swings over'),
+    ({'status': Status.NOT_EXCITED, 'limited': 400}, Level.WARN,
+     'v is limited in 66.7 % of the samples: widen control.min'),
+    ({'unreported': 60}, Level.WARN, '10 % of the samples came without applied_control'),
+]
+IDS = [text[:40] for *_, text in CASES]
+
+
+def first(figures: LoopFigures) -> Finding:
+    return findings_of(figures)[0]
+
+
+def worst_level(figures: LoopFigures) -> Level:
+    return max(finding.level for finding in findings_of(figures))
+
+
+def test_every_status_has_words_of_its_own() -> None:
+    assert set(STATES) == set(Status)
+    assert len({finding.text for finding in STATES.values()}) == len(Status)
+
+
+def test_a_loop_that_is_well_says_only_its_state() -> None:
+    assert findings_of(WELL) == [STATES[Status.TRACKING]]
+
+
+@pytest.mark.parametrize(('changes', 'level', 'text'), CASES, ids=IDS)
+def test_each_cause_is_named_with_its_figure_and_its_cure(
+    changes: dict[str, Any], level: Level, text: str,
+) -> None:
+    finding = first(replace(WELL, **changes))
+    assert finding.text.startswith(text)
+    assert finding.level == level
+
+
+@pytest.mark.parametrize(('changes', 'level', 'text'), CASES, ids=IDS)
+def test_what_is_known_goes_before_the_model(
+    changes: dict[str, Any], level: Level, text: str,
+) -> None:
+    if 'status' not in changes:
+        assert first(replace(INCONSISTENT, **changes)).text.startswith(text)
+
+
+def test_the_model_is_blamed_where_nothing_else_is_known() -> None:
+    assert first(INCONSISTENT) == STATES[Status.INCONSISTENT]
+    assert worst_level(INCONSISTENT) == Level.ERROR
+
+
+@pytest.mark.parametrize('changes', [
+    {'late': 30}, {'lost': 30}, {'lost': 30, 'unsent': 30}, {'intervals_s': (0.02, 0.02, 0.02)},
+])
+def test_a_loop_that_is_merely_late_is_never_an_error(changes: dict[str, Any]) -> None:
+    for status in Status:
+        assert worst_level(replace(WELL, status=status, **changes)) == Level.WARN
+
+
+def test_lateness_is_no_excuse_for_a_contradiction_that_lasts() -> None:
+    findings = findings_of(replace(INCONSISTENT, late=30, inconsistent_s=10.0))
+    assert [finding.kind for finding in findings] == ['model', 'late']
+    assert findings[0].level == Level.ERROR
+
+
+@pytest.mark.parametrize('changes', [
+    {'still': 200, 'v_swing': 2.0}, {'limited': 400}, {'output': output_from(DRIVER, OTHER)},
+    {'late': 3},
+])
+def test_an_estimate_that_does_not_fit_stays_an_error_beside_other_causes(
+    changes: dict[str, Any],
+) -> None:
+    assert worst_level(replace(INCONSISTENT, **changes)) == Level.ERROR
+
+
+@pytest.mark.parametrize('intervals_s', [
+    (0.005, 0.0072, 0.01),  # a third is lost
+    (0.005, 0.008, 0.02),  # the driver stands still now and then
+    (0.0001, 0.0025, 0.005),  # each is sent twice
+    (0.0053, 0.0054, 0.0055), (nan, nan, nan),
+])
+def test_losses_bursts_and_jitter_are_no_wrong_rate(
+    intervals_s: tuple[float, float, float],
+) -> None:
+    assert first(replace(WELL, intervals_s=intervals_s)) == STATES[Status.TRACKING]
+
+
+def test_held_learning_is_told_from_a_state_of_the_estimator() -> None:
+    held = replace(WELL, adapting=False)
+    assert first(held).text.startswith('estimates held as ~/freeze_adaptation asked')
+    assert first(replace(held, status=Status.INCONSISTENT)).level == Level.ERROR
+
+
+def test_a_sensor_at_rest_with_v_inside_the_gap_is_no_fault() -> None:
+    assert first(replace(WELL, still=2000, v_swing=0.9)) == STATES[Status.TRACKING]
+    assert first(replace(WELL, still=5, v_swing=3.0)) == STATES[Status.TRACKING]
+
+
+def test_no_text_is_cut_off_by_a_terminal() -> None:
+    long_name = '/a_rather_long_namespace/of_a_large_robot/my_driver_node'
+    for (a, *_), (b, *_) in product(CASES, CASES):
+        for finding in findings_of(replace(INCONSISTENT, **{**a, **b})):
+            assert len(finding.text) <= LONGEST_TEXT
+    (finding, *_) = findings_of(replace(WELL, rivals=(long_name,)))
+    assert len(finding.text) <= LONGEST_TEXT
+    assert all(len(text) <= LONGEST_TEXT for *_, text in CASES)
+
+
+def test_texts_with_names_of_usual_length_are_complete() -> None:
+    for changes, *_ in CASES:
+        for finding in findings_of(replace(WELL, **changes)):
+            assert not finding.text.endswith('…')

@@ -1,0 +1,58 @@
+"""Which diagnostics become a line of the log."""
+
+from __future__ import annotations
+
+from backlash_ros.nodes.causes import Finding, Level
+from backlash_ros.nodes.level_log import AGAIN_S, LASTS_S, LevelLog
+
+WELL = Finding(Level.OK, 'learned', 'learned')
+WRONG = Finding(Level.ERROR, 'model', 'the model is wrong')
+SLOW = Finding(Level.WARN, 'rate', 'too slow')
+WAITING = Finding(Level.WARN, 'waiting', 'waiting', lasting=True)
+
+
+def lines_of(findings: list[tuple[float, Finding]]) -> list[tuple[Level, str]]:
+    lines: list[tuple[Level, str]] = []
+    log = LevelLog(lambda level, text: lines.append((level, text)))
+    for now_s, finding in findings:
+        log.take(finding, now_s)
+    return lines
+
+
+def test_a_change_of_level_is_one_line_and_one_when_all_is_well_again() -> None:
+    findings = [(float(t), WRONG if 5 <= t < 20 else WELL) for t in range(40)]
+    assert lines_of(findings) == [
+        (Level.ERROR, 'the model is wrong'), (Level.OK, 'well again: learned'),
+    ]
+
+
+def test_well_from_the_beginning_is_no_line() -> None:
+    assert lines_of([(float(t), WELL) for t in range(10)]) == []
+
+
+def test_another_cause_at_the_same_level_is_told() -> None:
+    findings = [(0.0, SLOW), (0.5, SLOW._replace(kind='bad', text='no number')), (1.0, SLOW)]
+    assert [text for _, text in lines_of(findings)] == ['too slow', 'no number']
+
+
+def test_new_figures_of_the_same_cause_are_not_told() -> None:
+    findings = [(float(t), SLOW._replace(text=f'{t} Hz')) for t in range(30)]
+    assert lines_of(findings) == [(Level.WARN, '0 Hz')]
+
+
+def test_what_comes_and_goes_is_told_once_per_while() -> None:
+    findings = [(0.5 * n, WRONG if n % 2 else WELL) for n in range(50)]
+    assert lines_of(findings) == [(Level.ERROR, 'the model is wrong')]
+    slowly = [(0.1 * n, WRONG if n // 30 % 2 else WELL) for n in range(600)]
+    told = lines_of(slowly)
+    assert len(told) <= 2 * (60.0 / AGAIN_S + 1)
+    assert {text for _, text in told} == {'the model is wrong', 'well again: learned'}
+
+
+def test_what_passes_by_itself_is_told_once_it_has_lasted() -> None:
+    assert lines_of([(0.0, WAITING), (LASTS_S / 2.0, WAITING), (LASTS_S, WELL)]) == []
+    assert lines_of([(0.0, WAITING), (LASTS_S, WAITING)]) == [(Level.WARN, 'waiting')]
+
+
+def test_trouble_that_was_not_told_is_not_told_to_be_over() -> None:
+    assert lines_of([(0.0, WAITING), (1.0, WELL), (20.0, WELL)]) == []

@@ -1,0 +1,151 @@
+"""`report` of bags with more than one run: restarts, several axes, two controllers, a span."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from test_report import MULTI_ARRAY, PARAMETERS, TYPES, rows_of
+
+from backlash_ros import topics
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.tools import report
+from backlash_ros.tools.bag_reading import read_bag
+from backlash_ros.tools.bag_sections import Span
+
+PERIOD_NS = 10_000_000
+START_NS = 10**18
+OTHER = Parameters({'estimator.law': 'lms', 'amplitude': 7.0})
+COLUMN = {name: i for i, name in enumerate(COLUMNS)}
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A run within a bag: its rows leave from begin_s on, its count begins with first."""
+
+    run: RunRecord
+    begin_s: float = 0.0
+    first: int = 0
+    namespace: str = ''
+    truth_first: int | None = None
+
+
+def write_pieces(path: Path, *pieces: Piece) -> Path:
+    """Write a bag with all of them, in the order of their stamps."""
+    messages: list[tuple[int, int, str, bytes]] = []
+    for piece in pieces:
+        truth_first = piece.first if piece.truth_first is None else piece.truth_first
+        for topic, labels, prefix, first in (
+            (topics.SIGNALS, topics.SIGNAL_LABELS, '', piece.first),
+            (topics.ESTIMATES, topics.ESTIMATE_LABELS, '', piece.first),
+            (topics.TRUTH, topics.TRUTH_LABELS, 'true_', truth_first),
+        ):
+            rows = rows_of(piece.run, labels, frozenset(), prefix, first)
+            messages += [
+                (START_NS + int(piece.begin_s * 1e9) + k * PERIOD_NS, len(messages) + k,
+                 f'/{piece.namespace}{topic}', raw) for k, raw in rows
+            ]
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        names = {name for _, _, name, _ in messages}
+        connections = {
+            name: writer.add_connection(name, MULTI_ARRAY, typestore=TYPES) for name in names
+        }
+        for stamp_ns, _, name, raw in sorted(messages):
+            writer.write(connections[name], stamp_ns, raw)
+    return path
+
+
+@pytest.fixture(scope='module')
+def first() -> RunRecord:
+    return build_closed_loop(PARAMETERS).run(120)
+
+
+@pytest.fixture(scope='module')
+def second() -> RunRecord:
+    return build_closed_loop(OTHER).run(90)
+
+
+def same(found: RunRecord, run: RunRecord) -> bool:
+    names = ('y', 'v', 'm', 'status')
+    return all(np.array_equal(found.column(name), run.column(name)) for name in names)
+
+
+def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
+    tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=1.5, first=40))
+    assert same(read_bag(bag).run, second)
+    assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
+    (line,) = capsys.readouterr().err.splitlines()
+    assert 'began its count anew 1 time: this is what follows the last time, 1.5 s after' in line
+    assert '--from and --to' in line
+    assert (tmp_path / 'out' / 'report.html').is_file()
+
+
+def test_from_and_to_choose_the_other_part(
+    tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=1.5, first=40))
+    assert same(read_bag(bag, span=Span(to_s=1.5)).run, first)
+    part = read_bag(bag, span=Span(0.2, 0.7)).run
+    assert np.array_equal(part.column('y'), first.column('y')[20:70])
+    assert part.column('t')[0] == 0.0
+    assert report.main([str(bag), '--to', '1.5', '--out', str(tmp_path / 'out')]) == 0
+    assert 'began its count anew' not in capsys.readouterr().err
+    assert report.main([str(bag), '--from', '9', '--out', str(tmp_path / 'none')]) == 2
+    assert 'holds no sample between --from and --to' in capsys.readouterr().err
+    assert report.main([str(bag), '--from', '2', '--to', '1']) == 2
+
+
+def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> None:
+    report.report_run(first, tmp_path, PARAMETERS)
+    part = report.open_source(tmp_path, span=Span(0.5, 0.8)).run
+    assert np.array_equal(part.column('y'), first.column('y')[50:80])
+    assert part.column('t')[0] == 0.0
+
+
+def test_count_that_goes_on_after_a_restart_makes_one_run(
+    tmp_path: Path, first: RunRecord, second: RunRecord,
+) -> None:
+    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=1.5, first=150))
+    found = read_bag(bag)
+    assert found.notes == ()
+    assert found.run.samples == first.samples + second.samples
+    assert found.run.column('t')[-1] == pytest.approx(1.5 + 0.89)
+
+
+def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(
+    tmp_path: Path, first: RunRecord,
+) -> None:
+    bag = write_pieces(
+        tmp_path / 'bag', Piece(first, first=179_536_708_930, truth_first=17)
+    )
+    u = read_bag(bag).run.column('u')
+    assert np.array_equal(u, first.column('u'))
+
+
+def test_bag_of_two_axes_gives_a_report_of_either(
+    tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag = write_pieces(
+        tmp_path / 'bag', Piece(first, namespace='pan/'), Piece(second, namespace='tilt/')
+    )
+    assert same(read_bag(bag, axis='tilt').run, second)
+    assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
+    assert 'this is pan, --axis tilt chooses another one' in capsys.readouterr().err
+    assert report.main([str(bag), '--axis', 'roll', '--out', str(tmp_path / 'none')]) == 2
+    assert 'holds no controller/signals of axis roll' in capsys.readouterr().err
+
+
+def test_bag_of_two_controllers_at_once_gives_a_report(
+    tmp_path: Path, first: RunRecord, second: RunRecord,
+) -> None:
+    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=0.002, first=3))
+    found = read_bag(bag)
+    assert 'two controllers published at once' in found.notes[0]
+    assert found.run.samples == first.samples
