@@ -47,11 +47,11 @@ def search(
 ) -> Generator[None, None, Found]:
     """Compare gaps up to `widest` over v (N,) and y (N,), nan where lost; yields between pieces."""
     swing = float(np.ptp(v))
+    top = min(swing, widest)
+    if not top > 0.0 or float(weights[np.isfinite(y)].sum()) <= model.order + 3:
+        return Found([], 0.0)
     comparison = _Comparison(v, y, weights, model, error, told_std)
     null = comparison.null
-    top = min(swing, widest)
-    if not top > 0.0 or comparison.rows <= model.order + 2:
-        return Found([], null)
     gaps: Array = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
     coarse = yield from comparison.best_per_gap(gaps, STARTS, pace)
     best = max(coarse)
