@@ -202,12 +202,12 @@ def test_with_the_true_slope_the_observer_changes_no_pole_of_the_loop(gain: list
     assert tolerates(model, k, 1.0) == (radius < 1.0)
 
 
-@pytest.mark.parametrize('law', ['kalman', 'fixed'])
+@pytest.mark.parametrize('law', ['moving_horizon', 'fixed'])
 def test_saturation_and_rate_limit_leave_no_cycle_behind(law: str) -> None:
     t = np.arange(900) * 0.01
     y_m = np.where(t < 5.0, 0.3, 0.1) * np.sin(12.6 * t)
     p = tracking(control__max=22.0, control__min=-22.0, control__rate_max=1280.0)
-    run = simulate(p if law == 'kalman' else p.replaced(EXACT), 900, y_m)
+    run = simulate(p if law == 'moving_horizon' else p.replaced(EXACT), 900, y_m)
     assert np.abs(run.column('v')).max() == 22.0
     # Full feedback through these limits cycles with an amplitude of 7.
     assert np.abs(run.column('y')[700:]).max() < 0.105

@@ -20,9 +20,11 @@ from backlash_ros.core.estimation.constants import (
     PRECISE_GAP,
     PRECISE_SLOPE,
     REVERSALS,
+    SMALLEST_NOISE,
 )
 from backlash_ros.core.estimation.crossings import crossings_of
 from backlash_ros.core.estimation.error_model import build_error_model
+from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.relabelling import (
     Fitted,
@@ -41,7 +43,6 @@ FEWEST = 10  # samples per unknown of G and u below which nothing is said
 SEARCHED_AT_MOST = 6000  # samples of a record that the search for the gap looks at
 OUTLYING = 0.2  # share of the samples that may be outliers
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
-SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
 MOTION = (0.1, 0.9)  # shares of the power of the moves of y below which its frequencies lie
 
 
@@ -211,9 +212,9 @@ def _found(
     v: Array, y: Array, around: Around, widest: float,
 ) -> tuple[Fitted, Around] | None:
     if len(v) <= SEARCHED_AT_MOST:
-        return _drained(searched(v, y, around, widest, len(v)))
+        return _drained(searched(v, y, around, widest, Pace()))
     part = _busiest(v)
-    found = _drained(searched(v[part], y[part], around, widest, SEARCHED_AT_MOST))
+    found = _drained(searched(v[part], y[part], around, widest, Pace()))
     if found is None:
         return None
     result, moved = found
@@ -221,11 +222,11 @@ def _found(
     gap = max(solution.gap, 0.0)
     # The play output at the start of the record may be anywhere in the gap.
     fits = [
-        _drained(fitted(v, y, moved, Start(gap, float(v[0]) + share * gap), solution.m, len(v)))
+        _drained(fitted(v, y, moved, Start(gap, float(v[0]) + share * gap), solution.m, Pace()))
         for share in (0.0, 0.5, 1.0)
     ]
     best = max(fits, key=lambda fit: fit.solution.posterior.evidence)
-    return _drained(with_better_model(v, y, moved, best, len(v)))
+    return _drained(with_better_model(v, y, moved, best, Pace()))
 
 
 def _busiest(v: Array) -> slice:
@@ -239,15 +240,15 @@ def _refitted(v: Array, y: Array, around: Around, result: Fitted) -> tuple[Fitte
     """The fit again, from where it stands, for other y."""
     solution = result.solution
     start = result.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
-    again = _drained(fitted(v, y, around, start, solution.m, len(v)))
-    return _drained(with_better_model(v, y, around, again, len(v)))
+    again = _drained(fitted(v, y, around, start, solution.m, Pace()))
+    return _drained(with_better_model(v, y, around, again, Pace()))
 
 
 def _still(v: Array, y: Array, around: Around, result: Fitted) -> Fitted:
     """The fit of a constant u: of a gap wider than all of v."""
     swing = float(np.ptp(v))
     start = Start(3.0 * swing, float(v[0]) + 1.5 * swing)
-    return _drained(fitted(v, y, around, start, result.solution.m, len(v)))
+    return _drained(fitted(v, y, around, start, result.solution.m, Pace()))
 
 
 def _negated(around: Around) -> Around:
