@@ -25,6 +25,7 @@ from backlash_ros.core.estimation.constants import (
 from backlash_ros.core.estimation.crossings import crossings_of
 from backlash_ros.core.estimation.error_model import build_error_model
 from backlash_ros.core.estimation.pace import Pace
+from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.relabelling import (
     Fitted,
@@ -43,6 +44,7 @@ FEWEST = 10  # samples per unknown of G and u below which nothing is said
 SEARCHED_AT_MOST = 6000  # samples of a record that the search for the gap looks at
 OUTLYING = 0.2  # share of the samples that may be outliers
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
+SURE = 5.0  # standard deviations of the gap by which the play output must move to count
 MOTION = (0.1, 0.9)  # shares of the power of the moves of y below which its frequencies lie
 
 
@@ -59,7 +61,7 @@ class RecordFit:
     correlation: of successive residuals beyond chance. unexplained: motion of u that nothing
     explains, over m times the gap. evidence: log-likelihood by which the fit beats a constant u.
     predicted: share of the motion of y, beyond what a constant u explains, that it predicts.
-    reversals: changes of the engaged side. outliers: samples that were left out. frequencies:
+    reversals: of the play output. outliers: samples that were left out. frequencies:
     between which y moves [rad/sample]. doubts: why the backlash is not known from this record, a
     sentence each. All numbers are nan where there is no fit.
     """
@@ -166,7 +168,8 @@ def fit_record(
         delay: results[best].evidence - results[delay].evidence if delay in results else inf
         for delay in delays
     }
-    return _described(results[best], state, best, margins, bounds, after)
+    before = v[longest - best:len(v) - 1 - best]
+    return _described(results[best], state, best, margins, bounds, before, after)
 
 
 def _check(v: Array, y: Array, delays: Sequence[int]) -> None:
@@ -180,7 +183,7 @@ def _check(v: Array, y: Array, delays: Sequence[int]) -> None:
         raise ValueError(f'delays={delays!r} must name at least one, none of them negative')
 
 
-def _drained(work: Generator[None, None, T]) -> T:
+def drained(work: Generator[None, None, T]) -> T:
     """What a generator returns once all of its pieces are done."""
     while True:
         try:
@@ -212,9 +215,9 @@ def _found(
     v: Array, y: Array, around: Around, widest: float,
 ) -> tuple[Fitted, Around] | None:
     if len(v) <= SEARCHED_AT_MOST:
-        return _drained(searched(v, y, around, widest, Pace()))
+        return drained(searched(v, y, around, widest, Pace()))
     part = _busiest(v)
-    found = _drained(searched(v[part], y[part], around, widest, Pace()))
+    found = drained(searched(v[part], y[part], around, widest, Pace()))
     if found is None:
         return None
     result, moved = found
@@ -222,11 +225,11 @@ def _found(
     gap = max(solution.gap, 0.0)
     # The play output at the start of the record may be anywhere in the gap.
     fits = [
-        _drained(fitted(v, y, moved, Start(gap, float(v[0]) + share * gap), solution.m, Pace()))
+        drained(fitted(v, y, moved, Start(gap, float(v[0]) + share * gap), solution.m, Pace()))
         for share in (0.0, 0.5, 1.0)
     ]
     best = max(fits, key=lambda fit: fit.solution.posterior.evidence)
-    return _drained(with_better_model(v, y, moved, best, Pace()))
+    return drained(with_better_model(v, y, moved, best, Pace()))
 
 
 def _busiest(v: Array) -> slice:
@@ -240,15 +243,15 @@ def _refitted(v: Array, y: Array, around: Around, result: Fitted) -> tuple[Fitte
     """The fit again, from where it stands, for other y."""
     solution = result.solution
     start = result.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
-    again = _drained(fitted(v, y, around, start, solution.m, Pace()))
-    return _drained(with_better_model(v, y, around, again, Pace()))
+    again = drained(fitted(v, y, around, start, solution.m, Pace()))
+    return drained(with_better_model(v, y, around, again, Pace()))
 
 
 def _still(v: Array, y: Array, around: Around, result: Fitted) -> Fitted:
     """The fit of a constant u: of a gap wider than all of v."""
     swing = float(np.ptp(v))
     start = Start(3.0 * swing, float(v[0]) + 1.5 * swing)
-    return _drained(fitted(v, y, around, start, result.solution.m, Pace()))
+    return drained(fitted(v, y, around, start, result.solution.m, Pace()))
 
 
 def _negated(around: Around) -> Around:
@@ -271,9 +274,9 @@ def _outliers(result: Fitted) -> NDArray[np.bool_]:
 
 def _described(
     result: _Result, told: StateModel, delay: int, margins: dict[int, float],
-    bounds: Bounds | None, y: Array,
+    bounds: Bounds | None, v: Array, y: Array,
 ) -> RecordFit:
-    """All there is to say about a fit."""
+    """All there is to say about a fit of v (N,) and y (N,)."""
     fit, solution = result.found
     sign = result.sign
     theta = sign * solution.theta
@@ -294,11 +297,26 @@ def _described(
         solution.posterior.scale, solution.posterior.noise_std, solution.rms,
         solution.correlation, fit.unexplained(solution),
         result.evidence - result.still.solution.posterior.evidence,
-        1.0 - solution.rms / still if still > 0.0 else 0.0, fit.reversals, result.outliers,
+        1.0 - solution.rms / still if still > 0.0 else 0.0, _reversals(v, result.found), result.outliers,
         frequencies_of(y), (),
     )
     uncertain = result.around.error.count > 0
     return _with_doubts(found, bounds, NO_GAP * fit.swing, REVERSALS if uncertain else 1)
+
+
+def _reversals(v: Array, found: Fitted) -> int:
+    """How often the play output turned by more than the gap is uncertain.
+
+    A side that is engaged without moving the play output, as one at the very start may be, tells
+    nothing of its crossing.
+    """
+    start = found.fit.start
+    moves = np.diff(play(v, start.gap, start.p)[0], prepend=start.p)
+    moves = moves[moves != 0.0]
+    turns = np.flatnonzero(np.diff(np.sign(moves))) + 1
+    strokes = np.add.reduceat(moves, np.append(0, turns)) if len(moves) else moves
+    strokes = strokes[np.abs(strokes) > SURE * found.solution.std_gap]
+    return int(np.count_nonzero(np.diff(np.sign(strokes))))
 
 
 def _with_doubts(
@@ -308,8 +326,8 @@ def _with_doubts(
     doubts: list[str] = []
     if found.reversals < wanted:
         doubts.append(
-            f'v crossed the gap {found.reversals} times, {wanted} are needed to tell the gap from '
-            'a lag of G'
+            f'v crossed the gap {found.reversals} times; at least {wanted} are needed to tell both '
+            'crossings'
         )
     if not found.std_m <= PRECISE_SLOPE * abs(found.m):
         doubts.append(f'm is known to {found.std_m:.2g} only')
