@@ -155,11 +155,11 @@ def test_columns_times_unknowns_are_the_output_of_an_uncertain_plant(
     if layout.jump:
         size = float((labels.jump * (labels.p - np.append(p0, labels.p[:-1]))).sum())
         unknowns[layout.unknowns - layout.errors:] = m * a * size
-    rows = regressors.rows(labels)
+    rows = regressors.rows(labels, y)
     assert rows @ unknowns == pytest.approx(y, abs=1e-7 * (1.0 + np.abs(y).max()))
     # What the state is a linear function of.
     without = Regressors(model, error, jump)
-    without.rows(labels)
+    without.rows(labels, y)
     by_map = without.state_map() @ unknowns[:without.state_map().shape[1]]
     assert by_map == pytest.approx(x, abs=1e-7 * (1.0 + np.abs(x).max()))
 
@@ -172,10 +172,38 @@ def test_columns_in_pieces_equal_columns_in_one(
     v = np.array(values)
     cuts = data.draw(st.lists(st.integers(0, len(v)), max_size=4))
     p0 = v[0] + share * gap
-    whole = Regressors(model, error, jump=True).rows(labels_of(v, gap, p0))
+    y = np.where(np.arange(len(v)) % 3 == 2, nan, v + 1.0)
+    whole = Regressors(model, error, jump=True).rows(labels_of(v, gap, p0), y)
     running = Regressors(model, error, jump=True)
-    parts = [running.rows(labels) for labels in in_pieces(v, gap, p0, cuts)]
+    parts, done = [], 0
+    for labels in in_pieces(v, gap, p0, cuts):
+        parts.append(running.rows(labels, y[done:done + len(labels.p)]))
+        done += len(labels.p)
     assert np.concatenate(parts) == pytest.approx(whole, abs=1e-9 * (1.0 + np.abs(whole).max()))
+
+
+def test_leak_of_an_integrator_is_a_column() -> None:
+    leak, count = 1e-4, 200
+    lag = [1.0, -0.9]
+    told, leaky = (
+        TransferFunction([0.05], np.convolve([1.0, -pole], lag).tolist()) for pole in (1.0, 1.0 - leak)
+    )
+    model = StateModel(told)
+    v = 3.0 * np.sin(0.1 * np.arange(count))
+    labels = labels_of(v, 1.0, v[0])
+    m, c_r = 1.7, 0.3
+    u = m * (labels.p - c_r)
+    y, ideal = (
+        lfilter(g.numerator, g.denominator, np.append(u, 0.0))[1:] for g in (leaky, told)
+    )
+    regressors = Regressors(model, ErrorModel(model, 0.2), jump=True)
+    rows, layout = regressors.rows(labels, y), regressors.layout
+    assert layout.leak
+    unknowns = np.zeros(layout.unknowns)
+    unknowns[layout.n] = m * (v[0] - c_r)
+    unknowns[layout.theta] = m, m * c_r, m * (c_r - 1.0)
+    unknowns[layout.driven] = leak
+    assert np.abs(rows @ unknowns - y).max() <= 0.05 * np.abs(ideal - y).max()
 
 
 def test_prior_of_the_error_is_as_wide_as_plants_around_the_model() -> None:
