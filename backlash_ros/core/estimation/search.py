@@ -50,7 +50,7 @@ def search(
     comparison = _Comparison(v, y, weights, model, error, told_std)
     null = comparison.null
     top = min(swing, widest)
-    if not top > 0.0 or comparison.rows <= model.order + 2:
+    if not (top > 0.0 and NO_GAP * swing > 0.0) or comparison.rows <= model.order + 2:
         return Found([], null)
     gaps: Array = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
     coarse = yield from comparison.best_per_gap(gaps, STARTS, pace)
