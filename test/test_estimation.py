@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
 
 from cramer_rao import cramer_rao
 from estimation_runs import (
+    EXACT,
     QUIET,
     SeedJob,
     estimates,
@@ -38,7 +39,7 @@ MARKS_S = (2.0, 6.0)
 
 
 def test_noise_free_example_is_exact_after_one_second() -> None:
-    error = relative_errors(build_closed_loop(Parameters({})).run(601)).max(axis=1)
+    error = relative_errors(build_closed_loop(Parameters(EXACT)).run(601)).max(axis=1)
     assert error[35:].max() <= 0.01
     assert error[100:].max() <= 1e-5
 

@@ -77,7 +77,9 @@ def test_a_sample_of_delay_is_found() -> None:
 def test_an_integrator_stays_one_and_a_drift_is_not_taken_for_it() -> None:
     lag = np.exp(-PERIOD_S / 0.05)
     true_lag = np.exp(-PERIOD_S / 0.06)
-    told = TransferFunction([PERIOD_S * (1.0 - lag)], np.convolve([1.0, -1.0], [1.0, -lag]).tolist())
+    told = TransferFunction(
+        [PERIOD_S * (1.0 - lag)], np.convolve([1.0, -1.0], [1.0, -lag]).tolist()
+    )
     true = TransferFunction(
         [PERIOD_S * (1.0 - true_lag)], np.convolve([1.0, -1.0], [1.0, -true_lag]).tolist()
     )

@@ -56,6 +56,7 @@ def test_samples_that_were_taken_out_stay_what_they_are() -> None:
 
 def test_more_than_it_holds_is_refused() -> None:
     record = Record(2)
+    for k in range(4):  # there is room for as many again, before the samples are moved
+        record.append(float(k), 0.0)
     with pytest.raises(OverflowError, match='let old ones go'):
-        for k in range(10):
-            record.append(float(k), 0.0)
+        record.append(4.0, 0.0)

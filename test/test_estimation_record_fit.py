@@ -23,11 +23,12 @@ from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 
 NOISE = 1e-3
+TRUTH = Truth()
 MODEL = resonance()
 
 
 def record(
-    count: int, truth: Truth = Truth(), model: TransferFunction = MODEL, noise: float = NOISE,
+    count: int, truth: Truth = TRUTH, model: TransferFunction = MODEL, noise: float = NOISE,
     seed: int = 0, delay: int = 0, size: float = 3.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """v from k to k+1 and y at k; v comes into effect `delay` samples late."""
@@ -91,7 +92,7 @@ def test_delay_of_v_is_found_by_evidence(delay: int) -> None:
     assert fit.delay == delay
     assert fit.margins[delay] == 0.0
     assert min(margin for other, margin in fit.margins.items() if other != delay) > 10.0
-    assert_is(fit, Truth())
+    assert_is(fit, TRUTH)
 
 
 def test_a_wrong_sign_is_a_finding_and_not_usable() -> None:
@@ -118,8 +119,8 @@ def test_a_model_that_is_off_is_learned_with_its_sign(ratio: float, sign: float)
     seen = np.abs(true.response(z) / MODEL.response(z) - 1.0)
     assert fit.error_of_model(frequencies) == pytest.approx(seen, rel=0.05)
     assert 0.2 < fit.error_scale < 5.0
-    assert abs(fit.m) == pytest.approx(Truth().m, rel=0.01)
-    assert fit.gap == pytest.approx(Truth().gap, rel=0.01)
+    assert abs(fit.m) == pytest.approx(TRUTH.m, rel=0.01)
+    assert fit.gap == pytest.approx(TRUTH.gap, rel=0.01)
 
 
 def test_an_exact_model_stays_the_one_that_was_told() -> None:
@@ -144,9 +145,9 @@ def test_a_long_record_is_fitted_as_a_whole() -> None:
     count = SEARCHED_AT_MOST + 2000
     v, y = record(count)
     v[:1500] = v[1500]  # still at first: the search looks where v moves
-    y = np.append(nan, output(MODEL, v, Truth(), NOISE))[:count]
+    y = np.append(nan, output(MODEL, v, TRUTH, NOISE))[:count]
     fit = of(v, y, 0.0)
-    assert_is(fit, Truth())
+    assert_is(fit, TRUTH)
     short = of(v[:SEARCHED_AT_MOST - 2000], y[:SEARCHED_AT_MOST - 2000], 0.0)
     assert fit.std_gap < short.std_gap
 
@@ -156,7 +157,7 @@ def test_outliers_are_left_out_and_counted() -> None:
     y[50::60] += 0.5
     fit = of(v, y)
     assert fit.outliers == len(y[50::60])
-    assert_is(fit, Truth())
+    assert_is(fit, TRUTH)
     assert fit.noise_std == pytest.approx(NOISE, rel=0.25)
 
 
@@ -174,7 +175,7 @@ def test_unexplained_motion_is_told_and_widens_the_deviations() -> None:
 
 def test_one_side_alone_does_not_identify_the_gap() -> None:
     v = np.linspace(0.0, 5.0, 400)
-    y = np.append(nan, output(MODEL, v, Truth(), NOISE))[:400]
+    y = np.append(nan, output(MODEL, v, TRUTH, NOISE))[:400]
     fit = of(v, y)
     assert not fit.usable
     assert any('crossed the gap 0 times' in reason for reason in fit.reasons)
@@ -185,7 +186,7 @@ def test_one_side_alone_does_not_identify_the_gap() -> None:
     (np.zeros(400), 'stood still'), (swing(20), 'too few samples'), (0.05 * swing(400), 'nothing'),
 ], ids=['still', 'short', 'within the gap'])
 def test_why_there_is_no_fit_is_said(v: np.ndarray, reason: str) -> None:
-    y = np.append(nan, output(MODEL, v, Truth(), NOISE))[:len(v)]
+    y = np.append(nan, output(MODEL, v, TRUTH, NOISE))[:len(v)]
     fit = of(v, y)
     assert not fit.usable
     assert reason in fit.reasons[0]
@@ -205,7 +206,7 @@ def test_bounds_limit_what_is_usable() -> None:
 def test_a_prior_helps_a_short_record() -> None:
     v, y = record(60)
     alone = of(v, y, 0.0)
-    prior = Prior(Truth().theta, (1e-6 * Truth().theta) ** 2 * np.eye(3))
+    prior = Prior(TRUTH.theta, (1e-6 * TRUTH.theta) ** 2 * np.eye(3))
     helped = of(v, y, 0.0, prior=prior)
     assert helped.std_m < 0.1 * alone.std_m
     assert helped.m == pytest.approx(1.3, rel=1e-5)

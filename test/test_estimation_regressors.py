@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
+from itertools import pairwise
 from math import nan
 
 import numpy as np
@@ -33,7 +34,7 @@ gaps = st.floats(0.05, 8.0)
 shares = st.floats(0.0, 1.0)
 
 
-@lru_cache(maxsize=None)
+@cache
 def known(name: str) -> tuple[StateModel, ErrorModel]:
     """A model and its error model."""
     model = StateModel(MODELS[name])
@@ -93,7 +94,7 @@ def test_reversals_count_changes_of_the_side(
     labels = labels_of(np.array(values), gap, values[0] + share * gap)
     sides = [r - le for r, le, h in zip(labels.right, labels.left, labels.held, strict=True)
              if h == 0.0]
-    assert labels.reversals == sum(a != b for a, b in zip(sides, sides[1:], strict=False))
+    assert labels.reversals == sum(a != b for a, b in pairwise(sides))
 
 
 @given(names, moves, st.data())
@@ -114,7 +115,8 @@ def delta(name: str, h: np.ndarray, u: np.ndarray) -> np.ndarray:
     poles = MODELS[name].poles
     a = monic(poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)])
     taps = len(a) - 1
-    bases = [([1.0], [1.0])] * 2 + [([a.sum()], a)] * taps + [([a.sum() ** 2], np.polymul(a, a))] * taps
+    once, twice = ([a.sum()], a), ([a.sum() ** 2], np.polymul(a, a))
+    bases = [([1.0], [1.0])] * 2 + [once] * taps + [twice] * taps
     delays = [0, 1, *range(taps), *range(taps)]
     total = np.zeros(len(u))
     for weight, (b, a_i), delay in zip(h, bases, delays, strict=True):
@@ -186,7 +188,8 @@ def test_leak_of_an_integrator_is_a_column() -> None:
     leak, count = 1e-4, 200
     lag = [1.0, -0.9]
     told, leaky = (
-        TransferFunction([0.05], np.convolve([1.0, -pole], lag).tolist()) for pole in (1.0, 1.0 - leak)
+        TransferFunction([0.05], np.convolve([1.0, -pole], lag).tolist())
+        for pole in (1.0, 1.0 - leak)
     )
     model = StateModel(told)
     v = 3.0 * np.sin(0.1 * np.arange(count))
@@ -208,7 +211,7 @@ def test_leak_of_an_integrator_is_a_column() -> None:
 
 def test_prior_of_the_error_is_as_wide_as_plants_around_the_model() -> None:
     name = 'resonance'
-    model, error = known(name)
+    error = known(name)[1]
     z = np.exp([0.2j])
     impulse = np.zeros(400)
     impulse[0] = 1.0
@@ -217,10 +220,8 @@ def test_prior_of_the_error_is_as_wide_as_plants_around_the_model() -> None:
     expected = np.sqrt(np.sum(np.abs(gains) ** 2))
     rng = np.random.default_rng(3)
     told = MODELS[name].response(z)[0]
-    others = [
-        resonance(5.0 * np.exp(0.2 * rng.standard_normal()), 0.5 * np.exp(0.2 * rng.standard_normal()))
-        for _ in range(400)
-    ]
+    off = np.exp(0.2 * rng.standard_normal((400, 2)))
+    others = [resonance(5.0 * frequency, 0.5 * damping) for frequency, damping in off]
     seen = np.sqrt(np.mean([abs(g.response(z)[0] / told - 1.0) ** 2 for g in others]))
     assert expected == pytest.approx(seen, rel=0.25)
 
@@ -233,7 +234,7 @@ def test_exact_model_has_no_error_terms() -> None:
 def test_weights_share_one_among_readings_that_repeat(values: list[float]) -> None:
     y = np.array(values)
     weights = weights_of(y)
-    runs = 1 + sum(not a == b for a, b in zip(values, values[1:], strict=False))
+    runs = 1 + sum(a != b for a, b in pairwise(values))
     assert weights.sum() == pytest.approx(runs)
     for k in range(1, len(y)):
         if y[k] == y[k - 1]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from math import nan
 
 import numpy as np
@@ -32,7 +32,7 @@ seeds = st.integers(0, 1000)
 uncertainties = st.sampled_from([0.0, 0.2])
 
 
-@lru_cache(maxsize=None)
+@cache
 def around(uncertainty: float) -> Around:
     """The exact G, said to be as uncertain as this."""
     model = StateModel(MODEL)

@@ -38,7 +38,9 @@ EXACT = {**KNOWN, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0}
 
 def tracking(**changes: object) -> Parameters:
     named = {name.replace('__', '.'): value for name, value in changes.items()}
-    return Parameters({'structure': 'tracking', 'amplitude': 0.2, **named})
+    # What is promised here supposes, as the paper does, that G is exact.
+    known = {'structure': 'tracking', 'amplitude': 0.2, 'plant.uncertainty': 0.0}
+    return Parameters({**known, **named})
 
 
 def simulate(p: Parameters, samples: int, y_m: np.ndarray | None = None) -> RunRecord:

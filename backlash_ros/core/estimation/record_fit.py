@@ -293,12 +293,16 @@ def _described(
     model = transfer if learned.transfer_function is transfer \
         else _with_sign(learned.transfer_function, sign)
     found = RecordFit(
-        m, c_r, c_l, c_r - c_l, *stds, solution.start, transfer, model, delay, margins,
-        solution.posterior.scale, solution.posterior.noise_std, solution.rms,
-        solution.correlation, fit.unexplained(solution),
-        result.evidence - result.still.solution.posterior.evidence,
-        1.0 - solution.rms / still if still > 0.0 else 0.0, _reversals(v, result.found), result.outliers,
-        frequencies_of(y), (),
+        m=m, c_r=c_r, c_l=c_l, gap=c_r - c_l,
+        std_m=stds[0], std_c_r=stds[1], std_c_l=stds[2], std_gap=stds[3],
+        start=solution.start, told=transfer, model=model, delay=delay, margins=margins,
+        error_scale=solution.posterior.scale, noise_std=solution.posterior.noise_std,
+        rms=solution.rms, correlation=solution.correlation,
+        unexplained=fit.unexplained(solution),
+        evidence=result.evidence - result.still.solution.posterior.evidence,
+        predicted=1.0 - solution.rms / still if still > 0.0 else 0.0,
+        reversals=_reversals(v, result.found), outliers=result.outliers,
+        frequencies=frequencies_of(y), doubts=(),
     )
     uncertain = result.around.error.count > 0
     return _with_doubts(found, bounds, NO_GAP * fit.swing, REVERSALS if uncertain else 1)
@@ -326,7 +330,7 @@ def _with_doubts(
     doubts: list[str] = []
     if found.reversals < wanted:
         doubts.append(
-            f'v crossed the gap {found.reversals} times; at least {wanted} are needed to tell both '
+            f'v crossed the gap {found.reversals} times; {wanted} at least are needed to tell both '
             'crossings'
         )
     if not found.std_m <= PRECISE_SLOPE * abs(found.m):
