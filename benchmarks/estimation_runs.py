@@ -177,8 +177,8 @@ STEP_S = 10.0
 def run_wear(job: SeedJob) -> WearResult:
     """m falls by 1 % a second and c_r steps from 3 to 4 at 10 s; 20 s."""
     run = build_closed_loop(Parameters({
-        **EXACT, 'seed': job.seed, 'backlash.rate': (-0.013, 0.0, 0.0), 'backlash.jump_time': STEP_S,
-        'backlash.jump': (0.0, 1.0, 0.0), **job.changes,
+        **EXACT, 'seed': job.seed, 'backlash.rate': (-0.013, 0.0, 0.0),
+        'backlash.jump_time': STEP_S, 'backlash.jump': (0.0, 1.0, 0.0), **job.changes,
     })).run(2000)
     t, error = run.column('t'), relative_errors(run)
     return WearResult(

@@ -28,7 +28,7 @@ from backlash_ros.core.parameters import Parameters
 
 DOCUMENT = ROOT / 'docs' / 'performance.md'
 DURATION_S = 20.0
-LATENCY_LAWS = ('kalman', 'lms')
+LATENCY_LAWS = ('moving_horizon', 'lms')
 SPEED_HEADER = ('law', 'samples/s')
 SIMULATED_SAMPLES = 3000
 
@@ -59,13 +59,17 @@ def measure_steps(_: float) -> list[Section]:
         laws.checks = step_times.step_checks(timings)
     growth = Section(
         'Growth of the cost',
-        'The law kalman with G of growing order, and its bank alone with a growing number of '
-        'hypotheses: 7 once the gap is found, and during the search as many more as v has '
-        'swung over.', STEP_HEADER,
+        'The default law with G of growing order, known exactly (no error terms) and with all '
+        'error terms.', STEP_HEADER,
     )
-    growth.rows = [
-        timing.row for timing in [*step_times.order_timings(), *step_times.bank_timings()]]
-    return [laws, growth]
+    growth.rows = [timing.row for timing in step_times.order_timings()]
+    after = Section(
+        'Fits after the command',
+        f'`refine`, which may take {step_times.BUDGET:.0%} of a sample period: the mean per '
+        'sample, and the longest call.', step_times.REFINE_HEADER,
+    )
+    after.rows = step_times.refine_rows()
+    return [laws, growth, after]
 
 
 def measure_latency(duration_s: float) -> list[Section]:

@@ -120,7 +120,8 @@ def main() -> int:
     options = parser.parse_args()
     checks = run_loop(options.seconds, options.minutes)
     latencies = measure_latency(
-        1.0 / PERIOD_S, 'kalman', options.seconds, {**resampled(PERIOD_S), 'frequency': 12.6}
+        1.0 / PERIOD_S, 'moving_horizon', options.seconds,
+        {**resampled(PERIOD_S), 'frequency': 12.6},
     )
     print(text_table(LATENCY_HEADER, latencies.rows))
     ratio = latencies.ratio(0.99)

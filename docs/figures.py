@@ -85,7 +85,7 @@ def draw_figure_4() -> Figure:
     figure = new_figure(6.6)
     rows = figure.add_gridspec(2, 1, height_ratios=[1.0, 0.01])
     grid = np.asarray(rows[0].subgridspec(2, 3).subplots(sharex=True, sharey='row'))
-    for column, law in enumerate(('printed', 'lms', 'kalman')):
+    for column, law in enumerate(('printed', 'lms', 'moving_horizon')):
         run = simulate(5.0, {'estimator.law': law}).record
         absolute, relative = grid[0][column], grid[1][column]
         t = run.column('t')

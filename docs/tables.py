@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from printed_law import (
@@ -15,13 +17,16 @@ from printed_law import (
 )
 from runs import simulate
 
-from backlash_ros.core import early_fits, gap_choice, gap_search, kalman
 from backlash_ros.core.metrics import control_error_rms, settling_time
 from backlash_ros.core.transfer_function import TransferFunction
 
 NAMES = ('m', 'c_r', 'c_l')
 SECONDS = 10.0
 DISTURBANCE = 2.0
+ROOT = Path(__file__).resolve().parents[1]
+ESTIMATION = ROOT / 'backlash_ros' / 'core' / 'estimation'
+OF_EVERY_LAW = ('protocol.py', 'storage.py')
+CONSTANT = re.compile(r'([A-Z][A-Z0-9_]*) = (.*?)(?:  # (.*))?')
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -50,7 +55,7 @@ def plant_facts() -> str:
 def laws() -> str:
     """What each law reaches on the paper's example."""
     rows = []
-    for law in ('printed', 'lms', 'kalman'):
+    for law in ('printed', 'lms', 'moving_horizon'):
         run = simulate(SECONDS, {'estimator.law': law}).record
         t = run.column('t')
         settled = [settling_time(t, run.column(n), run.column(f'true_{n}')) for n in NAMES]
@@ -123,38 +128,31 @@ def disturbance() -> str:
 
 
 def estimator_constants() -> str:
-    """The constants of the method, as they stand in the code."""
-    k, s, g = kalman, gap_search, gap_choice
-    rows = (
-        ('coarse bank: hypotheses, besides "v never engaged"', f'{len(g.coarse_gaps(1.0))}',
-         'gap_choice.py'),
-        ('ratio of neighbouring gaps', f'{g.GRID_RATIO:g}', 'gap_choice.py'),
-        ('smallest gap, as a share of the widest one within the bounds', f'{g.SMALLEST_GAP:g}',
-         'gap_choice.py'),
-        ('fine bank: hypotheses', f'{g.FINE}', 'gap_choice.py'),
-        ('fine bank: reach to either side, in standard deviations of the gap', f'{g.REACH:g}',
-         'gap_choice.py'),
-        ('record: longest, in samples', f'{s.CAPACITY}', 'gap_search.py'),
-        ('recorded samples read again with each new one', f'{s.REPLAY_SPEED}', 'gap_search.py'),
-        ('... while none may be published', f'{s.SLOWEST_FIRST} to {s.FASTEST_FIRST}',
-         'gap_search.py'),
-        ('record: samples up to which it is fitted as a whole', f'{early_fits.LONGEST}',
-         'early_fits.py'),
-        ('... bank once the relative deviation of the gap is below',
-         f'{early_fits.PRECISION_OF_GAP:g}', 'early_fits.py'),
-        ('... and that of m below', f'{early_fits.PRECISION_OF_M:g}', 'early_fits.py'),
-        ('outlier: innovation beyond, in standard deviations', f'{k.GATE:g}', 'kalman.py'),
-        ('contradiction: outliers in a row', f'{k.REFUSED_IN_A_ROW}', 'kalman.py'),
-        ('contradiction: mean normalised innovation squared above', f'{k.NIS_LIMIT:g}',
-         'kalman.py'),
-        ('samples that a new search must fit before it takes over', f'{k.PROVEN}', 'kalman.py'),
-        ('published once the relative deviation of m is below', f'{k.PRECISE_SLOPE:g}',
-         'kalman.py'),
-        ('... and that of the gap below', f'{k.PRECISE_GAP:g}', 'kalman.py'),
-    )
-    return markdown(('constant', 'value', 'file'), [
-        (what, value, f'[{file}](../backlash_ros/core/{file})') for what, value, file in rows
-    ])
+    """The constants of the method with the comments beside them, as they stand in the code."""
+    rows: list[tuple[str, str, str, str]] = []
+    of_the_law = [path for path in ESTIMATION.glob('*.py') if path.name not in OF_EVERY_LAW]
+    for path in sorted(of_the_law, key=lambda path: (path.name != 'constants.py', path.name)):
+        link = f'[{path.name}](../{path.relative_to(ROOT)})'
+        rows += [(f'`{name}`', value, what, link) for name, value, what in constants_of(path)]
+    return markdown(('constant', 'value', 'meaning', 'file'), rows)
+
+
+def constants_of(path: Path) -> list[tuple[str, str, str]]:
+    """Name, value and meaning of the constants of a file: those with a comment."""
+    lines = path.read_text().splitlines()
+    found = []
+    for k, line in enumerate(lines):
+        match = CONSTANT.fullmatch(line)
+        if match is None:
+            continue
+        name, value, comment = match.groups()
+        first = k
+        while comment is None and first > 0 and lines[first - 1].startswith('# '):
+            first -= 1
+        what = comment or ' '.join(text.removeprefix('# ') for text in lines[first:k])
+        if what:
+            found.append((name, f'`{value}`', what.replace('|', '\\|')))
+    return found
 
 
 TABLES: dict[str, Callable[[], str]] = {

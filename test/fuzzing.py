@@ -38,7 +38,7 @@ LOW, HIGH = -20.0, 30.0
 ODD = (
     float('nan'), inf, -inf, 1e300, -1e300, 5e-324, -5e-324, 0.0, -0.0, 1e12, -1e12, 1e-12, 3.0,
 )
-LAWS = ('kalman', 'kalman', 'lms', 'printed', 'fixed', 'gradient')
+LAWS = ('moving_horizon', 'moving_horizon', 'lms', 'printed', 'fixed', 'gradient')
 STRUCTURES = ('proportional', 'tracking', 'pole_placement')
 EVENTS_PER_SEQUENCE = 40
 SEQUENCES_PER_NODE = 200

@@ -42,7 +42,7 @@ def parameters_of(rng: np.random.Generator) -> Parameters:
     noise = float(rng.choice([0.0, 1e-4, 1e-2]))
     return Parameters({
         **PLANTS[int(rng.integers(len(PLANTS)))],
-        'estimator.law': str(rng.choice(['kalman', 'kalman', 'kalman', 'lms', 'fixed'])),
+        'estimator.law': str(rng.choice(['moving_horizon'] * 3 + ['lms', 'fixed'])),
         'structure': str(rng.choice(['proportional', 'tracking'])),
         'waveform': str(rng.choice(['sine', 'square', 'triangle'])),
         'amplitude': float(rng.choice([0.2, 1.0, 10.0])),

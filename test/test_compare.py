@@ -38,7 +38,7 @@ def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> Non
 def test_learned_backlash_costs_less_than_an_uncompensated_one(
     results: dict[str, compare.Result],
 ) -> None:
-    learned, plain = results['kalman, tracking'], results['no compensation, tracking']
+    learned, plain = results['moving_horizon, tracking'], results['no compensation, tracking']
     assert results['no backlash, tracking'].penalty == 0.0
     assert results['no backlash, tracking'].note == ''
     assert plain.penalty > 0.0

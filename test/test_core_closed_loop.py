@@ -182,7 +182,7 @@ def test_first_output_always_arrives() -> None:
 
 
 @pytest.mark.parametrize(('law', 'structure'), [
-    ('kalman', 'proportional'), ('kalman', 'tracking'), ('lms', 'proportional'),
+    ('moving_horizon', 'proportional'), ('moving_horizon', 'tracking'), ('lms', 'proportional'),
     ('printed', 'proportional'), ('fixed', 'tracking'), ('gradient', 'pole_placement'),
 ])
 @pytest.mark.parametrize('size', [5e-324, 1e-162, 1e-155, 1e-130, 1e-100])

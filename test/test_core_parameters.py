@@ -208,7 +208,12 @@ def test_list_of_another_length_is_refused(parameter: Parameter) -> None:
 def test_word_outside_the_choices_is_refused_and_they_are_listed(parameter: Parameter) -> None:
     assert ', '.join(parameter.choices) in refusal_of(parameter.name, 'no such word')
     for word in parameter.choices:
-        assert Parameters({parameter.name: word})[parameter.name] == word
+        stands_for = dict(parameter.aliases).get(word, word)
+        assert Parameters({parameter.name: word})[parameter.name] == stands_for
+
+
+def test_former_name_of_the_default_law_is_accepted() -> None:
+    assert Parameters({'estimator.law': 'kalman'}).word('estimator.law') == 'moving_horizon'
 
 
 @named([p for p in PARAMETERS if isinstance(p.default, str)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from math import inf, nan
 
@@ -22,7 +23,6 @@ from made_up_driver import (
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.record_fit import fit_record, reach_of
 from backlash_ros.core.transfer_function import TransferFunction
 from backlash_ros.nodes.driver_findings import (
     FITS,
@@ -279,22 +279,26 @@ def test_every_fault_in_the_table_has_its_cure_below() -> None:
     assert all('→' in lines[k + 1] for k in wrong)
 
 
-@pytest.mark.parametrize(('delay', 'slope', 'width'), [(0, 2.0, 0.5), (3, -0.1, 2.0)])
-def test_the_fit_of_a_record_is_exact_without_noise(delay, slope, width) -> None:
-    rng = np.random.default_rng(3)
-    v = np.cumsum(rng.normal(0.0, 0.6, 400)) * 0.5
-    g = TransferFunction([0.3, 0.1], [1.0, -1.5, 0.6])
-    u = slope * (reach_of(v, width) - 0.4 * width)
-    x, y = np.zeros(2), np.zeros(400)
-    a, b, c = g.state_space()
-    for k in range(400):
-        y[k] = c @ x
-        x = a @ x + b * (u[k - delay] if k >= delay else u[0])
-    y[::17] = nan
-    fit = fit_record(g, v, y)
-    assert fit is not None
-    assert fit.delay == delay
-    assert (fit.m, fit.c_r, fit.c_l) == pytest.approx((slope, 0.4 * width, -0.6 * width), rel=1e-3)
+@pytest.mark.parametrize('ratio', [0.8, 1.2])
+def test_a_model_that_is_off_by_a_fifth_fits_and_the_finding_says_how_far(ratio: float) -> None:
+    numerator, denominator = model(ratio * PERIOD_S)  # the same as another natural frequency
+    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters(
+        plant__numerator=numerator, plant__denominator=denominator,
+    )))
+    assert all_fit(findings), table(findings)
+    found = next(f.found for f in findings if f.subject == 'G(z)')
+    told, true = TransferFunction(numerator, denominator), TransferFunction(*model())
+    said = [(float(error) / 100.0, float(frequency)) for error, frequency in
+            re.findall(r'([\d.]+)% at ([\d.]+) Hz', found)]
+    assert len(said) == 2
+    for error, frequency in said:
+        z = np.exp([2j * np.pi * frequency * PERIOD_S])
+        assert error == pytest.approx(abs(true.response(z) / told.response(z) - 1.0)[0], rel=0.1)
+
+
+def test_a_model_that_is_exact_is_not_called_off() -> None:
+    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters()))
+    assert 'off' not in next(f.found for f in findings if f.subject == 'G(z)')
 
 
 @given(

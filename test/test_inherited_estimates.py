@@ -63,7 +63,7 @@ def test_backlash_that_changed_meanwhile_is_learned_anew() -> None:
     assert errors(after[-1:])[0] < 0.01
 
 
-@pytest.mark.parametrize('law', ['kalman', 'lms', 'printed', 'gradient'])
+@pytest.mark.parametrize('law', ['moving_horizon', 'lms', 'printed', 'gradient'])
 def test_held_estimates_do_not_move_and_learning_can_go_on(law: str) -> None:
     structure = 'pole_placement' if law == 'gradient' else 'proportional'
     p = Parameters({'estimator.law': law, 'structure': structure})
@@ -75,7 +75,7 @@ def test_held_estimates_do_not_move_and_learning_can_go_on(law: str) -> None:
     controller.estimator.adapting = True
     moving = {(e.m, e.c_r, e.c_l) for e in loop.run(controller, 300)}
     assert len(moving) > 1
-    if law in ('kalman', 'lms'):
+    if law in ('moving_horizon', 'lms'):
         assert errors([controller.estimator.estimate])[0] < 0.05
 
 

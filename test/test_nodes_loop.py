@@ -68,7 +68,7 @@ def read_messages(bag: Path) -> dict[str, list[tuple[int, np.ndarray]]]:
         ({'output_noise_std': 1e-4, 'output_loss': 0.1, 'seed': 5, 'truth.walk_std': 1e-3,
           'truth.numerator': [1.00001e-5, 4e-5, 1e-5]}, 200, 'sqlite3'),
     ],
-    ids=['lms-mcap', 'kalman-losses-sqlite3'],
+    ids=['lms-mcap', 'moving_horizon-losses-sqlite3'],
 )
 def test_lockstep_run_equals_the_simulation_in_one_process_to_the_last_bit(
     tmp_path: Path, parameters: dict[str, object], samples: int, storage: str,

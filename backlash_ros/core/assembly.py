@@ -267,7 +267,7 @@ def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -
 
 
 ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Estimator]] = {
-    'moving_horizon': _moving_horizon, 'kalman': _moving_horizon, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
+    'moving_horizon': _moving_horizon, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
     'gradient': _gradient,
 }
 STRUCTURES: dict[str, Callable[[Parameters], Structure]] = {

@@ -16,8 +16,8 @@ class Parameter:
     """A parameter: its default gives its type, low and high hold for each element of a list.
 
     above: low itself is excluded. length: how many elements a list must have, None for any.
-    choices: the allowed words. used_by: executables that read it. live: may change in a
-    running node.
+    choices: the allowed words. aliases: former words among them, each with the one that it stands
+    for. used_by: executables that read it. live: may change in a running node.
     """
 
     name: str
@@ -29,6 +29,7 @@ class Parameter:
     above: bool = False
     length: int | None = None
     choices: tuple[str, ...] = ()
+    aliases: tuple[tuple[str, str], ...] = ()
     used_by: tuple[str, ...] = (CONTROLLER,)
     live: bool = False
     infinite: bool = False  # inf is allowed and means "no limit"
@@ -64,8 +65,10 @@ PARAMETERS: tuple[Parameter, ...] = (
               'start only when the main topic has this many listeners', low=0,
               used_by=(CONTROLLER, PLANT, REFERENCE)),
     Parameter(
-        'estimator.law', 'kalman', 'law that learns m, c_r, c_l',
+        'estimator.law', 'moving_horizon',
+        'law that learns m, c_r, c_l; kalman: a former name of moving_horizon',
         choices=('moving_horizon', 'kalman', 'lms', 'printed', 'fixed', 'gradient'),
+        aliases=(('kalman', 'moving_horizon'),),
     ),
     Parameter('estimator.initial.m', 0.696, 'first estimate of the slope', 'u/v',
               low=0.0, above=True),
@@ -80,11 +83,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('estimator.output_noise_std', 1e-5,
               'standard deviation of the noise on y; where it is not given, that of the simulated '
               'noise and quantum if there is any', 'y', low=0.0, live=True),
-    Parameter('estimator.input_noise_std', 0.0,
-              'kalman: standard deviation of white noise on u: what G(z) and the backlash lack',
-              'u', low=0.0, live=True),
     Parameter('estimator.drift_std', (0.0, 0.0, 0.0),
-              'kalman: random walk of m, c_r, c_l per square root of a second', length=3,
+              'moving_horizon: random walk of m, c_r, c_l per square root of a second', length=3,
               low=0.0, live=True),
     Parameter('estimator.use_applied_control', 'auto',
               'take v from applied_control instead of the own command; auto: as soon as the driver '

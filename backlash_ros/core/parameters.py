@@ -137,7 +137,7 @@ def _word(parameter: Parameter, value: object) -> str:
         raise ParameterError(
             parameter.name, value, 'must be one of ' + ', '.join(parameter.choices)
         )
-    return value
+    return dict(parameter.aliases).get(value, value)
 
 
 def _names(parameter: Parameter, value: object) -> tuple[str, ...]:

@@ -1,25 +1,19 @@
 """What the motion of a driver says: delay, sign, G(z), noise, and whether the backlash shows.
 
-Pure: no ROS in here. The whole record is fitted at once, then read by the filters of the loop.
+Pure: no ROS in here. The whole record is fitted at once, by the fit of the loop.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import nan
+from math import inf, isnan, nan, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.bank_making import COARSE_TOLERANCE, NOISE_FLOOR, SLOPE_REACH
 from backlash_ros.core.controller import plausible
-from backlash_ros.core.estimation.crossings import Crossings
-from backlash_ros.core.gap_bank import GapBank, Noise, Prior
-from backlash_ros.core.gap_search import NO_GAP
-from backlash_ros.core.kalman import PRECISE_GAP, PRECISE_SLOPE
+from backlash_ros.core.estimation.record_fit import RecordFit, fit_record
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.record_fit import MORE_DELAY, RecordFit, fit_record
-from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 from backlash_ros.nodes.command_history import ReportUse, report_use
 from backlash_ros.nodes.driver_findings import (
@@ -48,7 +42,8 @@ COLOURED = 0.5  # correlation of successive residuals that noise of a sensor doe
 OTHER_PERIODS = (0.05, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0)
 ALTERED = 0.02  # of the swing of v: applied_control that differs by more was limited
 ALTERED_SHARE = 0.05  # of the samples
-GAP_RATIOS = np.geomspace(0.25, 4.0, 25)  # of the bank, around the gap of the fit
+MORE_DELAY = 8  # samples that are tried beyond the expected delay
+FAR = 2.0  # times plant.uncertainty; an error of G beyond may be that of its sample period
 REPORTED = 0.9  # share of the samples that applied_control has to report
 
 
@@ -159,10 +154,9 @@ def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
     swing = 0.0 if record is None else float(np.ptp(record.v))
     if record is None or swing == 0.0:
         return _only(BACKLASH, 'v stood still', 'run the controller, or check_driver --drive')
-    expected = p.integer('control.delay_samples')
     model = TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator'))
-    fit = fit_record(model, record.v, record.y, expected)
-    if fit is None:
+    fit = _fit(model, record, p)
+    if isnan(fit.evidence):
         return _only(
             BACKLASH, f'too few samples after v had swung by {swing:.4g}', 'raise --duration'
         )
@@ -171,14 +165,27 @@ def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
             BACKLASH, f'y shows nothing of v, which swung by {swing:.4g}',
             'let v swing wider than the gap; see that the driver applies v',
         )
-    if fit.predicted < PREDICTED or _odd(fit, record.lag, p):
-        return _only(MODEL, *_mismatch(fit, model, record, p))
-    found = _crossings(fit, record, p)
+    unlike = fit.predicted < PREDICTED or _odd(fit, record.lag, p)
+    if unlike or fit.error_scale > FAR:
+        other = _other_period(fit, record, p)
+        if unlike or other is not None:
+            return _only(MODEL, *_mismatch(fit, other, p))
     return [
-        _delay(fit, record.lag, p), _sign(fit, found, p),
-        Finding(MODEL, FITS, f'predicts {fit.predicted:.1%} of the motion of y'),
-        _noise(fit, p), _backlash(found, swing),
+        _delay(fit, record.lag, p), _sign(fit, p), _model(fit, p), _noise(fit, p),
+        _backlash(fit, swing),
     ]
+
+
+def _fit(
+    model: TransferFunction, record: Record, p: Parameters, more_delay: int = MORE_DELAY,
+) -> RecordFit:
+    """Fit with any delay that the driver may have, or with the expected one alone."""
+    expected = p.integer('control.delay_samples')
+    return fit_record(
+        record.v, record.y, model, p.real('plant.uncertainty'),
+        p.real('estimator.output_noise_std'),
+        delays=range(expected + more_delay + 1) if more_delay else (expected,),
+    )
 
 
 def _only(subject: str, found: str, cure: str) -> list[Finding]:
@@ -199,29 +206,33 @@ def _odd(fit: RecordFit, lag: int, p: Parameters) -> bool:
     return noisy and fit.correlation > COLOURED and _delay(fit, lag, p).mark == WRONG
 
 
-def _mismatch(
-    fit: RecordFit, model: TransferFunction, record: Record, p: Parameters,
-) -> tuple[str, str]:
-    """Say how badly G predicts y, and whether the same poles at another period would."""
-    found = f'predicts {max(fit.predicted, 0.0):.0%} of the motion of y'
+def _mismatch(fit: RecordFit, other: float | None, p: Parameters) -> tuple[str, str]:
+    """Say how badly G predicts y, and whether the same poles at another period [s] would."""
     period = p.real('sample_period')
-    others: list[tuple[float, float]] = []
-    for ratio in OTHER_PERIODS:
-        denominator = np.real(np.poly(model.poles.astype(complex) ** ratio)).tolist()
-        other = TransferFunction(model.numerator.tolist(), denominator)
-        refit = fit_record(other, record.v, record.y, p.integer('control.delay_samples'))
-        if refit is not None:
-            others.append((refit.predicted, ratio))
-    best, ratio = max(others, default=(0.0, 1.0))
-    if best >= PREDICTED:
-        return found, (
-            f'G(z) looks made for a sample period of about {period / ratio:.3g} s: discretise it '
-            f'with sample_period, {period:g} s'
+    if other is not None:
+        return f'is off by far, and less so for a sample period of {other:.3g} s', (
+            f'G(z) looks made for a sample period of about {other:.3g} s: discretise it with '
+            f'sample_period, {period:g} s'
         )
-    return found, (
+    return f'predicts {max(fit.predicted, 0.0):.0%} of the motion of y', (
         'enter the G(z) of this plant, discretised with sample_period; see that y is measured '
         'behind the gap and that the driver holds v over the period'
     )
+
+
+def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None:
+    """Sample period [s] for which the poles of G fit as they are, to within plant.uncertainty."""
+    later = Record(record.v[MORE_DELAY:], record.y[MORE_DELAY:], record.lag)
+    others: list[tuple[float, float]] = []
+    for ratio in OTHER_PERIODS:
+        denominator = np.real(np.poly(fit.told.poles.astype(complex) ** ratio)).tolist()
+        other = TransferFunction(fit.told.numerator.tolist(), denominator)
+        # The same samples of y as in the fit, whose evidence is compared.
+        refit = _fit(other, later, p, more_delay=0)
+        if refit.predicted >= PREDICTED and refit.error_scale <= 1.0:
+            others.append((refit.evidence, ratio))
+    best, ratio = max(others, default=(-inf, 1.0))
+    return p.real('sample_period') / ratio if best > fit.evidence - DECISIVE else None
 
 
 def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
@@ -229,8 +240,7 @@ def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
     if report_use(p) is ReportUse.ALWAYS:
         lag = 0  # the report already has it
     found = fit.delay + lag
-    inside = expected - lag
-    if 0 <= inside < len(fit.margins) and fit.margins[inside] <= DECISIVE:
+    if fit.margins.get(expected - lag, inf) <= DECISIVE:
         return Finding(DELAY, FITS, f'{expected} samples, as control.delay_samples says')
     return Finding(
         DELAY, WRONG, f'{found} samples; control.delay_samples says {expected}',
@@ -238,15 +248,15 @@ def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
     )
 
 
-def _sign(fit: RecordFit, found: Crossings | None, p: Parameters) -> Finding:
+def _sign(fit: RecordFit, p: Parameters) -> Finding:
     if fit.m < 0.0:
         return Finding(
             SIGN, WRONG, f'y moves against v: m would be {fit.m:.4g}',
             'change the sign of y or v in the driver, or of plant.numerator',
         )
     values = [('m', fit.m, fit.std_m)]
-    if found is not None:
-        values += [('c_r', found.c_r, found.std_c_r), ('c_l', found.c_l, found.std_c_l)]
+    if not fit.doubts:
+        values += [('c_r', fit.c_r, fit.std_c_r), ('c_l', fit.c_l, fit.std_c_l)]
     for name, value, std in values:
         low, high = p.pair(f'estimator.bounds.{name}')
         slack = 3.0 * std + BOUND_SLACK * abs(value)
@@ -257,6 +267,21 @@ def _sign(fit: RecordFit, found: Crossings | None, p: Parameters) -> Finding:
                 f'estimator.bounds.{name}',
             )
     return Finding(SIGN, FITS, f'm is about {fit.m:.4g}, within its bounds')
+
+
+def _model(fit: RecordFit, p: Parameters) -> Finding:
+    """Say how far G is off where it was learned to be another one: the loop learns it too."""
+    found = f'predicts {fit.predicted:.1%} of the motion of y'
+    if fit.model is not fit.told:
+        period = p.real('sample_period')
+        errors = ', '.join(
+            f'{error:.1%} at {frequency / (2.0 * pi * period):.2g} Hz'
+            for frequency, error in zip(
+                fit.frequencies, fit.error_of_model(fit.frequencies), strict=True
+            )
+        )
+        found += f' once it is corrected: it is off by {errors}'
+    return Finding(MODEL, FITS, found)
 
 
 def _noise(fit: RecordFit, p: Parameters) -> Finding:
@@ -270,47 +295,15 @@ def _noise(fit: RecordFit, p: Parameters) -> Finding:
     return Finding(NOISE, WRONG, found, cure)
 
 
-def _backlash(found: Crossings | None, swing: float) -> Finding:
-    if found is None:
+def _backlash(fit: RecordFit, swing: float) -> Finding:
+    if fit.doubts:
         return Finding(
-            BACKLASH, WRONG, f'not identifiable from this motion: v swung by {swing:.4g}',
+            BACKLASH, WRONG, f'not identifiable from this motion: v swung by {swing:.4g}; '
+            + '; '.join(fit.doubts),
             'swing v past the gap in both directions, several times; raise --duration',
         )
     return Finding(BACKLASH, FITS, ', '.join(
         f'{name} = {value:.4g} ± {std:.1g}' for name, value, std in (
-            ('m', found.m, found.std_m), ('c_r', found.c_r, found.std_c_r),
-            ('c_l', found.c_l, found.std_c_l),
+            ('m', fit.m, fit.std_m), ('c_r', fit.c_r, fit.std_c_r), ('c_l', fit.c_l, fit.std_c_l),
         )
     ))
-
-
-def _crossings(fit: RecordFit, record: Record, p: Parameters) -> Crossings | None:
-    """Read the record with the filters of the loop around the gap of the fit.
-
-    None unless m, c_r, c_l come out as precise as the loop would publish them.
-    """
-    sign = 1.0 if fit.m > 0.0 else -1.0
-    model = StateModel(TransferFunction(
-        tuple(sign * value for value in p.reals('plant.numerator')),
-        p.reals('plant.denominator') + (0.0,) * fit.delay,
-    ))
-    swing, m, gap = float(np.ptp(record.v)), abs(fit.m), fit.c_r - fit.c_l
-    gaps = np.union1d(
-        np.clip(gap * GAP_RATIOS, NO_GAP * swing * GAP_RATIOS, swing), max(gap, 1e-6 * swing)
-    )
-    floor = NOISE_FLOOR * float(np.linalg.norm(model.b)) * m * swing
-    noise_std = max(p.real('estimator.output_noise_std'), fit.rms, floor)
-    prior = Prior(np.array([m, 0.0, 0.0]), SLOPE_REACH * m)
-    bank = GapBank(gaps, model, prior, Noise(noise_std), COARSE_TOLERANCE)
-    for k in range(1, len(record.v)):
-        bank.predict(float(record.v[k - 1]))
-        if np.isfinite(record.y[k]):
-            bank.correct(float(record.y[k]))
-    if not bank.active:
-        return None
-    bank.elect()
-    found = bank.found()
-    if found is None or found.std_m > PRECISE_SLOPE * found.m:
-        return None
-    precise = found.std_gap <= max(PRECISE_GAP * found.gap, NO_GAP * swing)
-    return found if precise else None

@@ -118,13 +118,13 @@ def contenders(scenario: Parameters) -> list[Contender]:
     return [
         *(
             Contender(f'{law}, u_d = y_m + f v', {**paper, 'estimator.law': law}, False)
-            for law in ('printed', 'lms', 'kalman')
+            for law in ('printed', 'lms', 'moving_horizon')
         ),
         Contender('gradient, four blocks', {
             'structure': 'pole_placement', 'estimator.law': 'gradient',
             'tracking.input_weight': FOUR_BLOCKS_WEIGHT,
         }, True),
-        Contender('kalman, tracking', {**tracks, 'estimator.law': 'kalman'}, True),
+        Contender('moving_horizon, tracking', {**tracks, 'estimator.law': 'moving_horizon'}, True),
         Contender('wrong constants, tracking', {
             **tracks, **_fixed(m, 1.3 * c_r, 1.3 * c_l), 'fixed.doubt': 0.5,
         }, True),

@@ -42,7 +42,7 @@ def draw_comparison(results: Sequence[Result]) -> Figure:
             shown = np.where(size > 0.0, size, np.nan)
             name = result.contender.name if place == 0 else ''
             # Wide, as another curve comes to lie on it.
-            width = 3.4 if result.contender.name == 'kalman, tracking' else 1.7
+            width = 3.4 if result.contender.name == 'moving_horizon, tracking' else 1.7
             curve(axes, t, shown, colour, name, style, width)
             axes.set_xlim(0.0, float(t[-1]))
             drawn[place] += shown[np.isfinite(shown)].tolist()

@@ -24,7 +24,7 @@ COLOURS = {
     'u': '#000000', 'u_d': '#E69F00', 'v': '#CC79A7', 'y': '#332288', 'y_m': '#777777',
     'e': '#882255', 'true': '#000000',
 }
-LAW_COLOURS = {'kalman': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
+LAW_COLOURS = {'moving_horizon': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
 OTHER_LAW = '#555555'
 ESTIMATES = {'m': r'\hat{m}', 'c_r': r'\hat{c}_r', 'c_l': r'\hat{c}_l'}
 STYLES = {'m': '-', 'c_r': '--', 'c_l': '-.'}

@@ -30,6 +30,7 @@ NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
 REVERSALS = 2  # changes of the engaged side before the first estimate where G is uncertain
 
 # --- what does not fit
+SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
 GATE = 6.0  # standard deviations of an innovation beyond which y is an outlier
 OUTLIERS = 5  # outliers in a row that are none
 MISFIT = 3.0  # mean normalised square of the residuals of a block that contradicts the fit

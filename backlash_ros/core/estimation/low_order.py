@@ -98,8 +98,8 @@ def low_order(
         return None
     b = b * (gain * float(a.sum()) / float(b.sum()))
     taps = int(np.flatnonzero(np.abs(b) > NO_TAP * np.abs(b).max())[-1]) + 1
-    order = max(n, delay + taps - 1)
-    numerator: Array = np.zeros(order + 1)
+    order = max(n, delay + taps - 1 - problem.integrators)  # of the stable part
+    numerator: Array = np.zeros(order + problem.integrators + 1)
     denominator: Array = np.append(a, np.zeros(order - n))
     numerator[delay:delay + taps] = b[:taps]
     whole = np.convolve(denominator, problem.integrate)

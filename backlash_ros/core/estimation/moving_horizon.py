@@ -39,6 +39,7 @@ from backlash_ros.core.estimation.constants import (
     REVERSALS,
     SEARCH_GROWTH,
     SEARCHED,
+    SMALLEST_NOISE,
     UNDECIDED,
 )
 from backlash_ros.core.estimation.crossings import Crossings
@@ -61,7 +62,6 @@ Array = NDArray[np.float64]
 Task = Generator[None, None, None]
 
 CAPACITY = 2 * LONGEST  # samples kept: those that are fitted, and those that come meanwhile
-SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
 
 
 class MovingHorizon:

@@ -25,20 +25,24 @@ from backlash_ros.core.state_model import StateModel
 Array = NDArray[np.float64]
 
 # Noise on u, as its stationary share of y in units of the noise of y, that gains are made for.
-RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
+STEP = 10.0  # ratio of neighbours
+RATIOS = tuple(STEP**exponent for exponent in range(-4, 5))
 ROUNDING = 1e-9  # noise on every state beside that on u: keeps the Riccati equation regular
 MEMORY = 100  # samples over which innovations are averaged
+CHANCE = 1.15  # ratio of their deviation to the expected one that chance explains
 
 
 class Gain(NamedTuple):
     """gain: after a prediction, in the observer form. innovation: its deviation over that of y.
 
     cov: of the state in the coordinates of StateModel, in units of the variance of y, (n, n).
+    quiet: what `innovation` is with this gain where the noise on u is that of the next smaller one.
     """
 
     gain: tuple[float, ...]
     innovation: float
     cov: Array
+    quiet: float
 
 
 @lru_cache(maxsize=256)
@@ -52,13 +56,19 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
     noise += ROUNDING * float(np.trace(noise)) * np.eye(n)
     try:
         p = linalg.solve_discrete_are(model.a.T, c, noise, np.eye(1))
+        variance = float(model.c * p[0, 0] * model.c) + 1.0
+        column = p[:, 0] * model.c / variance
+        # Error of the prediction with this gain: P = (A - A k c) P (A - A k c)' + A k k' A' + Q.
+        after = model.a @ column
+        quiet = linalg.solve_discrete_lyapunov(
+            model.a - np.outer(after, c), np.outer(after, after) + noise * STEP**-2
+        )
     except (linalg.LinAlgError, ValueError):
         return None
-    variance = float(model.c * p[0, 0] * model.c) + 1.0
-    column = p[:, 0] * model.c / variance
     return Gain(
         tuple((model.to_observer @ column).tolist()), sqrt(variance),
         p - np.outer(column, column) * variance,
+        sqrt(float(model.c * quiet[0, 0] * model.c) + 1.0),
     )
 
 
@@ -122,18 +132,17 @@ class Observer:
         noise_std: of y from now on.
         """
         self._noise_std = noise_std
-        if self.variance > (self._gain.innovation * noise_std) ** 2:
-            level = min(self._level + 1, len(RATIOS) - 1)
-        else:
-            level = max(self._level - 1, 0)
-        gain = self._gain_at(level)
-        if level > self._level or self.variance <= (gain.innovation * noise_std) ** 2:
-            self._level, self._gain = level, gain
+        gain = self._gain
+        if self.variance > (CHANCE * gain.innovation * noise_std) ** 2:
+            self._level = min(self._level + 1, len(RATIOS) - 1)
+        elif self.variance < gain.innovation * gain.quiet * noise_std**2:
+            self._level = max(self._level - 1, 0)
+        self._gain = self._gain_at(self._level)
         self.cov = self.noise_cov
 
     def _gain_at(self, level: int) -> Gain:
         gain = gain_of(self.model, RATIOS[level])
         if gain is None:
             n = self._n
-            return Gain((0.0,) * n, 1.0, np.eye(n))
+            return Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
         return gain

@@ -48,7 +48,8 @@ def search(
     """Compare gaps up to `widest` over v (N,) and y (N,), nan where lost; yields between pieces."""
     swing = float(np.ptp(v))
     top = min(swing, widest)
-    if not top > 0.0 or float(weights[np.isfinite(y)].sum()) <= model.order + 3:
+    if not (top > 0.0 and NO_GAP * swing > 0.0) \
+            or float(weights[np.isfinite(y)].sum()) <= model.order + 3:
         return Found([], 0.0)
     comparison = _Comparison(v, y, weights, model, error, told_std)
     null = comparison.null

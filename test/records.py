@@ -1,0 +1,71 @@
+"""Records of v and y for the tests of the default law, simulated without its code."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete
+
+from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+PERIOD_S = 0.005
+
+
+class Truth(NamedTuple):
+    """A backlash. share: of the gap, where the play output stands before the first sample."""
+
+    m: float = 1.3
+    c_r: float = 1.0
+    c_l: float = -0.8
+    share: float = 0.4
+
+    @property
+    def gap(self) -> float:
+        """Width."""
+        return self.c_r - self.c_l
+
+    @property
+    def theta(self) -> Array:
+        """(m, m c_r, m c_l)."""
+        return self.m * np.array([1.0, self.c_r, self.c_l])
+
+    def start(self, v: Array) -> float:
+        """Play output before v (N,)."""
+        return float(v[0]) + self.share * self.gap
+
+
+def resonance(frequency_hz: float = 5.0, damping: float = 0.5) -> TransferFunction:
+    """G(z) of a load on a spring."""
+    w = 2.0 * np.pi * frequency_hz
+    continuous = ([w**2], [1.0, 2.0 * damping * w, w**2])
+    numerator, denominator, _ = cont2discrete(continuous, PERIOD_S, 'zoh')
+    return TransferFunction(numerator[0, 1:].tolist(), denominator.tolist())
+
+
+def swing(count: int, size: float = 3.0, seed: int = 0) -> Array:
+    """A smooth v of many frequencies, up to about `size`."""
+    rng = np.random.default_rng(seed)
+    t = PERIOD_S * np.arange(count)
+    return size / 2.0 * sum(
+        np.sin(2.0 * np.pi * f * t + rng.uniform(0.0, 2.0 * np.pi)) for f in (0.7, 1.9, 3.7)
+    )
+
+
+def output(
+    model: TransferFunction, v: Array, truth: Truth, noise_std: float = 0.0, seed: int = 0,
+) -> Array:
+    """y (N,) after each v (N,), from rest at the u held before."""
+    held = truth.m * (truth.start(v) - truth.c_r)
+    backlash = Backlash(truth.m, truth.c_r, truth.c_l, held)
+    a, b, c = model.state_space()
+    x = np.linalg.solve(np.eye(model.order) - a, b * held)
+    y = []
+    for value in v.tolist():
+        x = a @ x + b * backlash.step(value)
+        y.append(float(c @ x))
+    return np.array(y) + noise_std * np.random.default_rng(seed).standard_normal(len(v))
