@@ -185,3 +185,19 @@ def test_every_command_keeps_the_limits_that_hold_at_that_moment(
             )
             assert outside <= max(outside_before - limits.move, 0.0) + 1e-9 * (1.0 + abs(v))
             v = command
+
+
+def test_a_loop_that_was_driven_to_its_bounds_comes_back() -> None:
+    # Full feedback between its own bounds would cycle like between those of v.
+    p = Parameters({
+        'structure': 'tracking', 'amplitude': 0.2, 'estimator.law': 'fixed', 'fixed.doubt': 0.1,
+        'estimator.initial.m': 1.3, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0,
+    })
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    y = []
+    for k in range(900):
+        y.append(plant.measure())
+        step = controller.step(-y[-1] if 100 <= k < 160 else y[-1], reference(k * 0.01))
+        plant.step(step.v)
+    assert max(map(abs, y)) > 10.0
+    assert max(map(abs, y[600:])) < 0.25

@@ -80,10 +80,11 @@ class Tracking:
         self._ideal = 0.0  # u* of the sample before
         self._asked = 0.0  # largest |u*| so far
         self._reach = 0.0  # that, or the u that the gap takes
+        self._bounded_before = False  # whether feedback has met its bound the sample before
         self._width = 1.0  # bound on feedback in reaches, while the backlash is unknown
         self._known = False  # whether the estimate comes from data
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
-        self._level = self._free = 0  # softer while v meets limits, samples since it last did
+        self._level = self._free = 0  # softer while v does not follow, samples since it last did
         self._softness = 0  # of the gain in use
         self._u_d = 0.0  # of the sample before
         self._resumes = False  # whether this goes on from an interruption
@@ -151,13 +152,14 @@ class Tracking:
         self._reach = max(self._asked, estimate.m * (estimate.c_r - estimate.c_l))
         trusted = self._is_trusted(estimate, first)
         if self._trusted_for > 0:
-            feedback = dot(self._gain(inverse.limited or inverse.taking_up), deviation)
+            held_back = self._bounded_before or inverse.limited or inverse.taking_up
+            feedback = dot(self._gain(held_back), deviation)
         else:
             feedback = self._careful_feedback(deviation)
         if trusted and gains.integral:
             feedback += gains.integral * (self._integral - self._q)
         most = LARGEST_FEEDBACK * max(self._reach, self._tolerated)
-        bounded = not -most <= feedback <= most
+        self._bounded_before = bounded = not -most <= feedback <= most
         if bounded:
             feedback = most if feedback > 0.0 else -most
         u_d = ideal - feedback
@@ -244,7 +246,10 @@ class Tracking:
         self._x = (self._design.model.equilibrium * r).tolist()
 
     def _gain(self, limited: bool) -> list[float]:
-        """K, or a softer one: the longer v meets its limits, and the newer the estimate."""
+        """K, or a softer one: the longer v does not follow, and the newer the estimate.
+
+        limited: whether v met its limits, was on its way across the gap, or feedback at its bound.
+        """
         self._free = 0 if limited else self._free + 1
         if limited:
             self._level = min(self._level + 1, len(self._soft) - 1)
