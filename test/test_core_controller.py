@@ -171,7 +171,7 @@ def test_new_estimates_move_v_no_faster_than_the_gap_is_crossed(f: float) -> Non
         for _ in range(80):
             before, y_m = c.inverse.v, y_m + 1e-6
             moves.append(abs(c.step(0.0, y_m).v - before))
-        assert max(moves) <= 0.1 * (1.0 + 1e-9)
+        assert max(moves) <= 0.1 + 1e-3, 'the line is reached, and what y_m has moved meanwhile'
         assert c.inverse.v == pytest.approx(3.0 + (y_m + 3.0 * f) / (changed.m - f))
     c.compensating = False
     before = c.inverse.v
@@ -207,7 +207,9 @@ def test_saturated_v_comes_back_as_soon_as_the_command_allows() -> None:
     c = controller(Notebook(replace(PAPER, f=0.0)), Limits(high=5.0))
     assert c.step(0.0, 10.0).v == 5.0
     assert c.step(0.0, 11.0).v == 5.0
-    assert c.step(0.0, 5.0).v == pytest.approx(5.0 / 1.3 - 3.0)
+    # u has not come further than 2.6: only below that v has to turn.
+    assert c.step(0.0, 5.0).v == 5.0
+    assert c.step(0.0, 2.5).v == pytest.approx(2.5 / 1.3 - 3.0)
 
 
 @pytest.mark.parametrize('bad', [nan, inf, -inf])

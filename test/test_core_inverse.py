@@ -114,23 +114,23 @@ def test_a_turn_beyond_the_direction_band_changes_the_line(
     assert inverse.step(u_d, play.m, play.c_r, play.c_l) == u_d / play.m + far
 
 
-@given(play=usual_plays(), take_up=st.floats(0.1, 10.0), u_d=st.floats(0.5, 50.0))
+@given(play=usual_plays(), take_up=st.floats(0.1, 10.0), u_d=st.floats(0.5, 50.0),
+       signal=signals())
 def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(
-    play: Play, take_up: float, u_d: float,
+    play: Play, take_up: float, u_d: float, signal: list[float],
 ) -> None:
     inverse = BacklashInverse(take_up=take_up)
     backlash = Backlash(play.m, play.c_r, play.c_l)
-    v_before = 0.0
-    for target in (u_d, -u_d, u_d):
-        line = play.c_r if target > 0.0 else play.c_l
-        # The signal stays on its value while v crosses: taking up must go on by itself.
-        for _ in range(ceil(abs(target / play.m + line - v_before) / take_up) + 1):
-            v_last, v = inverse.v, inverse.step(target, play.m, play.c_r, play.c_l)
-            assert abs(v - v_last) <= take_up * (1.0 + 1e-9)
-            u = backlash.step(v)
-        assert v == target / play.m + line
-        assert u == pytest.approx(target, abs=play.rounding(target))
-        v_before = v
+    for target in (u_d, -u_d, u_d, *signal):
+        held, v_last = backlash.u, inverse.v
+        v = inverse.step(target, play.m, play.c_r, play.c_l)
+        u = backlash.step(v)
+        # What lies beyond the gap is free.
+        assert abs(v - v_last) <= take_up + abs(u - held) / play.m + play.rounding(v)
+    # The signal stays where it ends while v crosses: taking up must go on by itself.
+    for _ in range(ceil(play.gap / take_up) + 2):
+        u = backlash.step(inverse.step(target, play.m, play.c_r, play.c_l))
+    assert u == pytest.approx(target, abs=play.rounding(u_d + abs(target)))
 
 
 @given(play=usual_plays(), u_d=st.floats(0.5, 50.0), growth=st.floats(1.01, 5.0))

@@ -19,8 +19,8 @@ class BacklashInverse:
     direction_band: u_d has turned only when it came back from its extreme by more than this
         [unit of u_d]; until then v is held. 0 is the printed inverse.
     take_up: largest move of v per sample while the gap is crossed (2.3: "a line segment with a
-        finite slope") and while v goes over to a line that the estimates have moved by more than
-        that [unit of v]; inf jumps.
+        finite slope"), and over to a line that new estimates have moved by more than that [unit
+        of v]; inf jumps. From there on v goes as far as u_d does.
     """
 
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
@@ -35,7 +35,9 @@ class BacklashInverse:
         self.side = GAP  # line in use; GAP until u_d moves for the first time
         self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
         self.taking_up = False  # whether v is still on its way to the line
-        self._slope, self._crossing = nan, nan  # of the line that v was last sent to
+        self._slowed = False  # whether that counts for the whole way to where u_d wants v
+        self._play = nan, nan, nan  # m, c_r, c_l in use the sample before
+        self._u = 0.0  # what they make of v, as long as v is on its way to a line
 
     def set_band(self, band: float) -> None:
         """Use this band, and none narrower from now on."""
@@ -50,7 +52,7 @@ class BacklashInverse:
         """Take over v and the line that is engaged."""
         self.v, self.side, self.extreme = other.v, other.side, other.extreme
         self.taking_up, self.limited = other.taking_up, other.limited
-        self._slope, self._crossing = other._slope, other._crossing
+        self._play, self._u, self._slowed = other._play, other._u, other._slowed
 
     def direction(self, u_d: float) -> Region:
         """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held.
@@ -68,26 +70,48 @@ class BacklashInverse:
     def step(self, u_d: float, m: float, c_r: float, c_l: float) -> float:
         """Return v(t) for u_d(t) and the parameters in use, equation (2.3)."""
         side = self.direction(u_d)
+        if not self.taking_up:
+            self._u = self.extreme
+        elif self.side is not GAP:
+            side = self._side_on_the_way(u_d, side)
         if side is not GAP:
             self.taking_up = self.taking_up or side is not self.side
             self.side, self.extreme = side, u_d
         elif not self.taking_up or self.side is GAP:
             return self.v
         crossing = c_r if self.side is RIGHT else c_l
-        v = self.extreme / m + crossing
-        move, take_up = v - self.v, self.take_up
-        if (move > take_up or move < -take_up) and (self.taking_up or self._moved(m, crossing)):
+        # Where v begins to move u, or would have stood if these parameters had been in use before.
+        until = self.extreme if self._slowed else self._u
+        way, take_up = until / m + crossing - self.v, self.take_up
+        if way > take_up or way < -take_up:
+            self.v += take_up if way > 0.0 else -take_up
             self.taking_up = True
-            self.v += take_up if move > 0.0 else -take_up
         else:
-            self.v, self.taking_up = v, False
-        self._slope, self._crossing = m, crossing
+            self.v, self.taking_up = self.extreme / m + crossing, False
+            self._slowed = False
+        self._play = m, c_r, c_l
         return self.v
 
-    def _moved(self, m: float, crossing: float) -> bool:
-        """Whether the line has moved by more than v may in a sample."""
-        before = self.extreme / self._slope + self._crossing
-        return abs(self.extreme / m + crossing - before) > self.take_up
+    def _side_on_the_way(self, u_d: float, side: Region) -> Region:
+        """The same as `direction` while v is on its way to a line.
+
+        u is held until v arrives: u_d has turned only when it lies on the other side of that.
+        """
+        m, c_r, c_l = self._play
+        low, high = m * (self.v - c_r), m * (self.v - c_l)
+        if self._u < low:
+            self._u = low
+        elif self._u > high:
+            self._u = high
+        if side is GAP:
+            return GAP
+        if self.side is RIGHT:
+            return LEFT if u_d < self._u - self.direction_band else RIGHT
+        return RIGHT if u_d > self._u + self.direction_band else LEFT
+
+    def slow_down(self) -> None:
+        """Let v go on to where u_d wants it like it crosses the gap, until it is there."""
+        self.taking_up = self._slowed = True
 
     def aim(self, u_d: float, side: Region) -> None:
         """Let the next step go to u_d on the line of this side, whatever it came from."""
@@ -102,7 +126,8 @@ class BacklashInverse:
     def start_from(self, v: float) -> None:
         """Say which v acts before the next step, whatever was sent."""
         if v != self.v and self.side is not GAP:
-            self.extreme = self._slope * (v - self._crossing)
+            slope, c_r, c_l = self._play
+            self.extreme = slope * (v - (c_r if self.side is RIGHT else c_l))
         self.v = v
 
     def applied(self, v: float) -> None:

@@ -25,9 +25,17 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Adoption, Command, Situation, Structure
+from backlash_ros.core.structure import (
+    LARGEST_CAREFUL,
+    LARGEST_FEEDBACK,
+    Adoption,
+    Command,
+    Situation,
+    Structure,
+)
 from backlash_ros.core.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -40,7 +48,7 @@ class FourBlocks:
     """Gains theta_1 (n-1,), theta_2 (n-1,), theta_20, theta_3 and what they make of the loop.
 
     filter: Lambda, shape (n,). reference: theta_3 B/A_m from r to y. disturbance: W from u - u_d
-    to y.
+    to y. demand: theta_3 A/A_m from r to u_d, coefficients of numerator and denominator.
     """
 
     theta_1: Array
@@ -50,6 +58,7 @@ class FourBlocks:
     filter: Array
     reference: TransferFunction
     disturbance: TransferFunction
+    demand: tuple[Array, Array]
 
 
 def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> FourBlocks:
@@ -82,7 +91,7 @@ def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> F
     return FourBlocks(
         (placed - s)[1:], (r - r[0] * placed)[1:], float(r[0]), theta_3, placed,
         TransferFunction((theta_3 * b).tolist(), closed.tolist()),
-        TransferFunction(np.convolve(b, s).tolist(), product.tolist()),
+        TransferFunction(np.convolve(b, s).tolist(), product.tolist()), (theta_3 * a, closed),
     )
 
 
@@ -101,6 +110,10 @@ class PolePlacement:
         self._companion[:1] = -blocks.filter[1:]
         self._w_1: Array = np.zeros(size)
         self._w_2: Array = np.zeros(size)
+        # r and what it asks for, newest first.
+        self._r: Array = np.zeros(len(blocks.demand[0]))
+        self._asked: Array = np.zeros(len(blocks.demand[1]) - 1)
+        self._reach = 0.0  # largest of it so far
         self.delay = round(_delay_of(blocks.reference))
 
     def design(self, model: StateModel) -> Iterator[Adoption | None]:
@@ -111,18 +124,33 @@ class PolePlacement:
         """Take over what the filters hold."""
         if isinstance(other, PolePlacement) and len(other._w_1) == len(self._w_1):
             self._w_1, self._w_2 = other._w_1, other._w_2
+            self._r, self._asked, self._reach = other._r, other._asked, other._reach
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
         blocks, estimate = self._blocks, situation.estimate
         u_d = float(blocks.theta_1 @ self._w_1 + blocks.theta_2 @ self._w_2)
         u_d += blocks.theta_20 * situation.y + blocks.theta_3 * situation.y_m
+        u_d = self._bounded(u_d, situation.y_m, estimate)
         v = inverse.step(u_d, estimate.m, estimate.c_r, estimate.c_l)
         self._w_1 = self._companion @ self._w_1
         self._w_2 = self._companion @ self._w_2
         self._w_1[:1] += u_d
         self._w_2[:1] += situation.y
         return Command(u_d, v, 0.0)
+
+    def _bounded(self, u_d: float, r: float, estimate: Estimate) -> float:
+        """u_d, no further than feedback may go from what r asks for without disturbances."""
+        numerator, denominator = self._blocks.demand
+        self._r[1:] = self._r[:-1]
+        self._r[0] = r
+        asked = float(numerator @ self._r - denominator[1:] @ self._asked)
+        self._asked[1:] = self._asked[:-1]
+        self._asked[0] = asked
+        self._reach = max(self._reach, abs(asked))
+        reach = max(self._reach, estimate.m * (estimate.c_r - estimate.c_l))
+        share = LARGEST_FEEDBACK if estimate.status is Status.TRACKING else LARGEST_CAREFUL
+        return min(max(u_d, asked - share * reach), asked + share * reach)
 
 
 def _delay_of(model: TransferFunction) -> float:

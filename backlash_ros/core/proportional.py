@@ -53,7 +53,10 @@ class Proportional:
         if f > LARGEST_F_OVER_M * m:
             f = LARGEST_F_OVER_M * m
         if before is not None and before is not estimate and inverse.take_up < inf:
-            _slow_down(inverse, _solution(y_m, before, inverse), _solution(y_m, estimate, inverse))
+            # A new estimate moves u_d too, so the inverse cannot tell by itself.
+            now, then = _solution(y_m, estimate, inverse), _solution(y_m, before, inverse)
+            if abs(now - then) > inverse.take_up:
+                inverse.slow_down()
         right = m * (y_m + f * c_r) / (m - f)
         left = m * (y_m + f * c_l) / (m - f)
         v = inverse.v
@@ -94,14 +97,6 @@ def _solution(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> float
     """v on the line in use."""
     m, c = estimate.m, estimate.c_r if inverse.side is Region.RIGHT else estimate.c_l
     return c + (y_m + estimate.f * c) / (m - min(estimate.f, LARGEST_F_OVER_M * m))
-
-
-def _slow_down(inverse: BacklashInverse, before: float, now: float) -> None:
-    """Let v go over to what a new estimate wants like it crosses the gap.
-
-    The inverse cannot tell that by itself, as a new estimate moves u_d too.
-    """
-    inverse.taking_up = inverse.taking_up or abs(now - before) > inverse.take_up
 
 
 def _deviation(y_m: float, f: float, estimate: Estimate) -> float:

@@ -36,6 +36,7 @@ CLOSE, SETTLING = 7.0, 200
 DOUBT = 2.0  # the same in standard deviations of x, where that is more
 SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
 ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
+TURNS = 2  # while the trajectory rests, after which feedback goes on in single steps
 ARRIVED = 0.5  # share of the tolerance within which v comes to rest after a motion
 STEADY = 0.004  # share of the tolerance by which x* may still move per sample
 OFF = 6.0  # standard deviations of y that mean a deviation while the state is unknown
@@ -70,6 +71,8 @@ class Rest:
         self._reach = 0.0  # square of the largest |x*| so far
         self._limit = 0.0  # tolerance in use
         self._rested = 0  # samples for which the trajectory has rested
+        self._turns, self._side = 0, Region.GAP  # since x* rests; line in use the sample before
+        self._near = 0  # samples since y was last away
         self._pull = 0.0  # u - u* with which leading back began
         self._low, self._high = inf, -inf  # of the window, where it was still the sample before
 
@@ -82,16 +85,17 @@ class Rest:
         """Take over where another one of the same model rests."""
         self.mode, self.u_d, self.caution = other.mode, other.u_d, other.caution
         self._reach, self._limit, self._pull = other._reach, other._limit, other._pull
-        self._rested = other._rested
+        self._rested, self._near = other._rested, other._near
+        self._turns, self._side = other._turns, other._side
 
     def decide(
         self, y: float, window: Array, x: Sequence[float], onward: Sequence[float],
-        deviation: Sequence[float], x_std: float | None,
+        deviation: Sequence[float], x_std: float | None, side: Region,
     ) -> Mode:
         """Set the mode for this sample.
 
         window: r from now on. x, onward: x* now and at the next sample. deviation: x_hat - x*.
-        x_std: standard deviation of x_hat, None where it is unknown.
+        x_std: standard deviation of x_hat, None where it is unknown. side: line in use.
         """
         self._reach = max(self._reach, dot(x, x))
         least = SHARE * sqrt(self._reach)
@@ -101,9 +105,9 @@ class Rest:
             motion += (then - now) ** 2
         if motion > (STEADY * tolerance) ** 2:
             self._low, self._high = inf, -inf
-            self.mode, self._rested = Mode.FOLLOW, 0
+            self._moves_on()
         elif not self._is_still(window):
-            self.mode, self._rested = Mode.FOLLOW, 0
+            self._moves_on()
         elif x_std is None:
             off = abs(y - window.item(0)) > OFF * self._noise_std
             self.mode = Mode.FOLLOW if off else Mode.HOLD
@@ -112,8 +116,14 @@ class Rest:
             if self._rested < SETTLING:
                 tolerance = max(CLOSE * self._noise_std, least)
             self._limit = max(tolerance, DOUBT * x_std)
+            if self.mode is Mode.FOLLOW and side is not self._side:
+                self._turns += 1
             self.mode = self._mode_for(deviation)
+        self._side = side
         return self.mode
+
+    def _moves_on(self) -> None:
+        self.mode, self._rested, self._turns = Mode.FOLLOW, 0, 0
 
     def _is_still(self, window: Array) -> bool:
         newest = window.item(-1)
@@ -126,14 +136,21 @@ class Rest:
 
     def _mode_for(self, deviation: Sequence[float]) -> Mode:
         size = sqrt(dot(deviation, deviation))
-        if size > ASTRAY * self._limit:
+        # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
+        # it is due again when y has stayed where it belongs for a while, and is pushed away.
+        self._near = self._near + 1 if size <= self._limit else 0
+        if self._near >= SETTLING:
+            self._turns = 0
+        follows = self._turns < TURNS
+        if size > ASTRAY * self._limit and follows:
             return Mode.FOLLOW
-        if self.mode is Mode.FOLLOW:
+        if self.mode is Mode.FOLLOW and follows:
             return Mode.HOLD if size <= ARRIVED * self._limit else Mode.FOLLOW
         pull = self._pull_back(deviation)
         if self.mode is Mode.LEAD_BACK:
-            back = pull * self._pull <= LED_BACK * self._pull**2
-            return Mode.HOLD if back else Mode.LEAD_BACK
+            if pull * self._pull > LED_BACK * self._pull**2:
+                return Mode.LEAD_BACK
+            return Mode.HOLD
         if size <= self._limit:
             return Mode.HOLD
         self._pull = pull

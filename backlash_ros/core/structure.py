@@ -13,6 +13,11 @@ from backlash_ros.core.estimation.protocol import Estimate, StateSource
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.state_model import StateModel
 
+# Largest feedback, whatever y does, in units of the u that the reference has asked for so far or
+# that the gap takes: while the backlash is unknown, as wrong as a first guess may be; later what
+# leads y back from where it has gone until then.
+LARGEST_CAREFUL, LARGEST_FEEDBACK = 10.0, 100.0
+
 
 class Situation(NamedTuple):
     """What is known at a sample: reference, output, estimate, and who knows the state of G."""

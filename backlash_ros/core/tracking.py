@@ -13,9 +13,17 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.protocol import Estimate, StateSource, Status
 from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.reference_window import ReferenceWindow
-from backlash_ros.core.rest import OFF, Mode, Rest
+from backlash_ros.core.rest import OFF, TOLERANCE, Mode, Rest
 from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Adoption, Command, Situation, Structure, dot
+from backlash_ros.core.structure import (
+    LARGEST_CAREFUL,
+    LARGEST_FEEDBACK,
+    Adoption,
+    Command,
+    Situation,
+    Structure,
+    dot,
+)
 from backlash_ros.core.tracking_design import (
     Replay,
     TrackingDesign,
@@ -70,9 +78,13 @@ class Tracking:
         self._q = 0.0
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
-        self._u_reach = 0.0
+        self._asked = 0.0  # largest |u*| so far
+        self._reach = 0.0  # that, or the u that the gap takes
+        self._bounded_before = False  # whether feedback has met its bound the sample before
+        self._width = 1.0  # bound on feedback in reaches, while the backlash is unknown
+        self._known = False  # whether the estimate comes from data
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
-        self._level = self._free = 0  # softer while v meets limits, samples since it last did
+        self._level = self._free = 0  # softer while v does not follow, samples since it last did
         self._softness = 0  # of the gain in use
         self._u_d = 0.0  # of the sample before
         self._resumes = False  # whether this goes on from an interruption
@@ -91,6 +103,8 @@ class Tracking:
         self._b: list[float] = model.b.tolist()
         self._k: list[float] = gains.state.tolist()
         self._soft: list[list[float]] = [gain.tolist() for gain in (gains.state, *chosen.softer)]
+        # What an error of y calls for that would not matter at rest: never too much feedback.
+        self._tolerated = TOLERANCE * self._noise_std * sqrt(dot(self._k, self._k))
         self._careful = None if chosen.careful is None else chosen.careful.tolist()
         self._x_cov: Array | None = None
         self._x_std = self._feedback_std = 0.0  # of x_hat and of K x_hat, as in x_cov
@@ -108,7 +122,8 @@ class Tracking:
         self._handover, self._sharp_counts = other._handover, other._sharp_counts
         self._rest.go_on_from(other._rest)
         if state_known:
-            self._trusted_for, self._u_reach = other._trusted_for, other._u_reach
+            self._trusted_for, self._width = other._trusted_for, other._width
+            self._asked, self._known = other._asked, other._known
             self._resumes, self._blind_for = other._resumes, other._blind_for
         else:
             # However well the backlash is known, the first x_hat are full of noise.
@@ -133,13 +148,20 @@ class Tracking:
         x_cov = situation.x_cov
         if x_cov is not self._x_cov:
             self._note_covariance(x_cov)
+        self._asked = max(self._asked, abs(ideal))
+        self._reach = max(self._asked, estimate.m * (estimate.c_r - estimate.c_l))
         trusted = self._is_trusted(estimate, first)
         if self._trusted_for > 0:
-            feedback = dot(self._gain(inverse.limited), deviation)
+            held_back = self._bounded_before or inverse.limited or inverse.taking_up
+            feedback = dot(self._gain(held_back), deviation)
         else:
-            feedback = self._careful_feedback(estimate, deviation, ideal)
+            feedback = self._careful_feedback(deviation)
         if trusted and gains.integral:
             feedback += gains.integral * (self._integral - self._q)
+        most = LARGEST_FEEDBACK * max(self._reach, self._tolerated)
+        self._bounded_before = bounded = not -most <= feedback <= most
+        if bounded:
+            feedback = most if feedback > 0.0 else -most
         u_d = ideal - feedback
         rest = self._rest
         if self._resumes:
@@ -152,7 +174,8 @@ class Tracking:
             u_d = faded
         before = rest.mode
         mode = rest.decide(
-            situation.y, window, x, onward, deviation, None if x_cov is None else self._x_std
+            situation.y, window, x, onward, deviation,
+            None if x_cov is None else self._x_std, inverse.side,
         )
         caution = self._caution
         if mode is Mode.FOLLOW:
@@ -165,10 +188,10 @@ class Tracking:
             u_d, caution = rest.u_d, rest.caution
             inverse.widen_band(0.0)
         self._ideal, self._x, self._u_d = ideal, onward, u_d
-        c_r, c_l = cautious_crossings(estimate, caution)
+        c_r, c_l = cautious_crossings(estimate, caution, self._known)
         v = inverse.step(u_d, estimate.m, c_r, c_l)
         if gains.integral:
-            self._integrate(window.item(0), situation.y, x[0], trusted, inverse.limited)
+            self._integrate(window.item(0), situation.y, x[0], trusted, bounded or inverse.limited)
         return Command(u_d, v, 0.0)
 
     def design(self, model: StateModel) -> Iterator[Adoption | None]:
@@ -223,7 +246,10 @@ class Tracking:
         self._x = (self._design.model.equilibrium * r).tolist()
 
     def _gain(self, limited: bool) -> list[float]:
-        """K, or a softer one: the longer v meets its limits, and the newer the estimate."""
+        """K, or a softer one: the longer v does not follow, and the newer the estimate.
+
+        limited: whether v met its limits, was on its way across the gap, or feedback at its bound.
+        """
         self._free = 0 if limited else self._free + 1
         if limited:
             self._level = min(self._level + 1, len(self._soft) - 1)
@@ -234,37 +260,39 @@ class Tracking:
         self._softness = max(self._level, unproven)
         return self._soft[self._softness]
 
-    def _careful_feedback(
-        self, estimate: Estimate, deviation: Sequence[float], ideal: float,
-    ) -> float:
+    def _careful_feedback(self, deviation: Sequence[float]) -> float:
         """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.
 
         A wrong slope may make the loop unstable, which bounded feedback slows down. The bound
-        widens while it is met: a gap wider than the first guess has to be crossed some day.
+        widens while it is met, up to LARGEST_CAREFUL: a gap wider than the first guess has to be
+        crossed some day.
         """
-        self._u_reach = max(
-            self._u_reach, abs(ideal), estimate.m * (estimate.c_r - estimate.c_l)
-        )
         feedback = self._bounded(deviation)
-        if abs(feedback) == self._u_reach:
-            self._u_reach *= WIDENING
+        if abs(feedback) == self._width * self._reach:
+            self._width = min(WIDENING * self._width, LARGEST_CAREFUL)
         return feedback
 
     def _bounded(self, deviation: Sequence[float]) -> float:
         """Careful feedback within its bound."""
         if self._careful is None:
             return 0.0
-        return min(max(dot(self._careful, deviation), -self._u_reach), self._u_reach)
+        bound = self._width * self._reach
+        return min(max(dot(self._careful, deviation), -bound), bound)
 
     def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
-        """Whether the estimate gets full feedback; counts the samples for which it has held."""
-        if not _trusted(estimate):
+        """Whether the estimate gets full feedback; counts the samples for which it has held.
+
+        Without deviations nobody knows how far it may be relied on, and feedback stays careful.
+        """
+        self._known = _is_known(estimate, self._known)
+        if not (self._known and estimate.learned):
             self._trusted_for = 0
             return False
         if first:
             self._trusted_for = TRUSTED_AFTER
         if self._trusted_for < TRUSTED_AFTER:
-            self._trusted_for += self._sharp_counts if _is_sharp(estimate, self._u_reach) else 1
+            sharp = _is_sharp(estimate, self._width * self._reach)
+            self._trusted_for += self._sharp_counts if sharp else 1
         return self._trusted_for >= TRUSTED_AFTER
 
     def _note_covariance(self, x_cov: Array | None) -> None:
@@ -291,9 +319,14 @@ class Tracking:
         self._q += r - self._design.model.c * x_0
 
 
-def _trusted(estimate: Estimate) -> bool:
-    # What was learned before a restart says nothing yet about the state of G.
-    return estimate.learned and estimate.status not in (Status.ACQUIRING, Status.INCONSISTENT)
+def _is_known(estimate: Estimate, before: bool) -> bool:
+    """Whether an estimate comes from data of this loop; before: whether the one before it did."""
+    status = estimate.status
+    if status in (Status.ACQUIRING, Status.INCONSISTENT):
+        # What was learned before a restart says nothing yet about the state of G.
+        return False
+    # A law without deviations says by its status alone that it has learned, and holds that later.
+    return before or estimate.learned or status is Status.TRACKING
 
 
 def _is_sharp(estimate: Estimate, u_reach: float) -> bool:
@@ -303,16 +336,19 @@ def _is_sharp(estimate: Estimate, u_reach: float) -> bool:
     return estimate.std_m < SHARP * estimate.m and std_gap < SHARP * large
 
 
-def cautious_crossings(estimate: Estimate, deviations: float) -> tuple[float, float]:
+def cautious_crossings(
+    estimate: Estimate, deviations: float, known: bool,
+) -> tuple[float, float]:
     """Crossings shrunk towards each other by their uncertainty; both 0 while nothing is known.
 
     Over-compensation drives past the gap and starts a limit cycle, under-compensation only
-    leaves a rest of the backlash: in a loop around y the smaller gap is the safe one.
+    leaves a rest of the backlash: in a loop around y the smaller gap is the safe one. Where a law
+    knows no uncertainty there is nothing to shrink by once the crossings are known.
     """
     if deviations == 0.0:
         return estimate.c_r, estimate.c_l
     if isnan(estimate.std_c_r):
-        return 0.0, 0.0
+        return (estimate.c_r, estimate.c_l) if known else (0.0, 0.0)
     middle = 0.5 * (estimate.c_r + estimate.c_l)
     return (
         max(estimate.c_r - deviations * estimate.std_c_r, middle),

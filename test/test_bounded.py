@@ -1,0 +1,203 @@
+"""What no loop does, however wrong what it is told of the plant: run away, or break a limit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice
+from math import inf, sin
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from backlash_ros.core.assembly import (
+    build_controller,
+    build_plant,
+    build_reference,
+    law_fits,
+)
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.controller import AdaptiveController, Limits
+from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
+from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.last_command import last_commands
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.pole_placement import PolePlacement, place_poles
+from backlash_ros.core.proportional import Proportional
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.structure import LARGEST_CAREFUL, LARGEST_FEEDBACK, Structure
+from backlash_ros.core.tracking import Tracking
+from backlash_ros.core.tracking_design import Weights, design
+from backlash_ros.core.transfer_function import TransferFunction
+
+SAMPLES = 600
+# What becomes of y on the way to the controller, given y and the sample.
+SENSORS: dict[str, Callable[[float, int], float]] = {
+    'right': lambda y, k: y,
+    'negated': lambda y, k: -y,
+    'constant': lambda y, k: 0.7,
+    'of another axis': lambda y, k: 0.3 * sin(0.037 * k + 1.0),
+    'tenfold': lambda y, k: 10.0 * y,
+    'a tenth': lambda y, k: 0.1 * y,
+    'negated later': lambda y, k: y if k < 300 else -y,
+    'constant later': lambda y, k: y if k < 300 else 0.7,
+}
+LAWS = ('kalman', 'lms', 'printed', 'fixed', 'gradient')
+
+
+def asked_by_the_reference(structure: str, start: float = 0.0) -> float:
+    """Largest |u_d| of a loop without a gap in which nothing is wrong, from y = start on."""
+    loop = build_closed_loop(Parameters({
+        'structure': structure, 'amplitude': 0.2, 'estimator.law': 'fixed',
+        'estimator.initial.m': 1.3, 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
+        'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9,
+    }))
+    reference = loop.reference
+    loop.reference = lambda t: reference(t) - start
+    return float(np.abs(loop.run(SAMPLES).column('u_d')).max())
+
+
+@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize('law', LAWS)
+@pytest.mark.parametrize('structure', ['tracking', 'pole_placement'])
+def test_u_d_stays_within_a_stated_multiple_of_what_is_asked(
+    structure: str, law: str, sensor: str,
+) -> None:
+    settings = {'structure': structure, 'estimator.law': law, 'amplitude': 0.2}
+    p = Parameters({**settings, 'output_noise_std': 1e-3})
+    if not law_fits(law, structure):
+        return  # refused when it is configured
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    asked = asked_by_the_reference(structure, SENSORS[sensor](0.0, 0))
+    allowed = LARGEST_CAREFUL
+    for k in range(SAMPLES):
+        step = controller.step(SENSORS[sensor](plant.measure(), k), reference(k * 0.01))
+        controller.refine()
+        plant.step(step.v)
+        estimate = step.estimate
+        asked = max(asked, estimate.m * (estimate.c_r - estimate.c_l))
+        if estimate.status is Status.TRACKING:
+            allowed = LARGEST_FEEDBACK
+        assert abs(step.u_d) <= 1.05 * (1.0 + allowed) * asked
+
+
+def test_a_sign_that_is_wrong_from_the_start_moves_v_no_further_than_that() -> None:
+    p = Parameters({'structure': 'tracking', 'amplitude': 0.2})
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    v = []
+    for k in range(1000):
+        step = controller.step(-plant.measure(), reference(k * 0.01))
+        controller.refine()
+        plant.step(step.v)
+        v.append(abs(step.v))
+    asked = asked_by_the_reference('tracking') / 0.696 + 0.5  # through the first guess
+    assert max(v) <= (1.0 + LARGEST_CAREFUL) * asked
+    assert max(v[600:]) <= 1.01 * max(v[:600])
+
+
+class Told:
+    """An estimator that knows what it is told, and x of no plant."""
+
+    def __init__(self) -> None:
+        self.estimate = Estimate(1.0, 1.0, -1.0, 0.1)
+        self.adapting, self.u_hat, self.innovation = True, 0.0, 0.0
+        self.x_hat, self.x_cov = [0.0, 0.0], None
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        if y is not None:
+            self.x_hat = [y, 0.5 * y]
+
+    def refine(self, budget_s: float = inf) -> None:
+        """Nothing to do."""
+
+
+MODEL = StateModel(TransferFunction([0.1, 0.05], [1.0, -1.7, 0.72]))
+WEIGHTS = Weights(1e-2, 0.0, 5)
+DESIGN = design(MODEL, WEIGHTS)
+BLOCKS = place_poles(MODEL.transfer_function, np.poly([0.5, 0.5]), 0.2)
+
+
+def structure_named(name: str) -> Structure:
+    if name == 'tracking':
+        return Tracking(DESIGN, WEIGHTS, 1.0, 1e-3)
+    return Proportional() if name == 'proportional' else PolePlacement(BLOCKS)
+
+
+numbers = st.floats(-1e6, 1e6)
+events = st.one_of(
+    st.tuples(st.just('sample'), numbers, st.floats(-50.0, 50.0), st.integers(0, 3)),
+    st.tuples(st.just('estimate'), st.floats(0.01, 100.0), st.floats(0.0, 100.0),
+              st.floats(-100.0, 0.0), st.floats(0.0, 2.0), st.sampled_from(Status),
+              st.sampled_from([float('nan'), 0.0, 0.1])),
+    st.tuples(st.just('limits'), st.floats(-30.0, 20.0), st.floats(0.1, 40.0),
+              st.one_of(st.just(inf), st.floats(0.01, 20.0))),
+    st.tuples(st.just('compensating'), st.booleans()),
+    st.tuples(st.just('take_up'), st.one_of(st.just(inf), st.floats(0.01, 20.0))),
+    st.tuples(st.just('renewal'), st.booleans()),
+    st.tuples(st.just('end'), st.sampled_from(['hold', 'zero', 'ramp'])),
+)
+
+
+@settings(max_examples=300)
+@given(
+    name=st.sampled_from(['proportional', 'tracking', 'pole_placement']),
+    sequence=st.lists(events, max_size=40),
+)
+def test_every_command_keeps_the_limits_that_hold_at_that_moment(
+    name: str, sequence: list[tuple[Any, ...]],
+) -> None:
+    limits, inverse = Limits(), BacklashInverse()
+    core = AdaptiveController(Told(), structure_named(name), inverse, limits)
+    v = 0.0
+    for what, *values in sequence:
+        sent: list[float] = []
+        if what == 'sample':
+            y, y_m, lost = values
+            sent = [core.step(y, y_m, lost).v]
+            core.refine()
+        elif what == 'estimate':
+            m, c_r, c_l, f, status, std = values
+            core.estimator.estimate = Estimate(m, c_r, c_l, f, std, std, std, status)
+        elif what == 'limits':
+            low, width, move = values
+            limits = core.limits = Limits(low, low + width, move)
+        elif what == 'compensating':
+            core.compensating = values[0]
+        elif what == 'take_up':
+            core.inverse.take_up = values[0]
+        elif what == 'renewal':
+            before = core
+            core = AdaptiveController(Told(), structure_named(name), BacklashInverse(), limits)
+            if values[0]:
+                core.go_on_from(before)
+            core.start_from(v)
+        else:
+            if values[0] == 'ramp' and limits.move == inf:
+                continue  # refused when it is configured
+            sent = list(islice(last_commands(values[0], v, limits), 5))
+            core.start_from(sent[-1] if sent else v)
+        for command in sent:
+            assert abs(command - v) <= limits.move * (1.0 + 1e-9)
+            outside, outside_before = (
+                max(limits.low - x, x - limits.high, 0.0) for x in (command, v)
+            )
+            assert outside <= max(outside_before - limits.move, 0.0) + 1e-9 * (1.0 + abs(v))
+            v = command
+
+
+def test_a_loop_that_was_driven_to_its_bounds_comes_back() -> None:
+    # Full feedback between its own bounds would cycle like between those of v.
+    p = Parameters({
+        'structure': 'tracking', 'amplitude': 0.2, 'estimator.law': 'fixed', 'fixed.doubt': 0.1,
+        'estimator.initial.m': 1.3, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0,
+    })
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    y = []
+    for k in range(900):
+        y.append(plant.measure())
+        step = controller.step(-y[-1] if 100 <= k < 160 else y[-1], reference(k * 0.01))
+        plant.step(step.v)
+    assert max(map(abs, y)) > 10.0
+    assert max(map(abs, y[600:])) < 0.25
