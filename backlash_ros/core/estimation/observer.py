@@ -102,9 +102,16 @@ class Observer:
         return self._gain.cov * self._noise_std**2
 
     def start(self, x: Array, cov: Array | None) -> None:
-        """Go on from the state x in the coordinates of StateModel, known this well."""
+        """Go on from the state x in the coordinates of StateModel.
+
+        cov: of x from a fit that knows it better than the newest samples do, so that they are to
+        move it little; None where there is none.
+        """
         self._x = (self.model.to_observer @ x).tolist()
-        self.cov = self.noise_cov if cov is None else cov
+        if cov is None:
+            self.cov = self.noise_cov
+            return
+        self._level, self._gain, self.cov = 0, self._gain_at(0), cov
 
     def predict(self, u: float) -> float:
         """Take u over one period and return the y that is expected after it."""
