@@ -141,6 +141,10 @@ PARAMETERS: tuple[Parameter, ...] = (
               'which must be set then', choices=('hold', 'zero', 'ramp'), live=True),
     Parameter('on_timeout', 'hold', 'the same while plant_output is silent',
               choices=('hold', 'zero', 'ramp'), live=True),
+    Parameter('on_rival', 'stand_down',
+              'what to do where another node published control before this one was activated: '
+              'publish nothing until it is gone, or go on and report it',
+              choices=('stand_down', 'warn'), live=True),
     Parameter('timeout.plant_output', 0.5,
               'longest silence of plant_output before on_timeout is done, 0 for never', 's',
               low=0.0, live=True),

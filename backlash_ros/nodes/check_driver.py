@@ -41,6 +41,7 @@ from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, ta
 from backlash_ros.nodes.gentle_drive import GentleDrive, drive_range
 from backlash_ros.nodes.messages import DEPTH
 from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.rivals import names_of
 from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
 
 EXECUTABLE = 'check_driver'
@@ -232,7 +233,7 @@ class CheckDriverNode(ProcessNode):
         if self._limits is not None:
             others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
             # Once heard, a rival counts, even if it leaves.
-            self._rivals = self._rivals or _names_of(
+            self._rivals = self._rivals or names_of(
                 [info for info in others if info.node_name != self.get_name()]
             )
         graph.publishers = max(graph.publishers, len(outputs))
@@ -296,14 +297,6 @@ def _misfit(offered: QoSProfile, asked: QoSProfile) -> str:
     bare = QoSProfile(depth=DEPTH, reliability=asked.reliability, durability=asked.durability)
     compatibility, reason = qos_check_compatible(offered, bare)
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
-
-
-def _names_of(endpoints: Sequence[TopicEndpointInfo]) -> str:
-    return ', '.join(sorted({
-        f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-        # Names are discovered a little later than topics.
-        if 'UNKNOWN' not in info.node_name else 'another node' for info in endpoints
-    }))
 
 
 class _Parser(argparse.ArgumentParser):

@@ -32,6 +32,7 @@ class ControlLoop:
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
     learned before. v: the newest command. silent: the driver was given up for the time being.
+    standing_down: another controller commands the actuator, so nothing is sent.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class ControlLoop:
         self.commands = CommandHistory(p.real('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
         self.v = 0.0
-        self.silent = False
+        self.silent = self.standing_down = False
         self.adapting = self.compensating = True
         self.last: ControlStep | None = None
         self.heard_at: float | None = None  # on the steady clock [s]
@@ -95,11 +96,14 @@ class ControlLoop:
 
     def answer(self, output: Output) -> ControlStep | None:
         """Send v(k) for y(k); None where the message brings no command."""
-        return self.step(output, self.counter.count(output.stamp_ns, output.sequence), self.y_m)
+        arrival = self.counter.count(output.stamp_ns, output.sequence)
+        return self.step(output, arrival, self.y_m)
 
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """The same for a sample that was counted already, with the reference that belongs to it."""
         statistics = self.statistics
+        if self.standing_down:
+            return None
         if not arrival.is_sample:
             statistics.extra += 1
             return None
@@ -125,7 +129,9 @@ class ControlLoop:
         return step
 
     def send(self, v: float) -> None:
-        """Send a command and note when it left."""
+        """Send a command and note when it left; nothing while another controller commands."""
+        if self.standing_down:
+            return
         self.v = v
         self._send(v)
         self.commands.publish(v, self._now_ns())
@@ -142,6 +148,21 @@ class ControlLoop:
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""
         self.silent = True
+        self.renew(self.estimate)
+
+    def stand_down(self) -> None:
+        """Leave the actuator to another controller."""
+        self.standing_down = True
+
+    def hear_other(self, v: float) -> None:
+        """Take in a command of the controller that is in charge."""
+        if self.standing_down and plausible(v):
+            self.v = v
+
+    def resume(self) -> None:
+        """Command again, from the newest v that was heard; the state of the plant is unknown."""
+        self.standing_down = self.silent = False
+        self.heard_at = None
         self.renew(self.estimate)
 
     def take_up(self, p: Parameters) -> None:

@@ -27,7 +27,16 @@ from backlash_ros.nodes.command_history import REMEMBERED, ReportUse, report_use
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
 from backlash_ros.nodes.declare import LiveParameters
-from backlash_ros.nodes.diagnosis import OK, STATES, WARN, Finding, counts_of, values_of, worst
+from backlash_ros.nodes.diagnosis import (
+    ERROR,
+    OK,
+    STATES,
+    WARN,
+    Finding,
+    counts_of,
+    values_of,
+    worst,
+)
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.estimate_saver import EstimateSaver
 from backlash_ros.nodes.events import emit
@@ -40,6 +49,7 @@ from backlash_ros.nodes.messages import (
     LabelledArrayPublisher,
     stamp_ns_of,
 )
+from backlash_ros.nodes.rivals import RivalWatch, names_of, told
 from backlash_ros.nodes.spin import run
 
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -85,7 +95,11 @@ class ControllerNode(ManagedNode):
         self._told: Status | None = None  # the newest one that /diagnostics has
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._to_zero: Timer | None = None  # sends the commands of on_timeout
-        self._io.advertise()
+        self._rivals = RivalWatch(
+            self, self._io.topics.control, self._io.advertise, self._mind_rivals
+        )
+        self._told_rivals = self._rivals.found
+        self._commands_of_rivals: Subscription | None = None  # heard while standing down
         self._signals = LabelledArrayPublisher(self, topics.SIGNALS, topics.SIGNAL_LABELS)
         self._estimates = LabelledArrayPublisher(self, topics.ESTIMATES, topics.ESTIMATE_LABELS)
         self._diagnostics = DiagnosticsPublisher(self)
@@ -128,6 +142,7 @@ class ControllerNode(ManagedNode):
 
     def activate(self) -> None:
         assert self.loop is not None
+        self._rivals.begin()
         if self._driver is not None:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
             # that nobody was listened to is no silence of the driver.
@@ -146,8 +161,10 @@ class ControllerNode(ManagedNode):
         assert loop is not None
         self._end_ramp()
         if loop.last is not None:
-            self._send_last_commands(loop, p.word('on_stop'), p.real('timeout.ramp'))
+            if not loop.standing_down:
+                self._send_last_commands(loop, p.word('on_stop'), p.real('timeout.ramp'))
             self._save(loop)
+        self._rivals.end()
         self._diagnose()
 
     def _send_last_commands(self, loop: ControlLoop, action: str, longest_s: float) -> None:
@@ -180,10 +197,13 @@ class ControllerNode(ManagedNode):
 
     def _conditions_of_start(self) -> list[Callable[[], bool]]:
         """What has to be there before plant_output is listened to, for that starts the loop."""
+        # Whoever commands the actuator already has to be found first; simulated time hurts nobody.
+        alone: list[Callable[[], bool]] = [] if self._lockstep else [lambda: self._rivals.settled]
         wanted = max(self.settings.integer('wait_for_subscribers'), int(self._lockstep))
         if not wanted:
-            return []
+            return alone
         return [
+            *alone,
             lambda: self._io.listeners >= wanted,
             # Beside the driver, those who listen want to hear everything.
             lambda: min(self._signals.listeners, self._estimates.listeners) >= wanted - 1,
@@ -194,6 +214,7 @@ class ControllerNode(ManagedNode):
     def _listen_to_driver(self) -> None:
         # Whoever is activated twice before everybody is there has two that wait.
         if self._driver is None:
+            self._rivals.look()
             kept = max(KEPT_S / self.settings.real('sample_period'), KEPT_OUTPUTS)
             self._driver = self._io.listen(self._on_output, round(min(kept, DEPTH)))
             emit('ready')
@@ -275,6 +296,29 @@ class ControllerNode(ManagedNode):
     def _take_up(self, p: Parameters) -> None:
         if self.loop is not None:
             self.loop.take_up(p)
+        self._mind_rivals()
+
+    def _mind_rivals(self) -> None:
+        """Stand down or command again, as on_rival says, and tell of it."""
+        loop, found = self.loop, self._rivals.found
+        on_rival = self._live.parameters.word('on_rival')
+        stand_down = on_rival == 'stand_down' and not self._rivals.came_first
+        if loop is not None and stand_down != loop.standing_down:
+            if stand_down:
+                self._end_ramp()
+                loop.stand_down()
+                self._commands_of_rivals = self._io.listen_to_commands(loop.hear_other)
+            else:
+                assert self._commands_of_rivals is not None
+                self.destroy_subscription(self._commands_of_rivals)
+                loop.resume()
+        if found != self._told_rivals:
+            self._told_rivals = found
+            if found:
+                self.log.error(told(found, self._rivals.topic, on_rival))
+            else:
+                self.log.info(f'nobody else publishes {self._rivals.topic} any more')
+        self._diagnose()
 
     def _look_for_silence(self) -> None:
         loop = self.loop
@@ -327,7 +371,7 @@ class ControllerNode(ManagedNode):
 
     def _diagnose(self) -> None:
         values = values_of(self.loop) if self.loop is not None else {}
-        self._diagnostics.publish(*worst(self._findings()), values)
+        self._diagnostics.publish(*worst(self._findings()), {**values, **self._rivals.claim})
 
     def _findings(self) -> list[Finding]:
         loop, io = self.loop, self._io
@@ -336,6 +380,17 @@ class ControllerNode(ManagedNode):
         if not self.active:
             return [(OK, 'inactive: no control is published')]
         findings: list[Finding] = []
+        if self._rivals.found:
+            on_rival = self._live.parameters.word('on_rival')
+            findings.append((ERROR, told(self._rivals.found, self._rivals.topic, on_rival)))
+        if loop.standing_down:
+            return findings
+        if self._reference.get_publisher_count() > 1:
+            names = names_of(self.get_publishers_info_by_topic(self._reference.topic_name))
+            findings.append((
+                WARN, f'{topics.REFERENCE} is published by {names}, and the newest y_m counts, '
+                'whoever sent it: stop all but one',
+            ))
         if self._driver is not None and self._driver.get_publisher_count() > 1:
             findings.append((
                 WARN, f'{self._driver.get_publisher_count()} publishers of {io.topics.output}, '

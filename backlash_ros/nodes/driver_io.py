@@ -119,6 +119,21 @@ class DriverIo:
         self._publisher = publisher
         return publisher
 
+    def listen_to_commands(self, hear: Callable[[float], None]) -> Subscription:
+        """Call hear with every v that anybody sends to the driver."""
+        def hear_number(message: Float64) -> None:
+            hear(message.data)
+
+        def hear_numbers(message: Float64MultiArray) -> None:
+            if len(message.data) == 1:
+                hear(message.data[0])
+
+        several = self.topics.control_type is Float64MultiArray
+        return self._node.create_subscription(
+            self.topics.control_type, self.topics.control,
+            hear_numbers if several else hear_number, 1,
+        )
+
     def publish(self, v: float) -> None:
         """Send v to the driver."""
         assert self._publisher is not None
