@@ -137,7 +137,10 @@ class Fuzzer:
         elif kind == 1:
             self._untyped._on_reference(Float64(data=self._number_of_any_kind()))
         elif kind == 2:
-            report = Float64(data=self._number_of_any_kind())
+            # Where a command must not move further than the rate allows, the driver is honest
+            # about v: whoever begins anew goes on from what it says.
+            honest = isfinite(self._move)
+            report = Float64(data=loop.v if honest else self._number_of_any_kind())
             self._untyped._on_applied_control(report, {'source_timestamp': self._stamp})
         elif kind == 3:
             jump = int(rng.choice([-10**15, -5 * PERIOD_NS, 0, 1, 50 * PERIOD_NS, 10**15]))

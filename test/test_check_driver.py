@@ -13,7 +13,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from made_up_driver import LIMITS, parameters
+from made_up_driver import LIMITS, PERIOD_S, parameters
 from ros_processes import Probe
 from std_msgs.msg import Float64
 
@@ -180,6 +180,38 @@ def test_sigint_brings_v_to_rest(tmp_path: Path) -> None:
     v = [c.data for c in controls]
     step = LIMITS.rate * parameters()['sample_period']
     assert max(abs(b - a) for a, b in pairwise(v)) <= step * (1.0 + 1e-9)
+
+
+def first_commands(folder: Path, *options: str) -> tuple[list[float], str]:
+    """What a drive begins with, and what is printed about it."""
+    with bench(folder, 'none') as beside:
+        probe = Probe(beside.domain)
+        try:
+            controls = probe.collect('control', Float64)
+            process = beside.start('--drive', '--duration', '60', *options)
+            try:
+                probe.wait_until(lambda: len(controls) > 20, 'commands')
+                process.send_signal(signal.SIGINT)
+                probe.wait_until(lambda: process.poll() is not None, 'the end')
+                err = process.communicate()[1]
+            finally:
+                process.kill()
+        finally:
+            probe.close()
+    return [message.data for message in controls], err
+
+
+def test_the_drive_goes_on_from_control_initial(tmp_path: Path) -> None:
+    v, err = first_commands(tmp_path, '--ros-args', '-p', 'control.initial:=-4.0')
+    step = LIMITS.rate * PERIOD_S * (1.0 + 1e-9)
+    assert max(abs(b - a) for a, b in pairwise([-4.0, *v])) <= step
+    assert 'nobody says' not in err
+
+
+def test_the_drive_says_that_nobody_knows_v(tmp_path: Path) -> None:
+    v, err = first_commands(tmp_path)
+    assert abs(v[0]) <= LIMITS.rate * PERIOD_S
+    assert err.count('nobody says which v acts now') == 1
 
 
 def test_y_outside_the_given_range_ends_the_drive(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ class Parameter:
     choices: tuple[str, ...] = ()
     used_by: tuple[str, ...] = (CONTROLLER,)
     live: bool = False
-    infinite: bool = False  # inf is allowed and means "no limit"
+    infinite: bool = False  # inf is allowed and means "no limit", or "not known"
     names: bool = False  # a list of names instead of numbers, possibly empty
     may_be_empty: bool = False  # a list of numbers that stands for another one where it is empty
 
@@ -128,6 +128,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('control.max', inf, 'largest v', 'v', live=True, infinite=True),
     Parameter('control.rate_max', inf, 'largest speed of v', 'v/s', low=0.0, above=True,
               live=True, infinite=True),
+    Parameter('control.initial', inf,
+              'v that acts when the controller starts, where no applied_control tells it; '
+              '.inf: not known', 'v', infinite=True),
     Parameter('inverse.direction_band', 0.0,
               'u_d has turned only after coming back by more than this', 'u', low=0.0, live=True),
     Parameter('inverse.take_up_rate', inf,

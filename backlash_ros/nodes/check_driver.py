@@ -174,12 +174,23 @@ class CheckDriverNode(ProcessNode):
             self._range_left = y
             return
         if self._drive is None:
-            start = self._heard.applied[-1].value if self._heard.applied else 0.0
             self._drive = GentleDrive(
                 self._limits, self._period, self._options.duration, self._options.rising,
-                start if plausible(start) else 0.0,
+                self._v_at_start(),
             )
         self._command(self._drive.step())
+
+    def _v_at_start(self) -> float:
+        """The v that acts before the drive, 0 where nobody says it."""
+        told = [self.settings.real('control.initial')]
+        told += [message.value for message in self._heard.applied[-1:]]
+        known = [v for v in told if plausible(v)]
+        if not known:
+            print(
+                f'{EXECUTABLE}: nobody says which v acts now, so the drive goes on from 0: '
+                f'publish {topics.APPLIED_CONTROL}, or set control.initial', file=sys.stderr,
+            )
+        return known[-1] if known else 0.0
 
     def _command(self, v: float) -> None:
         now = time.time_ns()

@@ -31,19 +31,20 @@ class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
-    learned before. v: the newest command. silent: the driver was given up for the time being.
+    learned before. v: the newest command, 0 as long as nobody knows (knows_v) which
+    one acts. silent: the driver was given up for the time being.
     standing_down: another controller commands the actuator, so nothing is sent.
     """
 
     def __init__(
         self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
-        inherited: Estimate | None,
+        inherited: Estimate | None, v: float | None = None,
     ) -> None:
         self.statistics = LoopStatistics()
         self.counter = SampleCounter(p.real('sample_period'))
         self.commands = CommandHistory(p.real('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
-        self.v = 0.0
+        self.v, self.knows_v = v or 0.0, v is not None
         self.silent = self.standing_down = False
         self.adapting = self.compensating = True
         self.last: ControlStep | None = None
@@ -94,6 +95,23 @@ class ControlLoop:
         else:
             self.statistics.dropped += 1
 
+    @property
+    def begins(self) -> bool:
+        """Whether the next command is the first one, since the start or an interruption."""
+        return self.silent or not self._begun
+
+    def learn_v(self, stamp_ns: int) -> bool:
+        """Take the v that the driver reports with this output for the one that acts, if it does.
+
+        Returns whether it is known now which one acts.
+        """
+        reported = self.commands.newest_report(stamp_ns)
+        if isfinite(reported):
+            # A report beyond the limits would have the commands begin there.
+            limits = self.core.limits
+            self.v, self.knows_v = min(max(reported, limits.low), limits.high), True
+        return self.knows_v
+
     def answer(self, output: Output) -> ControlStep | None:
         """Send v(k) for y(k); None where the message brings no command."""
         arrival = self.counter.count(output.stamp_ns, output.sequence)
@@ -132,7 +150,7 @@ class ControlLoop:
         """Send a command and note when it left; nothing while another controller commands."""
         if self.standing_down:
             return
-        self.v = v
+        self.v, self.knows_v = v, True
         self._send(v)
         self.commands.publish(v, self._now_ns())
 
@@ -142,7 +160,12 @@ class ControlLoop:
         return self.core.limits.zero
 
     def last_commands(self, action: str) -> Iterator[float]:
-        """Commands that end the loop as on_stop or on_timeout say, from the present v on."""
+        """Commands that end the loop as on_stop or on_timeout say, from the present v on.
+
+        None where nobody knows v: then this loop has not commanded anything either.
+        """
+        if not self.knows_v:
+            return iter(())
         return last_commands(action, self.v, self.core.limits)
 
     def give_up(self) -> None:
@@ -157,7 +180,7 @@ class ControlLoop:
     def hear_other(self, v: float) -> None:
         """Take in a command of the controller that is in charge."""
         if self.standing_down and plausible(v):
-            self.v = v
+            self.v, self.knows_v = v, True
 
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""
@@ -209,10 +232,9 @@ class ControlLoop:
         lost, self._missing = self._missing, 0
         if not self._begun:
             self._begun = True
-            reported = commands.newest_report(stamp_ns)
-            # A report beyond the limits would have the commands begin there.
-            within = min(max(reported, core.limits.low), core.limits.high)
-            core.start_from(within if isfinite(reported) else self.v)
+            if not self._lockstep:
+                self.learn_v(stamp_ns)
+            core.start_from(self.v)
             commands.begin(stamp_ns)
             return core.step(y, y_m)
         if self._lockstep:

@@ -23,7 +23,7 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.command_history import REMEMBERED, ReportUse, report_use
+from backlash_ros.nodes.command_history import REMEMBERED
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
 from backlash_ros.nodes.declare import LiveParameters
@@ -60,6 +60,7 @@ KEPT_S, KEPT_OUTPUTS = 0.1, 20
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
+AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
 LOOK_S = 0.05  # between two looks for a silent plant_output or reference
 SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
 LAST_WORD_S = 0.1  # longest wait for the driver to confirm the last command
@@ -107,9 +108,13 @@ class ControllerNode(ManagedNode):
         self._reference = self.create_subscription(
             Float64, topics.REFERENCE, self._on_reference, KEPT if self._lockstep else 1
         )
-        self._reports: Inbox | None = None
-        if report_use(p) is not ReportUse.NEVER:
-            self._reports = Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
+        # The first command begins with what the driver reports, even if it is not learned from.
+        self._reports = (
+            None if self._lockstep else Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
+        )
+        self._last_v: float | None = None  # before a cleanup
+        self._warned: set[str] = set()  # texts
+        self._unanswered = 0  # outputs that were not answered because v was not known yet
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         offer_services(self, self)
@@ -133,7 +138,9 @@ class ControllerNode(ManagedNode):
     def configure(self) -> None:
         p = self._live.parameters
         inherited = load_estimate(p)
-        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited)
+        initial = p.real('control.initial')
+        v = initial if self._last_v is None and isfinite(initial) else self._last_v
+        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited, v)
         if inherited is not None:
             self.log.info(
                 f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
@@ -183,6 +190,8 @@ class ControllerNode(ManagedNode):
         self._io.wait_until_received(LAST_WORD_S)
 
     def cleanup(self) -> None:
+        if self.loop is not None and self.loop.knows_v:
+            self._last_v = self.loop.v
         self.loop = None
         self._diagnose()
 
@@ -235,7 +244,7 @@ class ControllerNode(ManagedNode):
 
     def _on_applied_control(self, message: Float64, info: dict[str, Any]) -> None:
         if self.loop is not None:
-            self.loop.take_applied(message.data, info['source_timestamp'])
+            self.loop.take_applied(message.data, self._io.stamp_ns(info))
 
     def _on_output(self, output: Output) -> None:
         if self._reports is not None:
@@ -247,6 +256,8 @@ class ControllerNode(ManagedNode):
         if self._lockstep:
             self._outputs.append(output)
             self._pair()
+            return
+        if loop.begins and not loop.standing_down and not self._may_begin(loop, output):
             return
         was_silent = loop.silent
         step = loop.answer(output)
@@ -262,6 +273,27 @@ class ControllerNode(ManagedNode):
         if self._behind % PUT_OFF == 0:
             loop.core.refine()
         self._follow_up(loop, step, was_silent)
+
+    def _may_begin(self, loop: ControlLoop, output: Output) -> bool:
+        """Whether it is known from which v the first command goes on, or waiting is in vain."""
+        if self._io.is_simulated:
+            return True
+        if loop.learn_v(output.stamp_ns):
+            return True
+        reported = self._reports is not None and self._reports.publishers > 0
+        self._unanswered += 1
+        if reported and self._unanswered <= AWAITED_REPORTS:
+            return False
+        self._warn_once(
+            'nobody says which v acts now, so the first command goes on from 0: publish '
+            f'{topics.APPLIED_CONTROL}, or set control.initial'
+        )
+        return True
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            self.log.warning(text)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
