@@ -139,3 +139,23 @@ def test_the_simulated_plant_is_known_to_begin_at_0(tmp_path: Path) -> None:
         watch.probe.wait_until(lambda: len(watch.controls) > 20, 'commands')
         assert controller.stop() == 0
         assert NOT_KNOWN not in controller.stderr
+        assert 'not set' not in controller.stderr
+
+
+def test_missing_limits_are_told_once_beside_a_driver(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        driver = standing_driver(world, reports_applied=True)
+        controller = controller_beside(driver, world, **{'control.min': -20.0})
+        driver.run_until(lambda: len(driver.controls) > 60, 'commands')
+        assert controller.stop() == 0
+        assert controller.stderr.count('control.max: not set, so nothing keeps v') == 1
+
+
+def test_where_all_limits_are_set_nothing_is_said(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        driver = standing_driver(world, reports_applied=True)
+        controller = controller_beside(
+            driver, world, **{'control.min': -20.0, 'control.max': 20.0}
+        )
+        assert controller.stop() == 0
+        assert 'not set' not in controller.stderr

@@ -22,7 +22,7 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters import Parameters, missing_limits
 from backlash_ros.nodes.command_history import REMEMBERED
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
@@ -278,6 +278,11 @@ class ControllerNode(ManagedNode):
         """Whether it is known from which v the first command goes on, or waiting is in vain."""
         if self._io.is_simulated:
             return True
+        if missing := missing_limits(self._live.parameters):
+            self._warn_once(
+                f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
+                'bears: set them'
+            )
         if loop.learn_v(output.stamp_ns):
             return True
         reported = self._reports is not None and self._reports.publishers > 0
