@@ -23,6 +23,7 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
 from backlash_ros.core.parameters import Parameters, missing_limits
+from backlash_ros.core.run_record import stated_deviations
 from backlash_ros.nodes.command_history import REMEMBERED
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
@@ -327,7 +328,7 @@ class ControllerNode(ManagedNode):
             float(e.status), sample, loop.statistics.latencies[-1],
         ))
         self._estimates.publish((
-            e.m, e.c_r, e.c_l, e.f, e.std_m, e.std_c_r, e.std_c_l, nan, sample,
+            e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample,
         ))
 
     def _take_up(self, p: Parameters) -> None:

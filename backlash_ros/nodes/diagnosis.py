@@ -5,6 +5,7 @@ from __future__ import annotations
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.run_record import stated_deviations
 from backlash_ros.nodes.control_loop import ControlLoop
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -55,7 +56,7 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
     return {
         **counts_of(loop),
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
-        'std_m': e.std_m, 'std_c_r': e.std_c_r, 'std_c_l': e.std_c_l,
+        **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
         'learning': loop.adapting, 'compensating': loop.compensating,
         'using applied_control': loop.commands.uses_reports,
         # Above 1 the gap is crossed, without which nothing can be learned of it.
