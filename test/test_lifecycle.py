@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -176,6 +178,62 @@ def test_estimates_are_saved_on_request_or_the_reason_is_told(tmp_path: Path) ->
         assert not answer.success
         assert 'cannot be written: No such file or directory' in answer.message
         assert nowhere.stop() == 0
+
+
+# In front of the standard library: a disk that takes its time to confirm.
+SLOW_DISK = """
+import os, time
+confirm = os.fsync
+def slowly(file):
+    time.sleep(1.0)
+    confirm(file)
+os.fsync = slowly
+"""
+
+
+def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(tmp_path: Path) -> None:
+    (tmp_path / 'sitecustomize.py').write_text(SLOW_DISK)
+    with ros_world(tmp_path) as world:
+        paths = [str(tmp_path), *filter(None, [world.environment.get('PYTHONPATH')])]
+        world.environment['PYTHONPATH'] = os.pathsep.join(paths)
+        controller, driver = another(world, str(tmp_path / 'estimates.json'))
+        asked = Asked(driver)
+        driver.learn()
+        count = len(driver.controls)
+        begin = time.monotonic()
+        assert asked.trigger('save_estimates').success
+        assert time.monotonic() - begin > 1.0
+        assert len(driver.controls) - count > 50
+        # Other requests are answered meanwhile.
+        client = driver.probe.node.create_client(Trigger, 'controller/save_estimates')
+        driver.run_until(client.service_is_ready, 'the service')
+        saved = client.call_async(Trigger.Request())
+        driver.run(0.1)
+        assert asked.set('freeze_adaptation', True)
+        assert not saved.done()
+        driver.run_until(saved.done, 'the second answer')
+        assert saved.result().success
+        assert controller.stop() == 0
+
+
+def test_noise_is_not_changed_live_for_a_law_that_would_not_take_it_up(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world, **{'estimator.law': 'lms'})
+        asked = Asked(driver)
+        driver.run(0.1)
+        request = SetParametersAtomically.Request(parameters=[
+            Parameter('estimator.output_noise_std', value=2e-3).to_parameter_msg()
+        ])
+        kind = SetParametersAtomically
+        refused = asked('set_parameters_atomically', kind, request).result
+        assert not refused.successful
+        assert 'estimator.output_noise_std=0.002' in refused.reason
+        assert 'kalman alone' in refused.reason
+        # Whoever begins anew takes it up.
+        assert asked.change(Transition.TRANSITION_DEACTIVATE)
+        assert asked.change(Transition.TRANSITION_CLEANUP)
+        assert asked('set_parameters_atomically', kind, request).result.successful
+        assert controller.stop() == 0
 
 
 def another(world: RosWorld, file: str) -> tuple[Any, PacedDriver]:

@@ -22,7 +22,7 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
-from backlash_ros.core.parameters import Parameters, missing_limits
+from backlash_ros.core.parameters import NOISE, Parameters, missing_limits
 from backlash_ros.core.run_record import stated_deviations
 from backlash_ros.nodes.command_history import REMEMBERED
 from backlash_ros.nodes.control_loop import ControlLoop
@@ -119,7 +119,7 @@ class ControllerNode(ManagedNode):
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         offer_services(self, self)
-        self._live = LiveParameters(self, p, build_controller, self._take_up)
+        self._live = LiveParameters(self, p, self._check_change, self._take_up)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         if not self._lockstep:
             self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
@@ -330,6 +330,17 @@ class ControllerNode(ManagedNode):
         self._estimates.publish((
             e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample,
         ))
+
+    def _check_change(self, p: Parameters) -> None:
+        """Raise ParameterError for values that the running loop cannot take up."""
+        build_controller(p)
+        law = p.word('estimator.law')
+        changes = p[NOISE] != self._live.parameters[NOISE]
+        if self.loop is not None and changes and law != 'kalman':
+            raise ParameterError(
+                NOISE, p[NOISE], f'is taken up live by kalman alone, not by {law}',
+                'clean the node up, set it, and configure again',
+            )
 
     def _take_up(self, p: Parameters) -> None:
         if self.loop is not None:
