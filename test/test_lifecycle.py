@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fuzzing import node_with
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from paced_driver import PacedDriver, controller_and_driver
@@ -17,6 +18,9 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from ros_processes import RosWorld, ros_world
 from std_srvs.srv import SetBool, Trigger
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.tools.processes import free_domain
 
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
@@ -78,6 +82,21 @@ def test_controller_goes_through_its_life_and_publishes_only_while_active(tmp_pa
         assert asked.change(Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
         assert asked.state() == 'finalized'
         assert controller.stop() == 0
+
+
+def test_a_node_whose_activation_fails_is_not_active(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise ParameterError('sample_period', 0.0, 'does not suit this test')
+
+    with free_domain() as domain, node_with({'autostart': False}, domain) as node:
+        untyped: Any = node
+        untyped.trigger_configure()
+        monkeypatch.setattr(node, 'activate', fail)
+        untyped.trigger_activate()
+        assert not node.active
+        monkeypatch.undo()
+        untyped.trigger_activate()
+        assert node.active
 
 
 @pytest.mark.parametrize('structure', ['proportional', 'tracking'])
