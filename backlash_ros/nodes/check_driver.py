@@ -227,11 +227,19 @@ class CheckDriverNode(ProcessNode):
         drive = self._drive
         if drive is None:
             return
-        self._driving, done = False, False
-        while not done:
-            done = drive.step_to_rest()
+        self._driving, before = False, self.signals
+        deadline = time.monotonic() + self._options.rest
+        while not drive.step_to_rest():
             self._control.publish(Float64(data=drive.v))
             time.sleep(self._period)
+            late = time.monotonic() > deadline
+            if late or self.signals > before:
+                why = f'not at rest within --rest={self._options.rest:g} s' if late \
+                    else 'another signal came'
+                print(f'{EXECUTABLE}: v is held at {drive.v:.6g}: {why}', file=sys.stderr)
+                break
+        else:
+            self._control.publish(Float64(data=drive.v))
         # The last command must leave before the node does.
         executor.spin_once(timeout_sec=LOOK_S)
 
@@ -344,6 +352,9 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
                         help='drive: keep v slower than this as well')
     parser.add_argument('--rising', action='store_true',
                         help='drive: once upwards without turning back, to find G(z)')
+    parser.add_argument('--rest', type=_positive, default=30.0, metavar='SECONDS',
+                        help='drive: longest way to rest at the end, after which v is held '
+                             '(default: 30); a signal on that way holds v at once')
     parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),
                         metavar=('LOW', 'HIGH'), help='drive: stop when y leaves this range')
     parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
