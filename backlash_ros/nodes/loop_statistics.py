@@ -7,12 +7,14 @@ from collections import deque
 from dataclasses import dataclass, field
 from math import inf, nan
 
+import numpy as np
+
 REMEMBERED = 1000  # latencies that p50 and p99 are taken of
 
 
 @dataclass
 class LoopStatistics:
-    """Counters since the start. latencies [s]: departure of y at the driver to that of v."""
+    """Counters since the start. latencies [s]: the newest ones, as topics.py defines them."""
 
     used: int = 0  # outputs that brought a command
     lost: int = 0  # outputs that never arrived
@@ -39,8 +41,7 @@ class LoopStatistics:
         """Latency that this share of the latest commands stayed below; nan without any."""
         if not self.latencies:
             return nan
-        ordered = sorted(self.latencies)
-        return ordered[min(int(share * len(ordered)), len(ordered) - 1)] * 1e3
+        return float(np.percentile(self.latencies, 100.0 * share)) * 1e3
 
     def since_last_look(self) -> tuple[float, float]:
         """Rate of commands [Hz] and swing of v since the last call."""
