@@ -154,10 +154,9 @@ class Fuzzer:
         elif kind == 6:
             loop.renew(None if rng.integers(2) else loop.estimate)
         elif kind == 7:
-            law = node.get_parameter('estimator.law').value
             noise = [Parameter('estimator.output_noise_std', value=self._size())]
             node.set_parameters_atomically([
-                *(noise if law == 'kalman' else []),
+                *(noise if loop.takes_up_noise else []),
                 Parameter('tracking.input_weight', value=self._size() + 1e-9),
                 Parameter('inverse.direction_band', value=self._size()),
             ])

@@ -98,7 +98,7 @@ def test_what_any_law_has_learned_may_be_taken_as_fixed(tmp_path: Path) -> None:
     ('fixed', 0.0, 'holds constants that were given'),
     ('fixed', None, ''),
 ])
-def test_a_file_without_the_law_serves_kalman_if_its_deviations_are_those_of_kalman(
+def test_a_file_without_the_law_serves_a_law_with_deviations_if_it_holds_some(
     tmp_path: Path, law: str, std: float | None, reason: str,
 ) -> None:
     file = tmp_path / 'estimates.json'

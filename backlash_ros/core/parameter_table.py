@@ -79,7 +79,7 @@ PARAMETERS: tuple[Parameter, ...] = (
               length=2, high=0.0),
     Parameter('estimator.output_noise_std', 1e-5,
               'standard deviation of the noise on y; where it is not given, that of the simulated '
-              'noise and quantum if there is any; live for kalman alone', 'y', low=0.0, live=True),
+              'noise and quantum if there is any; not live for every law', 'y', low=0.0, live=True),
     Parameter('estimator.input_noise_std', 0.0,
               'kalman: standard deviation of white noise on u: what G(z) and the backlash lack',
               'u', low=0.0, live=True),

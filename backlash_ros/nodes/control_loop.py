@@ -6,11 +6,13 @@ import time
 from collections.abc import Callable, Iterator
 from math import isfinite, nan
 
+import numpy as np
+
 from backlash_ros.core.assembly import build_controller, build_limits, build_structure
 from backlash_ros.core.controller import ControlStep, plausible
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
+from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Estimate
-from backlash_ros.core.kalman import KalmanEstimator
 from backlash_ros.core.last_command import last_commands
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.command_history import CommandHistory, report_use
@@ -60,6 +62,11 @@ class ControlLoop:
     def estimate(self) -> Estimate:
         """What is known of the backlash."""
         return self.core.estimator.estimate
+
+    @property
+    def takes_up_noise(self) -> bool:
+        """Whether the law can change what it takes for the noise on y while it runs."""
+        return isinstance(self.core.estimator, MovingHorizon)
 
     def renew(self, inherited: Estimate | None) -> None:
         """Go on with a new core from the present v: nothing is known of the state of the plant.
@@ -198,10 +205,9 @@ class ControlLoop:
         if isinstance(core.estimator, NormalisedLms):
             core.estimator.step = p.real('lms.step')
             core.estimator.step_f = p.real('lms.step_f')
-        if isinstance(core.estimator, KalmanEstimator):
+        if isinstance(core.estimator, MovingHorizon):
             core.estimator.set_noise(
-                p.real('estimator.output_noise_std'), p.real('estimator.input_noise_std'),
-                p.triple('estimator.drift_std'),
+                p.real('estimator.output_noise_std'), np.array(p.triple('estimator.drift_std'))
             )
         if any(p[name] != before[name] for name in OF_THE_STRUCTURE):
             structure = build_structure(p)

@@ -334,11 +334,10 @@ class ControllerNode(ManagedNode):
     def _check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loop cannot take up."""
         build_controller(p)
-        law = p.word('estimator.law')
         changes = p[NOISE] != self._live.parameters[NOISE]
-        if self.loop is not None and changes and law != 'kalman':
+        if self.loop is not None and changes and not self.loop.takes_up_noise:
             raise ParameterError(
-                NOISE, p[NOISE], f'is taken up live by kalman alone, not by {law}',
+                NOISE, p[NOISE], f'is not taken up live by {p.word("estimator.law")}',
                 'clean the node up, set it, and configure again',
             )
 

@@ -13,7 +13,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.files import write_atomically
 
 VERSION = 1  # of the file format
-LAW, FIXED, KALMAN = 'estimator.law', 'fixed', 'kalman'
+LAW, FIXED = 'estimator.law', 'fixed'
+WITHOUT_DEVIATIONS = ('lms', 'printed', 'gradient')
 # What a saved estimate depends on; a file for anything else is refused.
 KEY = (
     LAW,
@@ -50,8 +51,8 @@ def load_estimate(p: Parameters) -> Estimate | None:
     """What estimates.file holds, None where it is not to be loaded or not there yet.
 
     Raises ParameterError for a file that is broken or belongs to another plant or law. The law
-    `fixed` takes what any other one has learned. Files of the time before the law was saved are
-    taken for those of kalman if they hold deviations, which no other law has.
+    `fixed` takes what any other one has learned. Files of the time before the law was saved serve
+    the laws that know deviations if they hold some.
     """
     if not p.flag('estimates.load'):
         return None
@@ -86,7 +87,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
         )
     law = p.word(LAW)
     if isinstance(key, dict) and LAW not in key and law != FIXED:
-        if law != KALMAN or not estimate.learned:
+        if law in WITHOUT_DEVIATIONS or not estimate.learned:
             raise ParameterError(
                 'estimates.file', name, 'does not say by which law it was learned',
                 'delete it or set estimates.load: false',
