@@ -139,14 +139,22 @@ class ControllerNode(ManagedNode):
     def configure(self) -> None:
         p = self._live.parameters
         inherited = load_estimate(p)
-        initial = p.real('control.initial')
-        v = initial if self._last_v is None and isfinite(initial) else self._last_v
-        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited, v)
+        self.loop = ControlLoop(
+            p, self._io.publish, self._io.now_ns, inherited, self._v_at_start(p)
+        )
         if inherited is not None:
             self.log.info(
                 f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
                 f'c_r={inherited.c_r:.6g}, c_l={inherited.c_l:.6g}'
             )
+
+    def _v_at_start(self, p: Parameters) -> float | None:
+        """The v that acts as far as this node can know, None if it cannot."""
+        if self._last_v is not None:
+            return self._last_v
+        initial = p.real('control.initial')
+        # In lockstep there is the simulated plant alone, which begins at 0.
+        return initial if isfinite(initial) and not self._lockstep else None
 
     def activate(self) -> None:
         assert self.loop is not None
