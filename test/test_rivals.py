@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from itertools import pairwise
@@ -241,6 +242,27 @@ def test_a_killed_controller_gives_way_to_the_one_that_stood_down(tmp_path: Path
         # Long before the middleware gives the killed one up, which takes 20 s.
         assert time.monotonic() - begin < SILENT_S + 4.0
         assert second.stop() == 0
+
+
+def test_a_long_ramp_at_the_end_is_not_cut_off_by_whoever_stands_down(tmp_path: Path) -> None:
+    slow = {'control.rate_max': 2.0, 'control.initial': 12.0, 'on_stop': 'ramp',
+            'timeout.ramp': 20.0}
+    with ros_world(tmp_path) as world:
+        stage, first = stage_with_first(world, **slow)
+        second = stage.start('second', **slow)
+        stage.run_until(lambda: stage.names_as_error('second', '/first'), 'the second to tell')
+        stage.driver.run(1.0)
+        v_at_end = stage.driver.controls[-1].data
+        assert v_at_end > 2.0 * (SILENT_S + 1.0)
+        begin = len(stage.driver.controls) + 50  # the signal is heard by then
+        first.send(signal.SIGINT)
+        stage.run_until(lambda: stage.driver.controls[-1].data == 0.0, 'the end of the ramp')
+        ramp = stage.commands_seen_by_all()[begin:]
+        assert len(ramp) > SILENT_S / PERIOD_S
+        steps = [b - a for a, b in pairwise(ramp)]
+        assert steps[:-1] == pytest.approx([-2.0 * PERIOD_S] * (len(steps) - 1))
+        assert first.wait() == 0
+        second.kill()
 
 
 def test_a_rival_is_found_at_the_command_of_ros2_control(tmp_path: Path) -> None:

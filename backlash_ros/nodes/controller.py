@@ -184,7 +184,7 @@ class ControllerNode(ManagedNode):
         self._diagnose()
 
     def _send_last_commands(self, loop: ControlLoop, action: str, longest_s: float) -> None:
-        deadline = time.monotonic() + longest_s
+        told, deadline = time.monotonic(), time.monotonic() + longest_s
         step_s = max(self.settings.real('sample_period'), SHORTEST_STEP_S)
         for v in loop.last_commands(action):
             loop.send(v)
@@ -196,6 +196,9 @@ class ControllerNode(ManagedNode):
                 )
                 break
             time.sleep(step_s)
+            if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
+                told = time.monotonic()
+                self._diagnose()  # whoever stands down must not take this one for gone
         self._io.wait_until_received(LAST_WORD_S)
 
     def cleanup(self) -> None:
