@@ -33,9 +33,9 @@ class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
-    learned before. v: the newest command, 0 as long as nobody knows (knows_v) which
-    one acts. silent: the driver was given up for the time being.
-    standing_down: another controller commands the actuator, so nothing is sent.
+    learned before. v: the newest command, 0 as long as nobody knows (knows_v) which one acts.
+    silent: the driver was given up for the time being. standing_down: another controller commands
+    the actuator, so nothing is sent.
     """
 
     def __init__(
@@ -114,9 +114,7 @@ class ControlLoop:
         """
         reported = self.commands.newest_report(stamp_ns)
         if isfinite(reported):
-            # A report beyond the limits would have the commands begin there.
-            limits = self.core.limits
-            self.v, self.knows_v = min(max(reported, limits.low), limits.high), True
+            self._go_on_from(reported)
         return self.knows_v
 
     def answer(self, output: Output) -> ControlStep | None:
@@ -187,7 +185,7 @@ class ControlLoop:
     def hear_other(self, v: float) -> None:
         """Take in a command of the controller that is in charge."""
         if self.standing_down and plausible(v):
-            self.v, self.knows_v = v, True
+            self._go_on_from(v)
 
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""
@@ -213,6 +211,11 @@ class ControlLoop:
             structure = build_structure(p)
             structure.go_on_from(core.structure)
             core.structure = structure
+
+    def _go_on_from(self, v: float) -> None:
+        # From a v beyond the limits the commands would begin there.
+        limits = self.core.limits
+        self.v, self.knows_v = min(max(v, limits.low), limits.high), True
 
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
