@@ -1,7 +1,8 @@
-"""Driver of a position-controlled motor: change the two functions at the top, keep the rest.
+"""Driver of a position-controlled motor: change the four functions at the top, keep the rest.
 
-As it is, it moves a tiny simulated motor with a load behind a worn gear, the one that
-config/geared_motor.yaml describes. docs/driver.md explains it.
+Watchdog: where no v has come for 20 sample periods, the motor is stopped until the next one comes,
+whatever the controller promises. As it is, the file moves a tiny simulated motor with a load behind
+a worn gear, the one that config/geared_motor.yaml describes. docs/driver.md explains it.
 """
 
 import contextlib
@@ -16,14 +17,27 @@ from std_msgs.msg import Float64
 
 SAMPLE_PERIOD_S = 0.005  # sample_period of the controller
 V_MIN, V_MAX = -12.6, 12.6  # [rad]; whatever the controller says, the motor stays within
+WATCHDOG_SAMPLES = 20  # without a v, after which the motor is stopped
 
 motor = SimulatedMotor(SAMPLE_PERIOD_S)
 
 
 # ---- HARDWARE: write v to your motor --------------------------------------------------------
-def write_motor_position(v: float) -> float:
-    """Command the motor to v [rad]; return the v that it really takes."""
-    return motor.move_to(v)
+def write_motor_position(v: float) -> None:
+    """Command the motor to v [rad]."""
+    motor.move_to(v)
+
+
+# ---- HARDWARE: stop your motor --------------------------------------------------------------
+def stop_motor() -> None:
+    """Hold the present position; where v is a speed or a torque, command 0 instead."""
+    motor.move_to(motor.motor_encoder())
+
+
+# ---- HARDWARE: read v before the gap --------------------------------------------------------
+def read_motor_position() -> float:
+    """Return the v that the motor has really taken [rad]; nan while it is not known."""
+    return motor.motor_encoder()
 
 
 # ---- HARDWARE: read y behind the gap --------------------------------------------------------
@@ -38,7 +52,7 @@ class MotorDriver(Node):
 
     def __init__(self) -> None:
         super().__init__('motor_driver')
-        self.applied = 0.0
+        self.unheard = WATCHDOG_SAMPLES  # samples since the newest v; there is none to stop yet
         self.report = self.create_publisher(Float64, 'applied_control', 10)
         self.output = self.create_publisher(Float64, 'plant_output', 10)
         self.create_subscription(Float64, 'control', self.on_control, 1)
@@ -47,14 +61,20 @@ class MotorDriver(Node):
     def on_control(self, message: Float64) -> None:
         """Apply v, within the limits."""
         if math.isfinite(message.data):
-            self.applied = write_motor_position(min(max(message.data, V_MIN), V_MAX))
+            self.unheard = 0
+            write_motor_position(min(max(message.data, V_MIN), V_MAX))
 
     def on_sample(self) -> None:
-        """Publish y, after the v that led to it."""
-        y = read_load_position()
-        self.report.publish(Float64(data=self.applied))
+        """Publish y, after the v that led to it; look whether v still comes."""
+        y, applied = read_load_position(), read_motor_position()
+        if math.isfinite(applied):
+            self.report.publish(Float64(data=applied))
         if math.isfinite(y):
             self.output.publish(Float64(data=y))
+        self.unheard += 1
+        if self.unheard == WATCHDOG_SAMPLES:
+            self.get_logger().warning('no control: the motor is stopped')
+            stop_motor()
 
 
 def main() -> None:

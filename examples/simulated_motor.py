@@ -19,10 +19,13 @@ class SimulatedMotor:
         self._sample = -1
         self._v = self._u = self._x1 = self._x2 = 0.0
 
-    def move_to(self, v: float) -> float:
-        """Set the position of the motor [rad]; return the one that it takes."""
+    def move_to(self, v: float) -> None:
+        """Set the position of the motor [rad]."""
         self._v = v
-        return v
+
+    def motor_encoder(self) -> float:
+        """Position of the motor [rad]."""
+        return self._v
 
     def load_encoder(self) -> float:
         """Angle of the load now [rad]."""

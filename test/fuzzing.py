@@ -137,7 +137,10 @@ class Fuzzer:
         elif kind == 1:
             self._untyped._on_reference(Float64(data=self._number_of_any_kind()))
         elif kind == 2:
-            report = Float64(data=self._number_of_any_kind())
+            # Where a command must not move further than the rate allows, the driver is honest
+            # about v: whoever begins anew goes on from what it says.
+            honest = isfinite(self._move)
+            report = Float64(data=loop.v if honest else self._number_of_any_kind())
             self._untyped._on_applied_control(report, {'source_timestamp': self._stamp})
         elif kind == 3:
             jump = int(rng.choice([-10**15, -5 * PERIOD_NS, 0, 1, 50 * PERIOD_NS, 10**15]))
@@ -151,8 +154,9 @@ class Fuzzer:
         elif kind == 6:
             loop.renew(None if rng.integers(2) else loop.estimate)
         elif kind == 7:
+            noise = [Parameter('estimator.output_noise_std', value=self._size())]
             node.set_parameters_atomically([
-                Parameter('estimator.output_noise_std', value=self._size()),
+                *(noise if loop.takes_up_noise else []),
                 Parameter('tracking.input_weight', value=self._size() + 1e-9),
                 Parameter('inverse.direction_band', value=self._size()),
             ])

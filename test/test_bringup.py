@@ -138,6 +138,14 @@ def test_no_process_survives_a_killed_bringup(start: Callable[..., Session]) -> 
         (['--duration', 'long'], ['--duration', 'long']),
         (['--driver', 'x', '--lockstep'], ["driver='x'", 'excludes lockstep', 'does not wait']),
         (['--driver', 'x --axis {axis}'], ['driver', 'names an axis', 'axes']),
+        (['--driver', 'x'], [
+            'control.min=-inf', 'set control.min, control.max, control.rate_max',
+            'give --unlimited',
+        ]),
+        (['--driver', 'none', '--set', 'control.min=-5', '--set', 'control.max=5'], [
+            'control.rate_max=inf', 'set control.rate_max, or',
+        ]),
+        (['--unlimited'], ['give --driver as well']),
         (['--driver', "x 'y"], ['driver', 'is not a command', 'quotation']),
         (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
         (['--set', 'x/seed=3'], ['x/seed', "no axis 'x'"]),

@@ -61,7 +61,7 @@ def test_each_axis_learns_its_own_backlash_in_a_time_of_its_own(
 
 
 def test_one_axis_that_fails_stops_all_and_their_drivers(start: Callable[..., Session]) -> None:
-    session = start('--config', str(CONFIG), '--driver', DRIVER, '--duration', '100')
+    session = start('--config', str(CONFIG), '--unlimited', '--driver', DRIVER, '--duration', '100')
     session.wait_for_samples('pan: ')
     session.wait_for_samples('tilt: ')
     os.kill(session.node('controller', '/tilt'), signal.SIGKILL)
@@ -83,7 +83,7 @@ def planned(folder: Path, *arguments: str) -> RunPlan:
 
 
 def test_each_axis_gets_a_driver_in_whose_command_it_is_named(tmp_path: Path) -> None:
-    drivers = plan_processes(planned(tmp_path, '--driver', DRIVER), None)[1]
+    drivers = plan_processes(planned(tmp_path, '--unlimited', '--driver', DRIVER), None)[1]
     assert [process.name for process in drivers] == ['pan/driver', 'tilt/driver']
     for axis, process in zip(TRUTH, drivers, strict=True):
         assert process.command[-1] == f'__ns:=/{axis}'

@@ -73,7 +73,8 @@ def test_driver_takes_the_place_of_the_plant_until_enough_samples_are_recorded(
     start: Callable[..., Session],
 ) -> None:
     session = start(
-        '--driver', PATIENT_PLANT, '--duration', '1', '--seed', '3', '--set', 'backlash.m=2',
+        '--unlimited', '--driver', PATIENT_PLANT, '--duration', '1', '--seed', '3',
+        '--set', 'backlash.m=2',
     )
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
@@ -93,7 +94,7 @@ def test_driver_takes_the_place_of_the_plant_until_enough_samples_are_recorded(
 def test_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported(
     start: Callable[..., Session], tmp_path: Path,
 ) -> None:
-    session = start('--driver', driver_command(tmp_path), '--duration', '100')
+    session = start('--unlimited', '--driver', driver_command(tmp_path), '--duration', '100')
     session.wait_for_samples()
     (driver,) = drivers(session)
     os.kill(driver, signal.SIGUSR1)
@@ -109,7 +110,7 @@ def test_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported(
 def test_driver_that_does_not_exist_is_named_and_nothing_stays(
     start: Callable[..., Session],
 ) -> None:
-    session = start('--driver', '/no/such/driver --fast')
+    session = start('--unlimited', '--driver', '/no/such/driver --fast')
     assert session.wait() == 1
     assert session.survivors() == {}
     assert session.stderr == (
@@ -121,7 +122,7 @@ def test_last_command_of_the_controller_reaches_the_driver(
     start: Callable[..., Session], tmp_path: Path,
 ) -> None:
     session = start(
-        '--driver', driver_command(tmp_path), '--duration', 'inf', '--no-record',
+        '--unlimited', '--driver', driver_command(tmp_path), '--duration', 'inf', '--no-record',
         '--set', 'on_stop=zero', '--set', 'bias=20',
     )
     session.wait_for_samples()
@@ -135,7 +136,7 @@ def test_second_ctrl_c_ends_a_driver_that_ignores_the_first_one(
     start: Callable[..., Session], tmp_path: Path,
 ) -> None:
     session = start(
-        '--driver', driver_command(tmp_path, sigint='SIG_IGN'), '--duration', 'inf',
+        '--unlimited', '--driver', driver_command(tmp_path, sigint='SIG_IGN'), '--duration', 'inf',
         '--no-record',
     )
     session.wait_for_samples()
@@ -152,7 +153,7 @@ def test_second_ctrl_c_ends_a_driver_that_ignores_the_first_one(
 
 
 def test_sigterm_while_the_driver_starts_leaves_no_process(start: Callable[..., Session]) -> None:
-    session = start('--driver', f'sh -c "{PLANT}; true"', '--no-record')
+    session = start('--unlimited', '--driver', f'sh -c "{PLANT}; true"', '--no-record')
     wait_until(lambda: len(session.survivors()) > 4, 'driver and nodes exist')
     session.process.send_signal(signal.SIGTERM)
     assert session.wait() == 1
@@ -162,7 +163,9 @@ def test_sigterm_while_the_driver_starts_leaves_no_process(start: Callable[..., 
 
 
 def test_no_grandchild_of_a_driver_survives_a_killed_bringup(start: Callable[..., Session]) -> None:
-    session = start('--driver', f'sh -c "{PLANT}; true"', '--duration', '100', '--no-record')
+    session = start(
+        '--unlimited', '--driver', f'sh -c "{PLANT}; true"', '--duration', '100', '--no-record',
+    )
     session.wait_for_samples()
     session.process.kill()
     session.wait()
@@ -176,7 +179,7 @@ def test_driver_elsewhere_is_awaited_and_ctrl_c_is_the_regular_end_of_an_endless
     folder.mkdir()
     with ros_world(folder) as world:
         session = start(
-            '--driver', 'none', '--duration', 'inf',
+            '--unlimited', '--driver', 'none', '--duration', 'inf',
             variables={'ROS_DOMAIN_ID': str(world.domain)},
         )
         wait_until(
@@ -201,7 +204,7 @@ def test_ctrl_c_before_the_awaited_driver_came_is_a_failure(
     folder.mkdir()
     with ros_world(folder) as world:
         session = start(
-            '--driver', 'none', '--duration', 'inf',
+            '--unlimited', '--driver', 'none', '--duration', 'inf',
             variables={'ROS_DOMAIN_ID': str(world.domain)},
         )
         wait_until(lambda: len(session.survivors()) > 3, 'nodes exist')

@@ -46,7 +46,7 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
     ({'late': 60}, Level.WARN, '10 % of control came too late: relieve the machine'),
     ({'lost': 66}, Level.WARN, '9.91 % of plant_output was lost on its way'),
     ({'lost': 66, 'unsent': 66}, Level.WARN, '9.91 % of plant_output was never sent'),
-    ({'rivals': ('/b/controller',)}, Level.WARN,
+    ({'rivals': ('/b/controller',)}, Level.ERROR,
      '2 publishers of control, also /b/controller: stop one'),
     ({'output': output_from(DRIVER, OTHER)}, Level.WARN, '2 publishers of plant_output'),
     ({'reference': reference_from(DRIVER, OTHER)}, Level.WARN, '2 publishers of reference'),

@@ -7,13 +7,14 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from made_up_driver import LIMITS, parameters
+from made_up_driver import LIMITS, PERIOD_S, parameters
 from ros_processes import Probe
 from std_msgs.msg import Float64
 
@@ -180,6 +181,85 @@ def test_sigint_brings_v_to_rest(tmp_path: Path) -> None:
     v = [c.data for c in controls]
     step = LIMITS.rate * parameters()['sample_period']
     assert max(abs(b - a) for a, b in pairwise(v)) <= step * (1.0 + 1e-9)
+
+
+def way_to_rest(
+    folder: Path, act: Callable[[subprocess.Popen[str], float], None], *options: str,
+) -> tuple[float, str]:
+    """Let v come to rest very slowly, and act; return how long the end took, and what was said."""
+    slow = ('--rate', '0.5', '--ros-args', '-p', 'control.initial:=4.0')
+    with bench(folder, 'none') as beside:
+        probe = Probe(beside.domain)
+        try:
+            controls = probe.collect('control', Float64)
+            process = beside.start('--drive', *options, *slow)
+            try:
+                probe.wait_until(lambda: len(controls) > 5, 'a motion')
+                begin = time.monotonic()
+                act(process, begin)
+                probe.wait_until(lambda: process.poll() is not None, 'the end')
+                took = time.monotonic() - begin
+                err = process.communicate()[1]
+            finally:
+                process.kill()
+        finally:
+            probe.close()
+    return took, err
+
+
+def test_a_signal_on_the_way_to_rest_holds_v(tmp_path: Path) -> None:
+    def interrupt_twice(process: subprocess.Popen[str], begin: float) -> None:
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+        assert process.poll() is None  # on its way, which takes 8 s
+        process.send_signal(signal.SIGINT)
+
+    took, err = way_to_rest(tmp_path, interrupt_twice)
+    assert took < 4.0
+    assert 'v is held at 3.' in err
+    assert 'another signal' in err
+
+
+def test_the_way_to_rest_has_a_deadline(tmp_path: Path) -> None:
+    def interrupt(process: subprocess.Popen[str], begin: float) -> None:
+        process.send_signal(signal.SIGINT)
+
+    took, err = way_to_rest(tmp_path, interrupt, '--rest', '1')
+    assert took < 5.0
+    assert 'v is held at 3.' in err
+    assert '--rest=1' in err
+
+
+def first_commands(folder: Path, *options: str) -> tuple[list[float], str]:
+    """What a drive begins with, and what is printed about it."""
+    with bench(folder, 'none') as beside:
+        probe = Probe(beside.domain)
+        try:
+            controls = probe.collect('control', Float64)
+            process = beside.start('--drive', '--duration', '60', *options)
+            try:
+                probe.wait_until(lambda: len(controls) > 20, 'commands')
+                process.send_signal(signal.SIGINT)
+                probe.wait_until(lambda: process.poll() is not None, 'the end')
+                err = process.communicate()[1]
+            finally:
+                process.kill()
+        finally:
+            probe.close()
+    return [message.data for message in controls], err
+
+
+def test_the_drive_goes_on_from_control_initial(tmp_path: Path) -> None:
+    v, err = first_commands(tmp_path, '--ros-args', '-p', 'control.initial:=-4.0')
+    step = LIMITS.rate * PERIOD_S * (1.0 + 1e-9)
+    assert max(abs(b - a) for a, b in pairwise([-4.0, *v])) <= step
+    assert 'nobody says' not in err
+
+
+def test_the_drive_says_that_nobody_knows_v(tmp_path: Path) -> None:
+    v, err = first_commands(tmp_path)
+    assert abs(v[0]) <= LIMITS.rate * PERIOD_S
+    assert err.count('nobody says which v acts now') == 1
 
 
 def test_y_outside_the_given_range_ends_the_drive(tmp_path: Path) -> None:

@@ -30,6 +30,16 @@ def test_document_and_figure_come_from_one_command(
         assert contender.name in printed
 
 
+def test_without_a_folder_it_writes_where_all_results_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert compare.main(['--duration', '2.5']) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ['results']
+    assert (tmp_path / 'results' / 'latest' / 'comparison.md').is_file()
+    assert 'document: results/' in capsys.readouterr().out
+
+
 def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare.main(['--set', 'amplitud=3']) == 2
     assert capsys.readouterr().err.count('\n') == 1

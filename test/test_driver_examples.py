@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import signal
@@ -13,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ros_processes import RosWorld, ros_world
-from std_msgs.msg import Float64MultiArray
+from ros_processes import Probe, RosWorld, ros_world
+from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.nodes.gentle_drive import GentleDrive, Range
@@ -32,6 +33,24 @@ DEADLINE_S = 90.0
 # Of a driver that a machine under load holds up, a run says nothing.
 HELD_UP, ATTEMPTS = ('✗ jitter', '✗ lost samples'), 5
 
+# motor_driver.py with a motor that takes its time, and stands elsewhere than at 0.
+SLOW_MOTOR = """
+import motor_driver
+class SlowMotor(motor_driver.SimulatedMotor):
+    position, moved = 2.0, False
+    def motor_encoder(self):
+        return self.position
+    def load_encoder(self):
+        if self.moved:
+            self.position += min(max(self._v - self.position, -0.02), 0.02)
+        return super().load_encoder()
+    def move_to(self, v):
+        self.moved = True
+        super().move_to(v)
+motor_driver.motor = SlowMotor(motor_driver.SAMPLE_PERIOD_S)
+motor_driver.main()
+"""
+PATHS = os.pathsep.join((str(EXAMPLES), str(ROOT)))
 sys.path.insert(0, str(EXAMPLES))
 from find_model import find_model, rising_part  # noqa: E402
 from simulated_motor import ENCODER_STEP, SimulatedMotor  # noqa: E402
@@ -99,12 +118,70 @@ def test_model_is_found_from_a_rising_record() -> None:
     v, y = np.empty(1000), np.empty(1000)
     for k in range(1000):
         y[k] = ENCODER_STEP * round(motor._x1 / ENCODER_STEP)
-        v[k] = motor.move_to(drive.step())
+        v[k] = drive.step()
+        motor.move_to(v[k])
         motor._step()
     numerator, denominator, noise_std = find_model(*rising_part(v, y, 100), 2)
     assert numerator / 0.098 == pytest.approx([0.15678154, 0.12688103], rel=0.01)
     assert denominator == pytest.approx([1.0, -1.24982552, 0.53348809], rel=0.01)
     assert noise_std == pytest.approx(ENCODER_STEP / 12.0**0.5, rel=0.1)
+
+
+class MotorBench:
+    """motor_driver.py, driven by the test and with a slow motor, on a domain of its own."""
+
+    def __init__(self, folder: Path, domain: int) -> None:
+        self.stderr = folder / 'driver.stderr'
+        self.probe = Probe(domain)
+        self.applied = self.probe.collect(topics.APPLIED_CONTROL, Float64)
+        self.control = self.probe.publisher(topics.CONTROL, Float64)
+        script = folder / 'slow_motor.py'
+        script.write_text(SLOW_MOTOR)
+        with self.stderr.open('wb') as err:
+            self.process = subprocess.Popen(
+                [sys.executable, str(script)], stderr=err, stdin=subprocess.DEVNULL,
+                env={**child_environment(folder, domain), 'PYTHONPATH': PATHS},
+            )
+
+    def command(self, v: float, samples: int) -> None:
+        """Send v for so many samples."""
+        for _ in range(samples):
+            self.control.publish(Float64(data=v))
+            count = len(self.applied)
+            self.probe.wait_until(lambda count=count: len(self.applied) > count, 'a sample')
+
+    def wait_samples(self, samples: int) -> None:
+        count = len(self.applied)
+        self.probe.wait_until(lambda: len(self.applied) > count + samples, 'samples')
+
+    def close(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.probe.close()
+
+
+def test_the_motor_is_stopped_where_no_control_comes_any_more(tmp_path: Path) -> None:
+    with free_domain() as domain:
+        bench = MotorBench(tmp_path, domain)
+        try:
+            bench.wait_samples(50)
+            assert 'no control' not in bench.stderr.read_text()  # none has come that could end
+            # What the motor has not said it has not applied: it stands at 2 from the start on.
+            assert {message.data for message in bench.applied} == {2.0}
+            bench.probe.wait_until(bench.control.get_subscription_count, 'the driver')
+            bench.command(8.0, 40)
+            moving = bench.applied[-1].data
+            assert 2.0 < moving < 8.0
+            bench.wait_samples(60)
+            held = bench.applied[-1].data
+            assert moving < held < 8.0
+            bench.wait_samples(40)
+            assert bench.applied[-1].data == held
+            assert bench.stderr.read_text().count('no control: the motor is stopped') == 1
+            bench.command(8.0, 40)
+            assert bench.applied[-1].data > held
+        finally:
+            bench.close()
 
 
 def commands_of_driver_page() -> list[list[str]]:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
+from fuzzing import node_with
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from paced_driver import PacedDriver, controller_and_driver
@@ -15,6 +18,9 @@ from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from ros_processes import RosWorld, ros_world
 from std_srvs.srv import SetBool, Trigger
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.tools.processes import free_domain
 
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
@@ -76,6 +82,21 @@ def test_controller_goes_through_its_life_and_publishes_only_while_active(tmp_pa
         assert asked.change(Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
         assert asked.state() == 'finalized'
         assert controller.stop() == 0
+
+
+def test_a_node_whose_activation_fails_is_not_active(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise ParameterError('sample_period', 0.0, 'does not suit this test')
+
+    with free_domain() as domain, node_with({'autostart': False}, domain) as node:
+        untyped: Any = node
+        untyped.trigger_configure()
+        monkeypatch.setattr(node, 'activate', fail)
+        untyped.trigger_activate()
+        assert not node.active
+        monkeypatch.undo()
+        untyped.trigger_activate()
+        assert node.active
 
 
 @pytest.mark.parametrize('structure', ['proportional', 'tracking'])
@@ -184,6 +205,62 @@ def test_saving_without_a_file_says_what_to_do(tmp_path: Path) -> None:
         answer = Asked(driver).trigger('save_estimates')
         assert not answer.success
         assert 'start with -p estimates.file:=PATH, or set it while unconfigured' in answer.message
+        assert controller.stop() == 0
+
+
+# In front of the standard library: a disk that takes its time to confirm.
+SLOW_DISK = """
+import os, time
+confirm = os.fsync
+def slowly(file):
+    time.sleep(1.0)
+    confirm(file)
+os.fsync = slowly
+"""
+
+
+def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(tmp_path: Path) -> None:
+    (tmp_path / 'sitecustomize.py').write_text(SLOW_DISK)
+    with ros_world(tmp_path) as world:
+        paths = [str(tmp_path), *filter(None, [world.environment.get('PYTHONPATH')])]
+        world.environment['PYTHONPATH'] = os.pathsep.join(paths)
+        controller, driver = another(world, str(tmp_path / 'estimates.json'))
+        asked = Asked(driver)
+        driver.learn()
+        count = len(driver.controls)
+        begin = time.monotonic()
+        assert asked.trigger('save_estimates').success
+        assert time.monotonic() - begin > 1.0
+        assert len(driver.controls) - count > 50
+        # Other requests are answered meanwhile.
+        client = driver.probe.node.create_client(Trigger, 'controller/save_estimates')
+        driver.run_until(client.service_is_ready, 'the service')
+        saved = client.call_async(Trigger.Request())
+        driver.run(0.1)
+        assert asked.set('freeze_adaptation', True)
+        assert not saved.done()
+        driver.run_until(saved.done, 'the second answer')
+        assert saved.result().success
+        assert controller.stop() == 0
+
+
+def test_noise_is_not_changed_live_for_a_law_that_would_not_take_it_up(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world, **{'estimator.law': 'lms'})
+        asked = Asked(driver)
+        driver.run(0.1)
+        request = SetParametersAtomically.Request(parameters=[
+            Parameter('estimator.output_noise_std', value=2e-3).to_parameter_msg()
+        ])
+        kind = SetParametersAtomically
+        refused = asked('set_parameters_atomically', kind, request).result
+        assert not refused.successful
+        assert 'estimator.output_noise_std=0.002' in refused.reason
+        assert 'not taken up live by lms' in refused.reason
+        # Whoever begins anew takes it up.
+        assert asked.change(Transition.TRANSITION_DEACTIVATE)
+        assert asked.change(Transition.TRANSITION_CLEANUP)
+        assert asked('set_parameters_atomically', kind, request).result.successful
         assert controller.stop() == 0
 
 

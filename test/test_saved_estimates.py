@@ -7,14 +7,18 @@ from dataclasses import replace
 from math import isnan, nan
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.storage import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import stated_deviations
 
 LEARNED = Estimate(1.25, 2.5, -3.5, 0.2, 0.01, 0.02, 0.03, Status.TRACKING)
 
@@ -25,7 +29,7 @@ def parameters(file: Path, **values: object) -> Parameters:
 
 @given(
     st.floats(0.01, 100.0), st.floats(0.0, 100.0), st.floats(-100.0, 0.0), st.floats(-0.5, 0.5),
-    st.one_of(st.just(nan), st.floats(0.0, 10.0)),
+    st.one_of(st.just(nan), st.floats(0.0, 10.0, exclude_min=True)),
 )
 def test_saved_estimate_comes_back_to_the_last_bit(
     tmp_path_factory: pytest.TempPathFactory, m: float, c_r: float, c_l: float, f: float,
@@ -56,13 +60,65 @@ def test_nothing_is_loaded_unless_asked_or_before_it_was_saved(tmp_path: Path) -
         ('plant.numerator', [1e-5, 4e-5, 2e-5]),
         ('control.delay_samples', 1),
         ('estimator.bounds.c_r', [0.0, 50.0]),
+        ('estimator.law', 'lms'),
     ],
 )
-def test_estimates_of_another_plant_are_refused(tmp_path: Path, name: str, value: object) -> None:
+def test_estimates_of_another_plant_or_law_are_refused(
+    tmp_path: Path, name: str, value: object,
+) -> None:
     file = tmp_path / 'estimates.json'
     save_estimate(file, LEARNED, parameters(file))
     with pytest.raises(ParameterError, match=f'was learned with {name}='):
         load_estimate(parameters(file, **{name: value}))
+
+
+def test_constants_that_are_given_are_never_saved_as_learned() -> None:
+    for status in Status:
+        given_ones = replace(LEARNED, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=status)
+        assert not worth_saving(given_ones)
+    controller = build_controller(Parameters({'estimator.law': 'fixed'}))
+    controller.step(0.0, 1.0)
+    assert not worth_saving(controller.estimator.estimate)
+
+
+def test_what_any_law_has_learned_may_be_taken_as_fixed(tmp_path: Path) -> None:
+    file = tmp_path / 'estimates.json'
+    save_estimate(file, LEARNED, parameters(file))
+    loaded = load_estimate(parameters(file, **{'estimator.law': 'fixed'}))
+    assert loaded is not None
+    assert loaded.m == LEARNED.m
+
+
+@pytest.mark.parametrize(('law', 'std', 'reason'), [
+    ('kalman', 0.01, ''),
+    ('kalman', 0.0, 'holds constants that were given'),
+    ('kalman', None, 'does not say by which law'),
+    ('lms', 0.01, 'does not say by which law'),
+    ('lms', None, 'does not say by which law'),
+    ('fixed', 0.0, 'holds constants that were given'),
+    ('fixed', None, ''),
+])
+def test_a_file_without_the_law_serves_a_law_with_deviations_if_it_holds_some(
+    tmp_path: Path, law: str, std: float | None, reason: str,
+) -> None:
+    file = tmp_path / 'estimates.json'
+    save_estimate(file, LEARNED, parameters(file))
+    content = json.loads(file.read_text())
+    del content['key']['estimator.law']
+    content['estimate'] |= dict.fromkeys(('std_m', 'std_c_r', 'std_c_l'), std)
+    file.write_text(json.dumps(content))
+    p = parameters(file, **{'estimator.law': law})
+    if reason:
+        with pytest.raises(ParameterError, match=reason):
+            load_estimate(p)
+    else:
+        assert load_estimate(p) is not None
+
+
+def test_deviations_of_constants_that_are_given_are_published_as_nan() -> None:
+    run = build_closed_loop(Parameters({'estimator.law': 'fixed'})).run(3)
+    assert np.isnan([run.column(name) for name in ('std_m', 'std_c_r', 'std_c_l')]).all()
+    assert stated_deviations(LEARNED) == (0.01, 0.02, 0.03)
 
 
 @pytest.mark.parametrize(

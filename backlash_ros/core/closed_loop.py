@@ -11,7 +11,7 @@ import numpy as np
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.controller import AdaptiveController
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.core.run_record import COLUMNS, RunRecord, stated_deviations
 from backlash_ros.core.simulated_plant import SimulatedPlant
 
 
@@ -50,9 +50,9 @@ class ClosedLoop:
                 u = self.plant.step(v)
                 e = step.estimate
                 rows[kept] = (
-                    t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f, e.std_m, e.std_c_r,
-                    e.std_c_l, estimator.u_hat, estimator.innovation, e.status, truth.m, truth.c_r,
-                    truth.c_l,
+                    t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f,
+                    *stated_deviations(e), estimator.u_hat, estimator.innovation, e.status,
+                    truth.m, truth.c_r, truth.c_l,
                 )
                 kept += 1
             if on_sample is not None:

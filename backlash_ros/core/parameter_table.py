@@ -32,7 +32,7 @@ class Parameter:
     aliases: tuple[tuple[str, str], ...] = ()
     used_by: tuple[str, ...] = (CONTROLLER,)
     live: bool = False
-    infinite: bool = False  # inf is allowed and means "no limit"
+    infinite: bool = False  # inf is allowed and means "no limit", or "not known"
     names: bool = False  # a list of names instead of numbers, possibly empty
     may_be_empty: bool = False  # a list of numbers that stands for another one where it is empty
 
@@ -82,7 +82,10 @@ PARAMETERS: tuple[Parameter, ...] = (
               length=2, high=0.0),
     Parameter('estimator.output_noise_std', 1e-5,
               'standard deviation of the noise on y; where it is not given, that of the simulated '
-              'noise and quantum if there is any', 'y', low=0.0, live=True),
+              'noise and quantum if there is any; not live for every law', 'y', low=0.0, live=True),
+    Parameter('estimator.input_noise_std', 0.0,
+              'moving_horizon: first guess of how far a slow disturbance of u walks within a '
+              'record; learned from the data', 'u', low=0.0, live=True),
     Parameter('estimator.drift_std', (0.0, 0.0, 0.0),
               'moving_horizon: random walk of m, c_r, c_l per square root of a second', length=3,
               low=0.0, live=True),
@@ -129,6 +132,9 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('control.max', inf, 'largest v', 'v', live=True, infinite=True),
     Parameter('control.rate_max', inf, 'largest speed of v', 'v/s', low=0.0, above=True,
               live=True, infinite=True),
+    Parameter('control.initial', inf,
+              'v that acts when the controller starts, where no applied_control tells it; '
+              '.inf: not known', 'v', infinite=True),
     Parameter('inverse.direction_band', 0.0,
               'u_d has turned only after coming back by more than this', 'u', low=0.0, live=True),
     Parameter('inverse.take_up_rate', inf,
@@ -142,6 +148,10 @@ PARAMETERS: tuple[Parameter, ...] = (
               'which must be set then', choices=('hold', 'zero', 'ramp'), live=True),
     Parameter('on_timeout', 'hold', 'the same while plant_output is silent',
               choices=('hold', 'zero', 'ramp'), live=True),
+    Parameter('on_rival', 'stand_down',
+              'what to do where another node published control before this one was activated: '
+              'publish nothing until it is gone, or go on and report it',
+              choices=('stand_down', 'warn'), live=True),
     Parameter('timeout.plant_output', 0.5,
               'longest silence of plant_output before on_timeout is done, 0 for never', 's',
               low=0.0, high=3600.0, live=True),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from math import hypot, isfinite, isnan, sqrt
+from math import hypot, isfinite, isinf, isnan, sqrt
 from typing import cast
 
 from backlash_ros.core.errors import UNTOLD, ParameterError
@@ -13,6 +13,7 @@ from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter, Va
 
 NOISE = 'estimator.output_noise_std'
 LARGEST = 1e100  # squares, and products of two, still are numbers
+LIMITS = ('control.min', 'control.max', 'control.rate_max')
 NAME = re.compile(r'[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # a namespace of ROS
 
 
@@ -92,6 +93,11 @@ class Parameters(Mapping[str, Value]):
     def replaced(self, changes: Mapping[str, object]) -> Parameters:
         """A new set with some values changed, defaults staying defaults; raises ParameterError."""
         return Parameters({**self._given, **changes})
+
+
+def missing_limits(p: Parameters) -> list[str]:
+    """Names of the limits of v that are infinite."""
+    return [name for name in LIMITS if isinf(p.real(name))]
 
 
 def check_names(names: Iterable[str]) -> None:

@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimation.storage import was_given
 
 COLUMNS = (
     't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
     'u_hat', 'innovation', 'status', 'true_m', 'true_c_r', 'true_c_l',
 )
 _INDEX = {name: i for i, name in enumerate(COLUMNS)}
+
+
+def stated_deviations(e: Estimate) -> tuple[float, float, float]:
+    """Standard deviations of m, c_r, c_l as they are published and recorded.
+
+    Those of constants that are taken as given are nan: nobody has learned how wrong they are.
+    """
+    return (nan, nan, nan) if was_given(e) else (e.std_m, e.std_c_r, e.std_c_l)
 
 
 @dataclass(frozen=True)

@@ -81,6 +81,7 @@ class LoopFigures:
     reference: TopicFigures = field(default_factory=lambda: TopicFigures('reference'))
     control: TopicFigures = field(default_factory=lambda: TopicFigures('control'))
     rivals: tuple[str, ...] = ()
+    standing_down: bool = False  # because of them
     status: Status | None = None  # None before the first command
     inconsistent_s: float = 0.0  # how long that status has been INCONSISTENT
     adapting: bool = True
@@ -211,9 +212,14 @@ def _bad_numbers(f: LoopFigures) -> list[Finding]:
 
 def _second_senders(f: LoopFigures) -> list[Finding]:
     found = []
-    if f.rivals:
+    if f.standing_down:
         found.append(Finding(
-            Level.WARN, 'rivals', f'{1 + len(f.rivals)} publishers of {f.control.name}, '
+            Level.ERROR, 'rivals', f'standing down: {f.rivals[0] if f.rivals else "another node"} '
+            f'published {f.control.name} before: stop one',
+        ))
+    elif f.rivals:
+        found.append(Finding(
+            Level.ERROR, 'rivals', f'{1 + len(f.rivals)} publishers of {f.control.name}, '
             f'also {f.rivals[0]}: stop one',
         ))
     senders = len(f.output.heard)
@@ -225,8 +231,8 @@ def _second_senders(f: LoopFigures) -> list[Finding]:
     senders = len(f.reference.heard)
     if senders > 1:
         found.append(Finding(
-            Level.WARN, 'second reference', f'{senders} publishers of {f.reference.name} '
-            'take turns: stop all but one',
+            Level.WARN, 'second reference', f'{f.reference.name} is published by '
+            f'{", ".join(peer.name for peer in f.reference.heard)}: stop all but one',
         ))
     return found
 

@@ -41,6 +41,7 @@ from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, ta
 from backlash_ros.nodes.gentle_drive import GentleDrive, drive_range
 from backlash_ros.nodes.messages import DEPTH
 from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.rivals import names_of
 from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
 from backlash_ros.shipped import find_config
 
@@ -183,12 +184,23 @@ class CheckDriverNode(ProcessNode):
             self._range_left = y
             return
         if self._drive is None:
-            start = self._heard.applied[-1].value if self._heard.applied else 0.0
             self._drive = GentleDrive(
                 self._limits, self._period, self._options.duration, self._options.rising,
-                start if plausible(start) else 0.0,
+                self._v_at_start(),
             )
         self._command(self._drive.step())
+
+    def _v_at_start(self) -> float:
+        """The v that acts before the drive, 0 where nobody says it."""
+        told = [self.settings.real('control.initial')]
+        told += [message.value for message in self._heard.applied[-1:]]
+        known = [v for v in told if plausible(v)]
+        if not known:
+            print(
+                f'{EXECUTABLE}: nobody says which v acts now, so the drive goes on from 0: '
+                f'publish {topics.APPLIED_CONTROL}, or set control.initial', file=sys.stderr,
+            )
+        return known[-1] if known else 0.0
 
     def _command(self, v: float) -> None:
         now = time.time_ns()
@@ -225,11 +237,19 @@ class CheckDriverNode(ProcessNode):
         drive = self._drive
         if drive is None:
             return
-        self._driving, done = False, False
-        while not done:
-            done = drive.step_to_rest()
+        self._driving, before = False, self.signals
+        deadline = time.monotonic() + self._options.rest
+        while not drive.step_to_rest():
             self._control.publish(Float64(data=drive.v))
             time.sleep(self._period)
+            late = time.monotonic() > deadline
+            if late or self.signals > before:
+                why = f'not at rest within --rest={self._options.rest:g} s' if late \
+                    else 'another signal came'
+                print(f'{EXECUTABLE}: v is held at {drive.v:.6g}: {why}', file=sys.stderr)
+                break
+        else:
+            self._control.publish(Float64(data=drive.v))
         # The last command must leave before the node does.
         executor.spin_once(timeout_sec=LOOK_S)
 
@@ -242,7 +262,7 @@ class CheckDriverNode(ProcessNode):
         if self._limits is not None:
             others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
             # Once heard, a rival counts, even if it leaves.
-            self._rivals = self._rivals or _names_of(
+            self._rivals = self._rivals or names_of(
                 [info for info in others if info.node_name != self.get_name()]
             )
         graph.publishers = max(graph.publishers, len(outputs))
@@ -308,14 +328,6 @@ def _misfit(offered: QoSProfile, asked: QoSProfile) -> str:
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
 
 
-def _names_of(endpoints: Sequence[TopicEndpointInfo]) -> str:
-    return ', '.join(sorted({
-        f'{info.node_namespace.rstrip("/")}/{info.node_name}'
-        # Names are discovered a little later than topics.
-        if 'UNKNOWN' not in info.node_name else 'another node' for info in endpoints
-    }))
-
-
 class _Parser(argparse.ArgumentParser):
     """Reports errors in one line."""
 
@@ -351,6 +363,9 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
                         help='drive: keep v slower than this as well')
     parser.add_argument('--rising', action='store_true',
                         help='drive: once upwards without turning back, to find G(z)')
+    parser.add_argument('--rest', type=_positive, default=30.0, metavar='SECONDS',
+                        help='drive: longest way to rest at the end, after which v is held '
+                             '(default: 30); a signal on that way holds v at once')
     parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),
                         metavar=('LOW', 'HIGH'), help='drive: stop when y leaves this range')
     parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')

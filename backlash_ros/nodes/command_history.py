@@ -94,8 +94,11 @@ class CommandHistory:
         self._output_ns = end_ns
 
     def newest_report(self, end_ns: int) -> float:
-        """The v reported for the interval that ended at end_ns, nan without one."""
-        if self._use is ReportUse.NEVER or not self._reported:
+        """The v reported for the interval that ended at end_ns, nan without one.
+
+        It tells where the commands begin, even where it is not to be learned from.
+        """
+        if not self._reported:
             return nan
         stamp_ns, v = self._reported[-1]
         return v if stamp_ns > end_ns - FRESH * self._period_ns else nan

@@ -33,20 +33,21 @@ class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
-    learned before. counter: goes on counting where another loop has ended. v: the newest command.
-    silent: the driver was given up for the time being.
+    learned before. counter: goes on counting where another loop has ended. v: the newest command,
+    0 as long as nobody knows (knows_v) which one acts. silent: the driver was given up for the time
+    being. standing_down: another controller commands the actuator, so nothing is sent.
     """
 
     def __init__(
         self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
-        inherited: Estimate | None, counter: SampleCounter,
+        inherited: Estimate | None, counter: SampleCounter, v: float | None = None,
     ) -> None:
         self.statistics = LoopStatistics()
         self.counter = counter
         self.commands = CommandHistory(p.real('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
-        self.v = 0.0
-        self.silent = False
+        self.v, self.knows_v = v or 0.0, v is not None
+        self.silent = self.standing_down = False
         self.adapting = self.compensating = True
         self.last: ControlStep | None = None
         self.heard_at: float | None = None  # on the steady clock [s]
@@ -61,6 +62,11 @@ class ControlLoop:
     def estimate(self) -> Estimate:
         """What is known of the backlash."""
         return self.core.estimator.estimate
+
+    @property
+    def takes_up_noise(self) -> bool:
+        """Whether the law can change what it takes for the noise on y while it runs."""
+        return isinstance(self.core.estimator, MovingHorizon)
 
     def renew(self, inherited: Estimate | None) -> None:
         """Go on with a new core from the present v: nothing is known of the state of the plant.
@@ -96,14 +102,32 @@ class ControlLoop:
         else:
             self.statistics.dropped += 1
 
+    @property
+    def begins(self) -> bool:
+        """Whether the next command is the first one, since the start or an interruption."""
+        return self.silent or not self._begun
+
+    def learn_v(self, stamp_ns: int) -> bool:
+        """Take the v that the driver reports with this output for the one that acts, if it does.
+
+        Returns whether it is known now which one acts.
+        """
+        reported = self.commands.newest_report(stamp_ns)
+        if isfinite(reported):
+            self._go_on_from(reported)
+        return self.knows_v
+
     def answer(self, output: Output) -> ControlStep | None:
         """Send v(k) for y(k); None where the message brings no command."""
-        return self.step(output, self.counter.count(output.stamp_ns, output.sequence), self.y_m)
+        arrival = self.counter.count(output.stamp_ns, output.sequence)
+        return self.step(output, arrival, self.y_m)
 
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """The same for a sample that was counted already, with the reference that belongs to it."""
         statistics = self.statistics
         statistics.note_arrival(output.stamp_ns)
+        if self.standing_down:
+            return None
         if not arrival.is_sample:
             statistics.extra += 1
             return None
@@ -129,8 +153,10 @@ class ControlLoop:
         return step
 
     def send(self, v: float) -> None:
-        """Send a command and note when it left."""
-        self.v = v
+        """Send a command and note when it left; nothing while another controller commands."""
+        if self.standing_down:
+            return
+        self.v, self.knows_v = v, True
         self._send(v)
         self.commands.publish(v, self._now_ns())
 
@@ -140,12 +166,32 @@ class ControlLoop:
         return self.core.limits.zero
 
     def last_commands(self, action: str) -> Iterator[float]:
-        """Commands that end the loop as on_stop or on_timeout say, from the present v on."""
+        """Commands that end the loop as on_stop or on_timeout say, from the present v on.
+
+        None where nobody knows v: then this loop has not commanded anything either.
+        """
+        if not self.knows_v:
+            return iter(())
         return last_commands(action, self.v, self.core.limits)
 
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""
         self.silent = True
+        self.renew(self.estimate)
+
+    def stand_down(self) -> None:
+        """Leave the actuator to another controller."""
+        self.standing_down = True
+
+    def hear_other(self, v: float) -> None:
+        """Take in a command of the controller that is in charge."""
+        if self.standing_down and plausible(v):
+            self._go_on_from(v)
+
+    def resume(self) -> None:
+        """Command again, from the newest v that was heard; the state of the plant is unknown."""
+        self.standing_down = self.silent = False
+        self.heard_at = None
         self.renew(self.estimate)
 
     def take_up(self, p: Parameters) -> None:
@@ -167,6 +213,11 @@ class ControlLoop:
             structure = build_structure(p)
             structure.go_on_from(core.structure)
             core.structure = structure
+
+    def _go_on_from(self, v: float) -> None:
+        # From a v beyond the limits the commands would begin there.
+        limits = self.core.limits
+        self.v, self.knows_v = min(max(v, limits.low), limits.high), True
 
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
@@ -193,10 +244,9 @@ class ControlLoop:
         lost, self._missing = self._missing, 0
         if not self._begun:
             self._begun = True
-            reported = commands.newest_report(stamp_ns)
-            # A report beyond the limits would have the commands begin there.
-            within = min(max(reported, core.limits.low), core.limits.high)
-            core.start_from(within if isfinite(reported) else self.v)
+            if not self._lockstep:
+                self.learn_v(stamp_ns)
+            core.start_from(self.v)
             commands.begin(stamp_ns)
             return core.step(y, y_m)
         if self._lockstep:

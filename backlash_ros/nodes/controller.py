@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from math import nan
+from math import isfinite, nan
 from typing import Any
 
 from rclpy.subscription import Subscription
@@ -22,9 +22,10 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.parameter_table import CONTROLLER
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters import NOISE, Parameters, missing_limits
+from backlash_ros.core.run_record import stated_deviations
 from backlash_ros.nodes.causes import Finding, Level
-from backlash_ros.nodes.command_history import REMEMBERED, ReportUse, report_use
+from backlash_ros.nodes.command_history import REMEMBERED
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.controller_services import offer_services
 from backlash_ros.nodes.declare import LiveParameters
@@ -41,6 +42,7 @@ from backlash_ros.nodes.messages import (
     LabelledArrayPublisher,
     stamp_ns_of,
 )
+from backlash_ros.nodes.rivals import RivalWatch
 from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import run
 
@@ -52,6 +54,7 @@ KEPT_S, KEPT_OUTPUTS = 0.1, 20
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
+AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
 LOOK_S = 0.05  # between two looks for a silent plant_output or reference
 SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
 LAST_WORD_S = 0.1  # longest wait for the driver to confirm the last command
@@ -89,7 +92,11 @@ class ControllerNode(ManagedNode):
         self._told: Status | None = None  # the newest one that /diagnostics has
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._to_zero: Timer | None = None  # sends the commands of on_timeout
-        self._io.advertise()
+        self._rivals = RivalWatch(
+            self, self._io.topics.control, self._io.advertise, self._mind_rivals
+        )
+        self._told_rivals = self._rivals.found
+        self._commands_of_rivals: Subscription | None = None  # heard while standing down
         self._signals = LabelledArrayPublisher(
             self, topics.of_node(topics.SIGNALS), topics.SIGNAL_LABELS
         )
@@ -103,9 +110,13 @@ class ControllerNode(ManagedNode):
         self._reference = self.create_subscription(
             Float64, topics.REFERENCE, self._on_reference, KEPT if self._lockstep else 1
         )
-        self._reports: Inbox | None = None
-        if report_use(p) is not ReportUse.NEVER:
-            self._reports = Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
+        # The first command begins with what the driver reports, even if it is not learned from.
+        self._reports = (
+            None if self._lockstep else Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
+        )
+        self._last_v: float | None = None  # before a cleanup
+        self._warned: set[str] = set()  # texts
+        self._unanswered = 0  # outputs that were not answered because v was not known yet
         self._diagnosis = Diagnosis(
             self, self._io, output_qos(p, DEPTH), self._reference.qos_profile
         )
@@ -113,7 +124,7 @@ class ControllerNode(ManagedNode):
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         offer_services(self, self)
         self._live = LiveParameters(
-            self, p, build_controller, self._take_up, lambda: self.loop is None
+            self, p, self._check_change, self._take_up, lambda: self.loop is None
         )
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         if not self._lockstep:
@@ -147,15 +158,26 @@ class ControllerNode(ManagedNode):
     def configure(self) -> None:
         p = self._live.parameters
         inherited = load_estimate(p)
-        self.loop = ControlLoop(p, self._io.publish, self._io.now_ns, inherited, self._counter)
+        self.loop = ControlLoop(
+            p, self._io.publish, self._io.now_ns, inherited, self._counter, self._v_at_start(p)
+        )
         if inherited is not None:
             self.log.info(
                 f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
                 f'c_r={inherited.c_r:.6g}, c_l={inherited.c_l:.6g}'
             )
 
+    def _v_at_start(self, p: Parameters) -> float | None:
+        """The v that acts as far as this node can know, None if it cannot."""
+        if self._last_v is not None:
+            return self._last_v
+        initial = p.real('control.initial')
+        # In lockstep there is the simulated plant alone, which begins at 0.
+        return initial if isfinite(initial) and not self._lockstep else None
+
     def activate(self) -> None:
         assert self.loop is not None
+        self._rivals.begin()
         if self._driver is not None:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
             # that nobody was listened to is no silence of the driver.
@@ -174,12 +196,14 @@ class ControllerNode(ManagedNode):
         assert loop is not None
         self._end_ramp()
         if loop.last is not None:
-            self._send_last_commands(loop, p.word('on_stop'), p.real('timeout.ramp'))
+            if not loop.standing_down:
+                self._send_last_commands(loop, p.word('on_stop'), p.real('timeout.ramp'))
             self._save(loop)
+        self._rivals.end()
         self._diagnose()
 
     def _send_last_commands(self, loop: ControlLoop, action: str, longest_s: float) -> None:
-        deadline = time.monotonic() + longest_s
+        told, deadline = time.monotonic(), time.monotonic() + longest_s
         step_s = max(self.settings.real('sample_period'), SHORTEST_STEP_S)
         for v in loop.last_commands(action):
             loop.send(v)
@@ -191,9 +215,14 @@ class ControllerNode(ManagedNode):
                 )
                 break
             time.sleep(step_s)
+            if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
+                told = time.monotonic()
+                self._diagnose()  # whoever stands down must not take this one for gone
         self._io.wait_until_received(LAST_WORD_S)
 
     def cleanup(self) -> None:
+        if self.loop is not None and self.loop.knows_v:
+            self._last_v = self.loop.v
         self.loop = None
         self._diagnose()
 
@@ -208,10 +237,13 @@ class ControllerNode(ManagedNode):
 
     def _conditions_of_start(self) -> list[Callable[[], bool]]:
         """What has to be there before plant_output is listened to, for that starts the loop."""
+        # Whoever commands the actuator already has to be found first; simulated time hurts nobody.
+        alone: list[Callable[[], bool]] = [] if self._lockstep else [lambda: self._rivals.settled]
         wanted = max(self.settings.integer('wait_for_subscribers'), int(self._lockstep))
         if not wanted:
-            return []
+            return alone
         return [
+            *alone,
             lambda: self._io.listeners >= wanted,
             # Beside the driver, those who listen want to hear everything.
             lambda: min(self._signals.listeners, self._estimates.listeners) >= wanted - 1,
@@ -222,6 +254,7 @@ class ControllerNode(ManagedNode):
     def _listen_to_driver(self) -> None:
         # Whoever is activated twice before everybody is there has two that wait.
         if self._driver is None:
+            self._rivals.look()
             kept = max(KEPT_S / self.settings.real('sample_period'), KEPT_OUTPUTS)
             self._driver = self._io.listen(self._on_output, round(min(kept, DEPTH)))
             emit('ready')
@@ -242,7 +275,7 @@ class ControllerNode(ManagedNode):
 
     def _on_applied_control(self, message: Float64, info: dict[str, Any]) -> None:
         if self.loop is not None:
-            self.loop.take_applied(message.data, info['source_timestamp'])
+            self.loop.take_applied(message.data, self._io.stamp_ns(info))
 
     def _on_output(self, output: Output) -> None:
         if self._reports is not None:
@@ -254,6 +287,8 @@ class ControllerNode(ManagedNode):
         if self._lockstep:
             self._outputs.append(output)
             self._pair()
+            return
+        if loop.begins and not loop.standing_down and not self._may_begin(loop, output):
             return
         was_silent = loop.silent
         step = loop.answer(output)
@@ -269,6 +304,32 @@ class ControllerNode(ManagedNode):
         if self._behind % PUT_OFF == 0:
             loop.core.refine()
         self._follow_up(loop, step, was_silent)
+
+    def _may_begin(self, loop: ControlLoop, output: Output) -> bool:
+        """Whether it is known from which v the first command goes on, or waiting is in vain."""
+        if self._io.is_simulated:
+            return True
+        if missing := missing_limits(self._live.parameters):
+            self._warn_once(
+                f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
+                'bears: set them'
+            )
+        if loop.learn_v(output.stamp_ns):
+            return True
+        reported = self._reports is not None and self._reports.publishers > 0
+        self._unanswered += 1
+        if reported and self._unanswered <= AWAITED_REPORTS:
+            return False
+        self._warn_once(
+            'nobody says which v acts now, so the first command goes on from 0: publish '
+            f'{topics.APPLIED_CONTROL}, or set control.initial'
+        )
+        return True
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            self.log.warning(text)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
@@ -295,23 +356,54 @@ class ControllerNode(ManagedNode):
             float(e.status), sample, loop.statistics.latencies[-1],
         ))
         self._estimates.publish((
-            e.m, e.c_r, e.c_l, e.f, e.std_m, e.std_c_r, e.std_c_l, nan, sample,
+            e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample,
         ))
+
+    def _check_change(self, p: Parameters) -> None:
+        """Raise ParameterError for values that the running loop cannot take up."""
+        build_controller(p)
+        changes = p[NOISE] != self._live.parameters[NOISE]
+        if self.loop is not None and changes and not self.loop.takes_up_noise:
+            raise ParameterError(
+                NOISE, p[NOISE], f'is not taken up live by {p.word("estimator.law")}',
+                'clean the node up, set it, and configure again',
+            )
 
     def _take_up(self, p: Parameters) -> None:
         before, self.settings = self.settings, p
         if self.loop is not None:
             self.loop.take_up(p)
-            return
-        self._saver.file = p.word('estimates.file')
-        if p['sample_period'] != before['sample_period']:
-            self._set_up(p, from_zero=False)
+        else:
+            self._saver.file = p.word('estimates.file')
+            if p['sample_period'] != before['sample_period']:
+                self._set_up(p, from_zero=False)
+        self._mind_rivals()
 
     def _set_up(self, p: Parameters, from_zero: bool) -> None:
         """Take up what follows from the sample period."""
         period = p.real('sample_period')
         self._give_way, self._period_ns = GIVE_WAY * period, period * 1e9
         self._counter = SampleCounter(period, from_zero)
+
+    def _mind_rivals(self) -> None:
+        """Stand down or command again, as on_rival says, and tell of it."""
+        loop, found = self.loop, self._rivals.found
+        on_rival = self._live.parameters.word('on_rival')
+        stand_down = on_rival == 'stand_down' and not self._rivals.came_first
+        if loop is not None and stand_down != loop.standing_down:
+            if stand_down:
+                self._end_ramp()
+                loop.stand_down()
+                self._commands_of_rivals = self._io.listen_to_commands(loop.hear_other)
+            else:
+                assert self._commands_of_rivals is not None
+                self.destroy_subscription(self._commands_of_rivals)
+                loop.resume()
+        if found != self._told_rivals:
+            self._told_rivals = found
+            if not found:
+                self.log.info(f'nobody else publishes {self._rivals.topic} any more')
+        self._diagnose()
 
     def _look_for_silence(self) -> None:
         loop = self.loop
@@ -365,12 +457,15 @@ class ControllerNode(ManagedNode):
         values = values_of(loop)
         if not self.active:
             text = f'inactive: no {self._io.topics.control} is published'
-            self._diagnostics.publish(Finding(Level.OK, 'inactive', text), values)
+            self._diagnostics.publish(
+                Finding(Level.OK, 'inactive', text), {**values, **self._rivals.claim}
+            )
             return
         findings, details = self._diagnosis.findings(
-            loop, self._live.parameters, self._reference_at
+            loop, self._live.parameters, self._reference_at,
+            tuple(rival.name for rival in self._rivals.found),
         )
-        self._diagnostics.publish(worst(findings), {**details, **values})
+        self._diagnostics.publish(worst(findings), {**details, **values, **self._rivals.claim})
 
 
 def main(args: list[str] | None = None) -> int:

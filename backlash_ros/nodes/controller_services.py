@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
-from typing import Protocol
+from concurrent.futures import Future as Writing
+from typing import Protocol, cast
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.estimation.storage import worth_saving
@@ -20,7 +22,7 @@ class Served(Protocol):
 
     loop: ControlLoop | None
 
-    def save_estimates(self) -> Future[str]:
+    def save_estimates(self) -> Writing[str]:
         """Begin to save the estimates; the result says why it failed, empty if it did not."""
 
     @property
@@ -63,7 +65,7 @@ def offer_services(node: Node, served: Served) -> None:
         when_configured(response, renew)
         return response
 
-    def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         loop = served.loop
         if loop is None:
             response.message = UNCONFIGURED
@@ -73,8 +75,12 @@ def offer_services(node: Node, served: Served) -> None:
         elif not worth_saving(loop.estimate):
             response.message = 'nothing was learned yet'
         else:
-            # Samples that come meanwhile wait; rclpy has no way to answer later.
-            why = served.save_estimates().result()
+            # The loop goes on while the disk takes its time.
+            written: Future = Future()
+            saved = served.save_estimates()
+            saved.add_done_callback(lambda _: written.set_result(None))
+            await written
+            why = saved.result()
             response.success = not why
             response.message = why or f'saved in {served.estimates_file}'
         return response
@@ -82,5 +88,9 @@ def offer_services(node: Node, served: Served) -> None:
     node.create_service(SetBool, '~/freeze_adaptation', freeze)
     node.create_service(SetBool, '~/enable_compensation', enable)
     node.create_service(Trigger, '~/reset_estimates', reset)
-    node.create_service(Trigger, '~/save_estimates', save)
+    # In a group of its own, so that it does not keep the others waiting.
+    node.create_service(
+        Trigger, '~/save_estimates', cast(Callable[..., Trigger.Response], save),
+        callback_group=MutuallyExclusiveCallbackGroup(),
+    )
 

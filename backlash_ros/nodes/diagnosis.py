@@ -12,11 +12,12 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import stated_deviations
 from backlash_ros.nodes.causes import Finding, Level, LoopFigures, Peer, findings_of
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.driver_io import DriverIo
 from backlash_ros.nodes.loop_statistics import Lately
-from backlash_ros.nodes.neighbours import publishers_of, rivals_of, subscribers_of
+from backlash_ros.nodes.neighbours import publishers_of, subscribers_of
 
 
 class Diagnosis:
@@ -35,17 +36,20 @@ class Diagnosis:
 
     def findings(
         self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
+        rivals: tuple[str, ...],
     ) -> tuple[list[Finding], dict[str, object]]:
         """What is to be said of an active loop, the likeliest cause first; details to it.
 
-        reference_at_s: when the newest y_m came, on the steady clock.
+        reference_at_s: when the newest y_m came, on the steady clock. rivals: who else publishes
+        the command.
         """
-        figures = self._figures(loop, p, reference_at_s)
+        figures = self._figures(loop, p, reference_at_s, rivals)
         findings = [*self._of_messages(p), *findings_of(figures)]
         return findings, _details(findings, figures)
 
     def _figures(
         self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
+        rivals: tuple[str, ...],
     ) -> LoopFigures:
         statistics, io, node = loop.statistics, self._io, self._node
         lately = self._lately.gained({
@@ -67,7 +71,8 @@ class Diagnosis:
             p.real('sample_period'),
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
             publishers_of(node, topics.REFERENCE, Float64, self._reference_qos),
-            subscribers_of(node, control, io.topics.control_type), rivals_of(node, control),
+            subscribers_of(node, control, io.topics.control_type), rivals,
+            standing_down=loop.standing_down,
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
             adapting=loop.adapting,
             silent_s=p.real('timeout.plant_output') if loop.silent else 0.0,
@@ -140,7 +145,7 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
     return {
         **counts_of(loop),
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
-        'std_m': e.std_m, 'std_c_r': e.std_c_r, 'std_c_l': e.std_c_l,
+        **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
         'learning': loop.adapting, 'compensating': loop.compensating,
         'using applied_control': loop.commands.uses_reports,
         # Above 1 the gap is crossed, without which nothing can be learned of it.

@@ -83,19 +83,27 @@ class DriverIo:
         """How many subscribers v has."""
         return 0 if self._publisher is None else self._publisher.get_subscription_count()
 
+    @property
+    def is_simulated(self) -> bool:
+        """Whether y comes from the plant of this package: no other one tells the truth."""
+        return self._node.count_publishers(topics.TRUTH) > 0
+
     def now_ns(self) -> int:
         """Time on the clock of the stamps."""
         # time.time_ns() is the system clock of ROS, without the detour.
         return self._node.get_clock().now().nanoseconds if self.simulated_time \
             else time.time_ns()
 
+    def stamp_ns(self, info: dict[str, Any]) -> int:
+        """When a message left, on the clock of the stamps."""
+        return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
+
     def listen(self, hear: Callable[[Output], None], depth: int) -> Subscription:
         """Call hear with every y."""
         def hear_number(message: Float64, info: dict[str, Any]) -> None:
             sent_ns = info['source_timestamp']
-            stamp_ns = self.now_ns() if self.simulated_time else sent_ns
             hear(Output(
-                message.data, stamp_ns, sent_ns, info['received_timestamp'],
+                message.data, self.stamp_ns(info), sent_ns, info['received_timestamp'],
                 info['publication_sequence_number'],
             ))
 
@@ -125,6 +133,21 @@ class DriverIo:
         self._message = to.control_type()
         self._publisher = publisher
         return publisher
+
+    def listen_to_commands(self, hear: Callable[[float], None]) -> Subscription:
+        """Call hear with every v that anybody sends to the driver."""
+        def hear_number(message: Float64) -> None:
+            hear(message.data)
+
+        def hear_numbers(message: Float64MultiArray) -> None:
+            if len(message.data) == 1:
+                hear(message.data[0])
+
+        several = self.topics.control_type is Float64MultiArray
+        return self._node.create_subscription(
+            self.topics.control_type, self.topics.control,
+            hear_numbers if several else hear_number, 1,
+        )
 
     def publish(self, v: float) -> None:
         """Send v to the driver."""

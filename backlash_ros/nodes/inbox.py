@@ -26,6 +26,11 @@ class Inbox:
             message_type, topic, lambda _: None, depth, callback_group=untyped()
         )
 
+    @property
+    def publishers(self) -> int:
+        """How many there are."""
+        return int(self._subscription.get_publisher_count())
+
     def take_all(self) -> Iterator[tuple[Any, dict[str, Any]]]:
         """Message and info (time stamps, number) of all that have arrived, oldest first."""
         while (taken := self._subscription.handle.take_message(self._type, False)) is not None:

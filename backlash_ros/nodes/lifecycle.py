@@ -55,8 +55,9 @@ class ManagedNode(LifecycleNodeMixin, ProcessNode):
         return self._tried(self.configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.active = True
-        return self._tried(self.activate)
+        result = self._tried(self.activate)
+        self.active = result == SUCCESS
+        return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         self.active = False

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf, nan
 
+import numpy as np
+
 REMEMBERED = 1000  # latencies that p50 and p99 are taken of
 FEWEST, MOST = 20, 50  # intervals that the rate of y is taken of
 WINDOW_S = 3.0  # what counts as lately
@@ -15,7 +17,7 @@ WINDOW_S = 3.0  # what counts as lately
 
 @dataclass
 class LoopStatistics:
-    """Counters since the start. latencies [s]: departure of y at the driver to that of v."""
+    """Counters since the start. latencies [s]: the newest ones, as topics.py defines them."""
 
     used: int = 0  # outputs that brought a command
     lost: int = 0  # outputs that never arrived
@@ -67,8 +69,7 @@ class LoopStatistics:
         """Latency that this share of the latest commands stayed below; nan without any."""
         if not self.latencies:
             return nan
-        ordered = sorted(self.latencies)
-        return ordered[min(int(share * len(ordered)), len(ordered) - 1)] * 1e3
+        return float(np.percentile(self.latencies, 100.0 * share)) * 1e3
 
     def intervals_s(self) -> tuple[float, float, float]:
         """Newest intervals between messages of y: low, mean and high [s]; nan while few.

@@ -35,15 +35,6 @@ def subscribers_of(node: Node, topic: str, message_type: type[Any]) -> TopicFigu
     return TopicFigures(topic, message_type.__name__, tuple(peers))
 
 
-def rivals_of(node: Node, topic: str) -> tuple[str, ...]:
-    """Names of the others who publish what the node publishes."""
-    names = [_name(info) for info in node.get_publishers_info_by_topic(topic)]
-    own = node.get_fully_qualified_name()
-    if own in names:
-        names.remove(own)  # once: another one of the same name is a rival all the same
-    return tuple(names)
-
-
 def _name(info: Any) -> str:
     # Programs without ROS have no node.
     if not info.node_name or info.node_name.startswith('_NODE_NAME_UNKNOWN'):

@@ -123,13 +123,16 @@ class PromptExecutor(SingleThreadedExecutor):
 
     def _serve_rest(self) -> bool:
         """Let rclpy serve one thing that is ready; return whether there was any."""
-        try:
-            handler, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
-        except (ShutdownException, TimeoutException):
-            return False
-        handler()
-        handler.result()  # raises what the callback has raised
-        return True
+        while True:
+            try:
+                handler, _, _ = self.wait_for_ready_callbacks(timeout_sec=0.0)
+            except (ShutdownException, TimeoutException):
+                return False
+            handler()
+            # What waits for something, as a service for the disk, is looked at again next time.
+            if handler.done():
+                handler.result()  # raises what the callback has raised
+                return True
 
 
 def _wants_info(callback: Callable[..., None]) -> bool:

@@ -65,6 +65,7 @@ class ProcessNode(Node):
         )
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.stopping = False
+        self.signals = 0  # SIGINT and SIGTERM that have come
         self.exit_code = DONE
         self.stop_request = self.create_guard_condition(self._stop)
 
@@ -197,13 +198,14 @@ class _SignalPipe:
     def stop_at_arrival(self, node: ProcessNode) -> None:
         """Ask the node to stop when a signal arrives or has arrived since the construction."""
         def wait() -> None:
-            os.read(self._read_end, 1)
-            # The node may be ending by itself.
-            with contextlib.suppress(InvalidHandle):
-                # An executor that is busy may overlook a single one.
-                while not node.stopping:
-                    node.stop_request.trigger()
-                    time.sleep(AGAIN_S)
+            while os.read(self._read_end, 1):
+                node.signals += 1
+                # The node may be ending by itself.
+                with contextlib.suppress(InvalidHandle):
+                    # An executor that is busy may overlook a single one.
+                    while not node.stopping:
+                        node.stop_request.trigger()
+                        time.sleep(AGAIN_S)
 
         threading.Thread(target=wait, daemon=True).start()
 

@@ -40,7 +40,7 @@ TRUE_BACKLASH = {'true_m': 'm', 'true_c_r': 'c_r', 'true_c_l': 'c_l'}
 class BagRun:
     """What a bag says about a run.
 
-    latency_s: arrival of y(k) to departure of v(k), shape (N,), nan where unknown.
+    latency_s: as topics.py defines it, shape (N,), nan where unknown.
     unpaired: samples left out because only one of signals and estimates was recorded. damage:
     what is wrong with the bag and the cure, empty if it is complete. notes: what else is in the
     bag, a sentence each.

@@ -13,7 +13,9 @@ EPILOG = """
 driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
 controller has seen as many samples as the duration holds. {axis} in it is the name of the axis;
 axes whose commands are the same share one driver. --driver none waits for a driver that you start
-yourself. The controller is stopped before the driver, which so hears its last command.
+yourself. The controller is stopped before the driver, which so hears its last command. As a driver
+moves something real, control.min, control.max and control.rate_max have to be set, or --unlimited
+given.
 
 axes: the parameter axes, in the section /bringup of the file, lists names; each gets nodes of its
 own in the namespace of that name and a folder DIR/NAME. Values stand under /**, /**/NODE,
@@ -50,6 +52,10 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         '--driver', metavar='COMMAND',
         help='start this command instead of the simulated plant; none: it is started elsewhere',
+    )
+    parser.add_argument(
+        '--unlimited', action='store_true',
+        help='let a driver run without control.min, control.max and control.rate_max',
     )
     parser.add_argument(
         '--lockstep', action='store_true',

@@ -33,6 +33,7 @@ from backlash_ros.tools.command_line import number_of_samples
 from backlash_ros.tools.configuration import effective_parameters
 from backlash_ros.tools.errors import BrokenOffError
 from backlash_ros.tools.operation_count import array_operations, scalar_operations
+from backlash_ros.tools.results import result_directory
 from backlash_ros.tools.simulation import run_loop
 
 Array = NDArray[np.float64]
@@ -88,7 +89,6 @@ def _parser() -> argparse.ArgumentParser:
     command_line.add_common_options(parser)
     parser.add_argument('--duration', type=float, default=10.0, metavar='SECONDS',
                         help='length of each run (default: 10)')
-    parser.set_defaults(out=Path('docs'))
     return parser
 
 
@@ -103,7 +103,8 @@ def _compare(args: Sequence[str] | None) -> None:
     from backlash_ros.tools.comparison_report import comparison_document, draw_comparison
     from backlash_ros.tools.drawing import png
     print(command_line.format_table(HEADER, [row(result) for result in results]))
-    document, figure = options.out / DOCUMENT, options.out / FIGURE
+    out = result_directory(options.out)
+    document, figure = out / DOCUMENT, out / FIGURE
     figure.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(figure, png(draw_comparison(results)))
     write_atomically(document, comparison_document(scenario, results, FIGURE.as_posix()))

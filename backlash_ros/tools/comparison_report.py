@@ -73,7 +73,7 @@ def comparison_document(
         f'Scenario: the plant of the configuration, m = {scenario.real("backlash.m"):g}, '
         f'c_r = {scenario.real("backlash.c_r"):g}, c_l = {scenario.real("backlash.c_l"):g}, '
         f'{scenario.word("waveform")} at {scenario.real("frequency"):g} rad/s, noise on y with '
-        f'standard deviation {noise:g}. Written by `compare`; do not edit.', '',
+        f'standard deviation {noise:g}. Written by `compare --out docs`; do not edit.', '',
         "- In the paper's structure y_m sets u_d, elsewhere y follows y_m scaled by |G| at its "
         'frequency: every loop asks for about the same motion.',
         '- Control error: RMS of u - u_d over the last second. Tracking error: relative RMS of '

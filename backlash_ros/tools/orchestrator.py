@@ -33,6 +33,7 @@ from backlash_ros.tools.run_plan import (
     AxisPlan,
     RunPlan,
     check_driver,
+    check_limits,
     plan_processes,
 )
 from backlash_ros.tools.supervision import Run, StopRequests, complain
@@ -49,6 +50,8 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     if len(names) > MOST_AXES:
         raise InputError(f'{len(names)} axes are too many for one machine: at most {MOST_AXES}')
     parameters = {name: _parameters(configuration, name, options) for name in names}
+    if options.unlimited and not any(values.word(DRIVER) for values in parameters.values()):
+        raise InputError('--unlimited is about a driver: give --driver as well')
     _check_files(parameters)
     for name, values in parameters.items():
         print_warnings(f'bringup: {name}' if name else 'bringup', values)
@@ -86,6 +89,8 @@ def _parameters(
         if options.driver is not None:
             changes[DRIVER] = options.driver
         parameters = check_driver(axis, parameters.replaced(changes))
+        if parameters.word(DRIVER) and not options.unlimited:
+            check_limits(parameters)
         if parameters.word('bag'):
             raise ParameterError(
                 'bag', parameters.word('bag'), 'is made by bringup', 'choose its folder with --out'

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters import Parameters, missing_limits
 from backlash_ros.tools import processes
 from backlash_ros.tools.processes import ProcessPlan
 from backlash_ros.tools.results import CONFIG
@@ -111,6 +111,16 @@ def check_driver(axis: str, parameters: Parameters) -> Parameters:
     if AXIS_MARK in text and not axis:
         raise ParameterError(DRIVER, text, 'names an axis', 'list the axes in the parameter axes')
     return parameters.replaced({DRIVER: text.replace(AXIS_MARK, axis)})
+
+
+def check_limits(parameters: Parameters) -> None:
+    """Raise ParameterError where nothing limits v."""
+    missing = missing_limits(parameters)
+    if missing:
+        raise ParameterError(
+            missing[0], parameters.real(missing[0]), 'is no limit, and a driver moves an actuator',
+            f'set {", ".join(missing)}, or give --unlimited',
+        )
 
 
 def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]:

@@ -13,8 +13,11 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.files import write_atomically
 
 VERSION = 1  # of the file format
+LAW, FIXED = 'estimator.law', 'fixed'
+WITHOUT_DEVIATIONS = ('lms', 'printed', 'gradient')
 # What a saved estimate depends on; a file for anything else is refused.
 KEY = (
+    LAW,
     'sample_period', 'plant.numerator', 'plant.denominator', 'control.delay_samples',
     'estimator.bounds.m', 'estimator.bounds.c_r', 'estimator.bounds.c_l',
 )
@@ -22,8 +25,15 @@ NEEDED, DEVIATIONS = ('m', 'c_r', 'c_l', 'f'), ('std_m', 'std_c_r', 'std_c_l')
 
 
 def worth_saving(estimate: Estimate) -> bool:
-    """Whether it was learned; a first guess is not."""
-    return estimate.learned or estimate.status == Status.TRACKING
+    """Whether it was learned; a first guess is not, nor are constants that were given."""
+    return not was_given(estimate) and (
+        estimate.learned or estimate.status == Status.TRACKING
+    )
+
+
+def was_given(estimate: Estimate) -> bool:
+    """Whether the constants are taken as they are: no law that learns is sure of them."""
+    return estimate.std_m == estimate.std_c_r == estimate.std_c_l == 0.0
 
 
 def save_estimate(path: Path, estimate: Estimate, p: Parameters) -> None:
@@ -40,7 +50,9 @@ def save_estimate(path: Path, estimate: Estimate, p: Parameters) -> None:
 def load_estimate(p: Parameters) -> Estimate | None:
     """What estimates.file holds, None where it is not to be loaded or not there yet.
 
-    Raises ParameterError for a file that is broken or belongs to another plant.
+    Raises ParameterError for a file that is broken or belongs to another plant or law. The law
+    `fixed` takes what any other one has learned. Files of the time before the law was saved serve
+    the laws that know deviations if they hold some.
     """
     if not p.flag('estimates.load'):
         return None
@@ -68,7 +80,22 @@ def load_estimate(p: Parameters) -> Estimate | None:
         raise ParameterError(
             'estimates.file', name, f'has format {version!r}, not {VERSION}', 'delete it'
         )
+    estimate = Estimate(m, c_r, c_l, f, std_m, std_c_r, std_c_l)
+    if was_given(estimate):
+        raise ParameterError(
+            'estimates.file', name, 'holds constants that were given, not learned', 'delete it'
+        )
+    law = p.word(LAW)
+    if isinstance(key, dict) and LAW not in key and law != FIXED:
+        if law in WITHOUT_DEVIATIONS or not estimate.learned:
+            raise ParameterError(
+                'estimates.file', name, 'does not say by which law it was learned',
+                'delete it or set estimates.load: false',
+            )
+        key = {**key, LAW: law}
     for part, value in _key(p).items():
+        if part == LAW and law == FIXED:
+            continue
         if not isinstance(key, dict) or key.get(part) != value:
             found = key.get(part) if isinstance(key, dict) else None
             raise ParameterError(
@@ -76,7 +103,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
                 f'was learned with {part}={found!r}, which is now {value!r}',
                 'name another file or set estimates.load: false',
             )
-    return _checked(name, Estimate(m, c_r, c_l, f, std_m, std_c_r, std_c_l), p)
+    return _checked(name, estimate, p)
 
 
 def _checked(name: str, estimate: Estimate, p: Parameters) -> Estimate:

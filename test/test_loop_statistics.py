@@ -1,0 +1,17 @@
+"""One definition of latency: what /diagnostics says is what a report says of the same samples."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from backlash_ros.nodes.loop_statistics import LoopStatistics
+from backlash_ros.tools.results import _latency_ms
+
+
+def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> None:
+    latencies = np.random.default_rng(3).gamma(2.0, 1e-4, 40)
+    statistics = LoopStatistics()
+    for latency in latencies:
+        statistics.note(0.0, False, float(latency))
+    reported = _latency_ms(latencies)
+    assert reported == {'p50': statistics.latency_ms(0.5), 'p99': statistics.latency_ms(0.99)}
