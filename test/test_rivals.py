@@ -40,7 +40,12 @@ class Stage:
         values = {
             'estimator.output_noise_std': NOISE, 'control.rate_max': RATE_MAX, **parameters,
         }
-        return self.world.start('controller', values, '-r', f'__node:={name}')
+        # The topics of both keep the names under which the driver listens.
+        same = [
+            part for topic in (topics.ESTIMATES, topics.SIGNALS)
+            for part in ('-r', f'{topics.of_node(topic)}:={topic}')
+        ]
+        return self.world.start('controller', values, '-r', f'__node:={name}', *same)
 
     def status(self, name: str) -> DiagnosticStatus | None:
         """The newest that a controller has said."""
