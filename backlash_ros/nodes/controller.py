@@ -452,7 +452,9 @@ class ControllerNode(ManagedNode):
     def _diagnose(self) -> None:
         loop = self.loop
         if loop is None:
-            self._diagnostics.publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), {})
+            self._diagnostics.publish(
+                Finding(Level.OK, 'unconfigured', 'unconfigured'), self._rivals.claim
+            )
             return
         values = values_of(loop)
         if not self.active:
