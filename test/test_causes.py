@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
-from math import nan
+from math import inf, nan
 from typing import Any
 
 import pytest
@@ -123,6 +123,25 @@ def test_what_is_known_goes_before_the_model(
 def test_the_model_is_blamed_where_nothing_else_is_known() -> None:
     assert first(INCONSISTENT) == STATES[Status.INCONSISTENT]
     assert worst_level(INCONSISTENT) == Level.ERROR
+
+
+@pytest.mark.parametrize(('changes', 'text'), [
+    ({'unexplained': 0.234},
+     '23.4 % of m*gap of the motion of u fits no G and no backlash: check G(z), load, sensor'),
+    ({'wrong_sign': True, 'unexplained': 0.3},
+     'plant_output moves against v: reverse it, or the sign of plant.numerator'),
+    # What noise leaves, or what has no gap to be compared with, is no reason.
+    ({'unexplained': 0.01}, STATES[Status.INCONSISTENT].text),
+    ({'unexplained': inf}, STATES[Status.INCONSISTENT].text),
+])
+def test_a_contradiction_is_named_by_what_the_fit_has_found(
+    changes: dict[str, Any], text: str,
+) -> None:
+    found = first(replace(INCONSISTENT, **changes))
+    assert found == STATES[Status.INCONSISTENT]._replace(text=text)
+    assert len(text) <= LONGEST_TEXT
+    # An estimate that holds is not doubted.
+    assert findings_of(replace(WELL, **changes)) == [STATES[Status.TRACKING]]
 
 
 @pytest.mark.parametrize('changes', [

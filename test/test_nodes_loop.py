@@ -19,6 +19,7 @@ from std_msgs.msg import Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools.bag_reading import read_bag
 
 NODES = ('recorder', 'controller', 'reference', 'plant')
 SIGNAL = {label: i for i, label in enumerate(topics.SIGNAL_LABELS)}
@@ -96,6 +97,8 @@ def test_lockstep_run_equals_the_simulation_in_one_process_to_the_last_bit(
             assert np.array_equal(column, run.column(name), equal_nan=True), name
     estimates = [run.column(name)[-1] for name in ('m', 'c_r', 'c_l')]
     assert estimates == pytest.approx([1.3, 3.0, -3.0], rel=0.01)
+    assert repr(read_bag(bag).run.learned) == repr(run.learned)
+    assert run.learned is not None
     assert closed['missed'] == 0
     assert_complete(recorded, run.column('y'), run.column('v'), samples)
     assert closed['messages'][f'/{topics.CONTROL}'] == run.samples

@@ -6,10 +6,11 @@ import base64
 import itertools
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import nan
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -20,10 +21,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
 from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import analysis, figures, report
 from backlash_ros.tools.bag_reading import read_bag
+from backlash_ros.tools.bag_sections import Span
 from backlash_ros.tools.configuration import write_config
 from backlash_ros.tools.errors import InputError
 from backlash_ros.tools.results import summarise, write_run, write_summary
@@ -65,7 +68,7 @@ def rows_of(
 def write_bag(
     path: Path, run: RunRecord, storage: StoragePlugin = StoragePlugin.MCAP, *,
     truth: bool = True, lost: frozenset[int] = frozenset(), namespace: str = '',
-    unpaired: frozenset[int] = frozenset(),
+    unpaired: frozenset[int] = frozenset(), models: Mapping[int, bytes] = MappingProxyType({}),
 ) -> Path:
     """Write a bag as the recorder does; the last sample has no truth, its v was never applied."""
     period_ns = round(run.sample_period * 1e9)
@@ -82,7 +85,24 @@ def write_bag(
                 f'/{namespace}{topic}', MULTI_ARRAY, typestore=TYPES)
             for k, raw in rows_of(run, labels, skipped, prefix):
                 writer.write(connection, 10**18 + k * period_ns, raw)
+        if models:
+            connection = writer.add_connection(
+                f'/{namespace}{topics.MODEL}', MULTI_ARRAY, typestore=TYPES)
+            for k, raw in models.items():
+                writer.write(connection, 10**18 + k * period_ns, raw)
     return path
+
+
+def believed(denominator: list[float], tail: int = 0) -> bytes:
+    """A message of controller/model; tail: numbers at its end that are missing."""
+    fields = LearnedModel((0.1,), tuple(denominator), 1, (0.1,) * 5, 1.2, 0.03).fields()
+    dimension = TYPES.types['std_msgs/msg/MultiArrayDimension']
+    layout = TYPES.types['std_msgs/msg/MultiArrayLayout'](dim=[
+        dimension(label=label, size=len(values), stride=0) for label, values in fields.items()
+    ], data_offset=0)
+    data = [value for values in fields.values() for value in values]
+    message = TYPES.types[MULTI_ARRAY](layout=layout, data=np.array(data[:len(data) - tail]))
+    return bytes(TYPES.serialize_cdr(message, MULTI_ARRAY))
 
 
 @pytest.fixture(scope='module')
@@ -127,6 +147,40 @@ def test_summary_of_a_bag_tells_latency_losses_and_truth(page: Path) -> None:
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 0.4, 'p99': 0.4})
     assert (summary['samples'], summary['lost_samples']) == (119, 1)
     assert summary['truth'] == {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
+
+
+def test_summary_of_a_bag_tells_the_newest_model(run: RunRecord, tmp_path: Path) -> None:
+    models = {5: believed([1.0, -0.5]), 50: believed([1.0, -0.6, 0.2]), 70: believed([1.0, -0.7])}
+    bag = write_bag(tmp_path / 'bag', run, models=models)
+    found = read_bag(bag, run.sample_period).run
+    summary = summarise(found, None)
+    assert summary['model'] == {
+        'numerator': [0.1], 'denominator': [1.0, -0.7], 'delay_samples': 1,
+    }
+    assert (summary['noise_ratio'], summary['unexplained']) == (1.2, 0.03)
+    part = read_bag(bag, run.sample_period, Span(to_s=60 * run.sample_period)).run
+    assert part.learned is not None
+    assert part.learned.denominator == (1.0, -0.6, 0.2)
+    early = read_bag(bag, run.sample_period, Span(to_s=5 * run.sample_period)).run
+    assert early.learned is None
+
+
+@pytest.mark.parametrize('models', [{}, {5: believed([1.0, -0.5], tail=1)}])
+def test_bag_without_a_whole_model_is_read_all_the_same(
+    run: RunRecord, tmp_path: Path, models: dict[int, bytes],
+) -> None:
+    found = read_bag(write_bag(tmp_path / 'bag', run, models=models), run.sample_period).run
+    assert found.samples == run.samples
+    assert found.learned is None
+    assert summarise(found, None)['model'] is None
+
+
+def test_part_of_saved_results_knows_no_model_of_its_end(run: RunRecord, tmp_path: Path) -> None:
+    write_run(run, tmp_path)
+    whole = report.open_source(tmp_path / 'record.npz').run
+    assert whole.learned == run.learned or repr(whole.learned) == repr(run.learned)
+    assert report.open_source(tmp_path / 'record.npz', span=Span(to_s=0.5)).run.learned is None
+    assert report.open_source(tmp_path / 'record.npz', span=Span(0.5)).run.learned is not None
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from math import nan
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.files import write_atomically
@@ -20,7 +22,9 @@ from backlash_ros.tools.errors import InputError
 FIELDS = [
     'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'final', 'final_std',
     'truth', 'settling_time_s', 'control_error_rms', 'tracking_error_rms', 'loop_latency_ms',
+    'final_status', 'status_share', 'model', 'noise_ratio', 'unexplained',
 ]
+LEARNED = LearnedModel((0.1, 0.05), (1.0, -0.9), 1, (0.1, 0.2, 0.3, 0.4, nan), 1.1, 0.02)
 
 
 @pytest.fixture(scope='module')
@@ -111,6 +115,44 @@ def test_without_truth_nothing_is_said_to_have_settled(run: RunRecord) -> None:
     assert summary['truth'] == nothing
     assert summary['settling_time_s'] == nothing
     assert summary['control_error_rms'] is None
+
+
+def test_summary_tells_the_states_by_their_share(run: RunRecord) -> None:
+    rows = run.rows.copy()
+    codes = rows[:, COLUMNS.index('status')]
+    codes[:] = 1.0
+    codes[:len(codes) // 2] = 0.0
+    codes[-1] = 2.0
+    summary = results.summarise(RunRecord(rows, 0.01), None)
+    assert summary['final_status'] == 'not excited'
+    share = summary['status_share']
+    assert list(share) == ['acquiring', 'tracking', 'not excited', 'no data', 'inconsistent']
+    assert share['acquiring'] == len(codes) // 2 / len(codes)
+    assert share['not excited'] == 1 / len(codes)
+    assert sum(share.values()) == pytest.approx(1.0)
+    codes[:] = nan
+    unknown = results.summarise(RunRecord(rows, 0.01), None)
+    assert unknown['final_status'] is None
+    assert unknown['status_share'] is None
+
+
+def test_summary_tells_the_model_that_was_believed_at_the_end(run: RunRecord) -> None:
+    summary = results.summarise(replace(run, learned=LEARNED), None)
+    assert summary['model'] == {
+        'numerator': [0.1, 0.05], 'denominator': [1.0, -0.9], 'delay_samples': 1,
+    }
+    assert (summary['noise_ratio'], summary['unexplained']) == (1.1, 0.02)
+    unknown = results.summarise(replace(run, learned=None), None)
+    assert [unknown[name] for name in ('model', 'noise_ratio', 'unexplained')] == [None] * 3
+
+
+def test_record_keeps_what_was_believed(run: RunRecord, tmp_path: Path) -> None:
+    results.write_run(replace(run, learned=LEARNED), tmp_path)
+    again = results.read_record(tmp_path / 'record.npz').learned
+    assert again is not None
+    assert repr(again) == repr(LEARNED)
+    results.write_run(replace(run, learned=None), tmp_path)
+    assert results.read_record(tmp_path / 'record.npz').learned is None
 
 
 def test_latency_is_given_in_milliseconds_without_the_unknown(run: RunRecord) -> None:

@@ -8,24 +8,32 @@ from math import nan
 
 import numpy as np
 
-from backlash_ros.core.assembly import build_controller, build_plant, build_reference
+from backlash_ros.core.assembly import (
+    build_controller,
+    build_model,
+    build_plant,
+    build_reference,
+)
 from backlash_ros.core.controller import AdaptiveController
+from backlash_ros.core.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord, stated_deviations
 from backlash_ros.core.simulated_plant import SimulatedPlant
+from backlash_ros.core.transfer_function import TransferFunction
 
 
 @dataclass
 class ClosedLoop:
     """Controller, plant and reference stepped together; row k holds sample k.
 
-    lose: says of each sample whether y(k) is lost on the way.
+    lose: says of each sample whether y(k) is lost on the way. told: G(z) as the parameters have it.
     """
 
     controller: AdaptiveController
     plant: SimulatedPlant
     reference: Callable[[float], float]
     sample_period: float
+    told: TransferFunction
     lose: Callable[[], bool] = field(default=lambda: False)
 
     def run(
@@ -57,7 +65,10 @@ class ClosedLoop:
                 kept += 1
             if on_sample is not None:
                 on_sample(k)
-        return RunRecord(rows[:kept], self.sample_period, self.controller.lost_samples + lost)
+        return RunRecord(
+            rows[:kept], self.sample_period, self.controller.lost_samples + lost,
+            learned_model_of(self.controller.estimator, self.told),
+        )
 
 
 def build_closed_loop(p: Parameters) -> ClosedLoop:
@@ -66,5 +77,5 @@ def build_closed_loop(p: Parameters) -> ClosedLoop:
     rng = np.random.default_rng([p.integer('seed'), 1])
     return ClosedLoop(
         build_controller(p), build_plant(p), build_reference(p),
-        p.real('sample_period'), lambda: loss > 0.0 and float(rng.random()) < loss,
+        p.real('sample_period'), build_model(p), lambda: loss > 0.0 and float(rng.random()) < loss,
     )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.estimation.storage import was_given
+from backlash_ros.core.learned_model import LearnedModel
 
 COLUMNS = (
     't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
@@ -32,11 +33,13 @@ class RunRecord:
 
     t [s] counts sample periods from the first one. u and true_* are nan without a simulation.
     Estimates stand as they were when v was computed. lost_samples: outputs that never arrived.
+    learned: what the controller believed of G at the end, None where it is not known.
     """
 
     rows: NDArray[np.float64]
     sample_period: float
     lost_samples: int = 0
+    learned: LearnedModel | None = None
 
     def column(self, name: str) -> NDArray[np.float64]:
         """One signal by name, shape (N,)."""

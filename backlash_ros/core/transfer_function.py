@@ -60,6 +60,17 @@ class TransferFunction:
         value = np.polyval(self.numerator, z) / np.polyval(self.denominator, z)
         return np.asarray(value, dtype=np.complex128)
 
+    def without_delay(self) -> tuple[list[float], list[float], int]:
+        """Numerator, denominator and delay [samples] of z^-delay numerator / denominator.
+
+        The whole delay, as far as the rest is still a G(z) that one can be told.
+        """
+        numerator = np.trim_zeros(self.numerator, 'f')
+        at_zero = len(self.denominator) - len(np.trim_zeros(self.denominator, 'b'))
+        delay = min(at_zero, self.delay - 1)
+        denominator = self.denominator[:len(self.denominator) - delay]
+        return numerator.tolist(), denominator.tolist(), delay
+
     def state_space(self) -> tuple[Array, Array, Array]:
         """Return A (n, n), B (n,), C (n,) of x(k+1) = A x + B u, y = C x in observer form.
 

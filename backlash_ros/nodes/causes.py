@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from typing import NamedTuple
 
 from backlash_ros.core.estimation.protocol import Status
@@ -15,6 +15,7 @@ RATE_TOLERANCE = 0.1
 # Share of late, lost or bad samples from which on the loop is told to suffer from them, and an
 # estimate that does not fit the data is put down to them.
 TROUBLE = 0.01
+UNEXPLAINED = 0.05  # share of m times the gap from which on unexplained motion is worth naming
 LIMITED = 0.5  # share of limited commands that leaves too little motion
 STILL_SAMPLES = 20  # equal values of y in a row, while v moves on
 # A contradiction between y and G(z) that lasts longer is not put down to late or lost samples [s].
@@ -84,6 +85,8 @@ class LoopFigures:
     standing_down: bool = False  # because of them
     status: Status | None = None  # None before the first command
     inconsistent_s: float = 0.0  # how long that status has been INCONSISTENT
+    unexplained: float = nan  # motion of u that no G and no backlash explains, over m times the gap
+    wrong_sign: bool = False  # whether y moves against v
     adapting: bool = True
     silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not
     on_timeout: str = 'hold'
@@ -159,7 +162,22 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
         )
     if not f.adapting and f.status != Status.INCONSISTENT:
         return HELD
-    return STATES[f.status]
+    return _contradiction(f) if f.status == Status.INCONSISTENT else STATES[f.status]
+
+
+def _contradiction(f: LoopFigures) -> Finding:
+    """What is known of why y does not follow from v."""
+    model = STATES[Status.INCONSISTENT]
+    if f.wrong_sign:
+        return model._replace(
+            text=f'{f.output.name} moves against v: reverse it, or the sign of plant.numerator'
+        )
+    if UNEXPLAINED <= f.unexplained < inf:
+        return model._replace(
+            text=f'{100.0 * f.unexplained:.3g} % of m*gap of the motion of u fits no G and no '
+            'backlash: check G(z), load, sensor'
+        )
+    return model
 
 
 def _unfit_peers(f: LoopFigures) -> list[Finding]:

@@ -8,13 +8,19 @@ from math import isfinite, nan
 
 import numpy as np
 
-from backlash_ros.core.assembly import build_controller, build_limits, build_structure
+from backlash_ros.core.assembly import (
+    build_controller,
+    build_limits,
+    build_model,
+    build_structure,
+)
 from backlash_ros.core.controller import ControlStep, plausible
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.last_command import last_commands
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.state_model import StateModel
 from backlash_ros.nodes.command_history import CommandHistory, report_use
 from backlash_ros.nodes.driver_io import Output
 from backlash_ros.nodes.loop_statistics import LoopStatistics
@@ -34,8 +40,9 @@ class ControlLoop:
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
     learned before. counter: goes on counting where another loop has ended. v: the newest command,
-    0 as long as nobody knows (knows_v) which one acts. silent: the driver was given up for the time
-    being. standing_down: another controller commands the actuator, so nothing is sent.
+    0 as long as nobody knows (knows_v) which one acts. told: G(z) as the parameters have it.
+    silent: the driver was given up for the time being. standing_down: another controller commands
+    the actuator, so nothing is sent.
     """
 
     def __init__(
@@ -57,6 +64,13 @@ class ControlLoop:
         self._anew = False  # whether sender or clock began anew since then
         self._begun = False  # whether the present core has taken a step
         self.core = build_controller(p, inherited)
+        self.told = build_model(p)
+
+    @property
+    def learned_model(self) -> StateModel | None:
+        """The G that the law has come to, None for a law that learns none."""
+        estimator = self.core.estimator
+        return estimator.learned_model if isinstance(estimator, MovingHorizon) else None
 
     @property
     def estimate(self) -> Estimate:

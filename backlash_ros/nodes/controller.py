@@ -42,6 +42,7 @@ from backlash_ros.nodes.messages import (
     LabelledArrayPublisher,
     stamp_ns_of,
 )
+from backlash_ros.nodes.model_publisher import ModelPublisher
 from backlash_ros.nodes.rivals import RivalWatch
 from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import run
@@ -53,6 +54,7 @@ KEPT_S, KEPT_OUTPUTS = 0.1, 20
 # After the command the controller gives way for this share of a period: a busy processor is where
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
+REFINE_SHARE = 0.3  # of a sample period for fits, after the command
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
 AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
 LOOK_S = 0.05  # between two looks for a silent plant_output or reference
@@ -103,6 +105,7 @@ class ControllerNode(ManagedNode):
         self._estimates = LabelledArrayPublisher(
             self, topics.of_node(topics.ESTIMATES), topics.ESTIMATE_LABELS
         )
+        self._model = ModelPublisher(self)
         self._diagnostics = DiagnosticsPublisher(
             self, p.word('io.joint') or self._io.publisher.topic_name
         )
@@ -161,6 +164,7 @@ class ControllerNode(ManagedNode):
         self.loop = ControlLoop(
             p, self._io.publish, self._io.now_ns, inherited, self._counter, self._v_at_start(p)
         )
+        self._model.publish(self.loop)
         if inherited is not None:
             self.log.info(
                 f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
@@ -199,6 +203,7 @@ class ControllerNode(ManagedNode):
             if not loop.standing_down:
                 self._send_last_commands(loop, p.word('on_stop'), p.real('timeout.ramp'))
             self._save(loop)
+            self._model.publish(loop)
         self._rivals.end()
         self._diagnose()
 
@@ -302,7 +307,7 @@ class ControllerNode(ManagedNode):
         if not behind:
             time.sleep(self._give_way)
         if self._behind % PUT_OFF == 0:
-            loop.core.refine()
+            loop.core.refine(self._refine_budget_s)
         self._follow_up(loop, step, was_silent)
 
     def _may_begin(self, loop: ControlLoop, output: Output) -> bool:
@@ -344,6 +349,7 @@ class ControllerNode(ManagedNode):
     def _follow_up(self, loop: ControlLoop, step: ControlStep, was_silent: bool) -> None:
         """Tell of a step."""
         self._publish_rows(loop, step)
+        self._model.follow(loop, self.settings.real('sample_period'))
         if was_silent or step.estimate.status != self._told:
             self._told = step.estimate.status
             self._diagnose()
@@ -383,6 +389,7 @@ class ControllerNode(ManagedNode):
         """Take up what follows from the sample period."""
         period = p.real('sample_period')
         self._give_way, self._period_ns = GIVE_WAY * period, period * 1e9
+        self._refine_budget_s = REFINE_SHARE * period
         self._counter = SampleCounter(period, from_zero)
 
     def _mind_rivals(self) -> None:

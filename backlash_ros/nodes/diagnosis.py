@@ -5,14 +5,17 @@ from __future__ import annotations
 import time
 from math import isfinite, isnan, nan
 
+import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
+from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import stated_deviations
+from backlash_ros.core.transfer_function import TransferFunction
 from backlash_ros.nodes.causes import Finding, Level, LoopFigures, Peer, findings_of
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.driver_io import DriverIo
@@ -67,6 +70,9 @@ class Diagnosis:
         overdue = reference_at_s is not None and not p.flag('lockstep') \
             and 0.0 < timeout < time.monotonic() - reference_at_s
         control = io.topics.control
+        estimator = loop.core.estimator
+        unexplained, wrong_sign = (estimator.unexplained, estimator.wrong_sign) \
+            if isinstance(estimator, MovingHorizon) else (nan, False)
         return LoopFigures(
             p.real('sample_period'),
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
@@ -74,7 +80,7 @@ class Diagnosis:
             subscribers_of(node, control, io.topics.control_type), rivals,
             standing_down=loop.standing_down,
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
-            adapting=loop.adapting,
+            unexplained=unexplained, wrong_sign=wrong_sign, adapting=loop.adapting,
             silent_s=p.real('timeout.plant_output') if loop.silent else 0.0,
             on_timeout=p.word('on_timeout'),
             referred=isfinite(loop.y_m),
@@ -144,6 +150,8 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
     _, mean_s, _ = statistics.intervals_s()
     return {
         **counts_of(loop),
+        'state': e.status.word,
+        **_of_the_fit(loop),
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
         **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
         'learning': loop.adapting, 'compensating': loop.compensating,
@@ -154,3 +162,24 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
         'latency p50 [ms]': statistics.latency_ms(0.5),
         'latency p99 [ms]': statistics.latency_ms(0.99),
     }
+
+
+def _of_the_fit(loop: ControlLoop) -> dict[str, object]:
+    """What the default law knows of its own fit."""
+    estimator = loop.core.estimator
+    if not isinstance(estimator, MovingHorizon):
+        return {}
+    moved = estimator.learned_model.transfer_function
+    return {
+        'noise: learned / told': estimator.noise_ratio,
+        'unexplained motion / (m * gap)': estimator.unexplained,
+        'samples that wait for a fit': estimator.waiting,
+        'outliers': estimator.outliers,
+        'failed fits': estimator.failed_fits,
+        'G(z)': 'as told' if _same(moved, loop.told) else 'learned',
+    }
+
+
+def _same(a: TransferFunction, b: TransferFunction) -> bool:
+    return np.array_equal(a.numerator, b.numerator) \
+        and np.array_equal(a.denominator, b.denominator)

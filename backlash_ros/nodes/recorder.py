@@ -30,7 +30,7 @@ from backlash_ros.nodes.bag import Bag, RecordingError
 from backlash_ros.nodes.causes import Finding, Level
 from backlash_ros.nodes.driver_io import STYLES, output_qos
 from backlash_ros.nodes.events import ENABLED, emit
-from backlash_ros.nodes.messages import DiagnosticsPublisher, stamp_ns_of
+from backlash_ros.nodes.messages import KEPT, DiagnosticsPublisher, stamp_ns_of
 from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.sample_counter import UNNUMBERED
 from backlash_ros.nodes.spin import BAD_INPUT, FAILED, ProcessNode, run
@@ -47,7 +47,8 @@ IDLE_SPINS = 5  # without a message, timers being served in between
 OF_THE_LOOP: dict[str, type[Any]] = {
     topics.REFERENCE: Float64, topics.APPLIED_CONTROL: Float64,
     topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
-    topics.TRUTH: Float64MultiArray, topics.DIAGNOSTICS: DiagnosticArray,
+    topics.MODEL: Float64MultiArray, topics.TRUTH: Float64MultiArray,
+    topics.DIAGNOSTICS: DiagnosticArray,
 }
 NEEDED_PUBLISHERS = (topics.REFERENCE, topics.ESTIMATES, topics.SIGNALS)
 
@@ -145,7 +146,9 @@ class RecorderNode(ProcessNode):
         wanted = (*NEEDED_PUBLISHERS, self._driver.control)
         recorded = {**OF_THE_LOOP, self._driver.control: self._driver.control_type}
         for topic, message_type in recorded.items():
-            subscription = self._record(topic, message_type, DEPTH)
+            # A G that was learned before this recorder came belongs into the bag as well.
+            qos: QoSProfile | int = KEPT if topic == topics.MODEL else DEPTH
+            subscription = self._record(topic, message_type, qos)
             if p.flag('wait_for_publishers') and topic in wanted:
                 needed.append(subscription)
         if self._lockstep:

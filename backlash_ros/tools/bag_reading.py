@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from backlash_ros import topics
 from backlash_ros.bags.content import CURE, BagError, is_being_written
 from backlash_ros.bags.remains import open_remains, visible_damage
+from backlash_ros.core.learned_model import LearnedModel, from_fields
 from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.bag_sections import WHOLE, Span, Table, choose, choose_namespace
 from backlash_ros.tools.errors import InputError
@@ -78,9 +79,10 @@ def read_bag(
     """
     content = _read_content(path)
     try:
-        tables, note = _find_tables(path, content, axis)
+        tables, note, models = _find_tables(path, content, axis)
     except InputError as error:
         raise InputError(f'{error}; {content.damage}' if content.damage else str(error)) from None
+    begin_ns = float(tables[topics.SIGNALS].stamps[0])
     signals, others, restart = choose(
         tables[topics.SIGNALS],
         {topic: table for topic, table in tables.items() if topic != topics.SIGNALS}, span,
@@ -105,9 +107,10 @@ def read_bag(
     heard = np.union1d(signals.sample, estimates.sample)
     lost = int(heard[-1] - heard[0]) + 1 - heard.size
     latency = signals.columns['latency_s'][of_signals]
+    learned = _newest_model(models, signals.stamps, begin_ns + span.to_s * 1e9)
     return BagRun(
-        RunRecord(rows, sample_period, lost), latency, heard.size - count.size, content.damage,
-        tuple(text for text in (note, restart) if text),
+        RunRecord(rows, sample_period, lost, learned), latency, heard.size - count.size,
+        content.damage, tuple(text for text in (note, restart) if text),
     )
 
 
@@ -182,7 +185,7 @@ def _read_content(path: Path) -> _Content:
 
 
 def _is_array_topic(name: str) -> bool:
-    return any(f'/{name}'.endswith(f'/{topic}') for topic in LABELS)
+    return any(f'/{name}'.endswith(f'/{topic}') for topic in (*LABELS, topics.MODEL))
 
 
 def _read_complete(path: Path) -> _Content:
@@ -222,8 +225,30 @@ def _read_remains(path: Path, reason: str) -> _Content:
     return content
 
 
-def _find_tables(path: Path, content: _Content, axis: str) -> tuple[dict[str, Table], str]:
-    """The array topics of one axis, and what other axes there are."""
+def _newest_model(
+    messages: Sequence[tuple[int, Any]], stamps: NDArray[np.int64], end_ns: float,
+) -> LearnedModel | None:
+    """The last G that was published from the first of the stamps on and before end_ns.
+
+    One that is not complete is none.
+    """
+    within = [message for stamp, message in messages if stamps[0] <= stamp < end_ns]
+    if not within:
+        return None
+    newest, fields, first = within[-1], {}, 0
+    for dimension in newest.layout.dim:
+        fields[dimension.label] = newest.data[first:first + dimension.size].tolist()
+        first += dimension.size
+    try:
+        return from_fields(fields)
+    except (KeyError, IndexError, ValueError):
+        return None
+
+
+def _find_tables(
+    path: Path, content: _Content, axis: str,
+) -> tuple[dict[str, Table], str, list[tuple[int, Any]]]:
+    """The array topics of one axis, what other axes there are, and its models."""
     tables, about = {}, ''
     for topic, labels in LABELS.items():
         names = sorted(name for name in content.names if f'/{name}'.endswith(f'/{topic}'))
@@ -239,7 +264,9 @@ def _find_tables(path: Path, content: _Content, axis: str) -> tuple[dict[str, Ta
             heard = ', '.join(sorted(content.names)) or 'nothing'
             of_axis = f' of axis {axis}' if axis else ''
             raise InputError(f'{path}: holds no {topic}{of_axis}, only {heard}')
-    return tables, about
+    names = sorted(name for name in content.names if f'/{name}'.endswith(f'/{topics.MODEL}'))
+    name = choose_namespace(names, axis)[0] if names else ''
+    return tables, about, content.messages.get(name, [])
 
 
 def _tabulate(

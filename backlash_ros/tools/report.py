@@ -220,7 +220,9 @@ def _part(run: RunRecord, span: Span) -> RunRecord:
     if not len(rows):
         raise InputError('there is no sample between --from and --to')
     rows[:, COLUMNS.index('t')] -= rows[0, COLUMNS.index('t')]
-    return RunRecord(rows, run.sample_period, run.lost_samples)
+    # Of G it is known what was believed at the end.
+    learned = run.learned if t[-1] < span.to_s else None
+    return RunRecord(rows, run.sample_period, run.lost_samples, learned)
 
 
 def _parameters_beside(path: Path) -> Parameters | None:

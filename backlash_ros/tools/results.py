@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.learned_model import LearnedModel, from_fields
 from backlash_ros.core.metrics import (
     control_error_rms,
     delayed_tracking_error_rms,
@@ -29,6 +31,7 @@ from backlash_ros.tools.errors import InputError
 RESULTS = Path('results')
 LATEST = 'latest'
 SAMPLES, RECORD, SUMMARY, CONFIG = 'samples.csv', 'record.npz', 'summary.json', 'parameters.yaml'
+LEARNED = 'learned.'  # before the names of what record.npz has of G
 SAMPLE_COLUMNS = ('t', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f')
 BACKLASH = ('m', 'c_r', 'c_l')
 
@@ -94,6 +97,34 @@ def summarise(
             run, reference_delay(parameters), float(t[run.samples // 2])
         ),
         'loop_latency_ms': _latency_ms(latency_s),
+        'final_status': _word(last['status']),
+        'status_share': _status_share(run.column('status')),
+        **_learned(run.learned),
+    }
+
+
+def _word(status: float) -> str | None:
+    """The word for a status code, None for none."""
+    return Status(int(status)).word if status in set(Status) else None
+
+
+def _status_share(status: NDArray[np.float64]) -> dict[str, float] | None:
+    """Share of the samples in each status, None where it was not recorded."""
+    known = status[np.isfinite(status)]
+    if known.size == 0:
+        return None
+    return {state.word: float(np.mean(known == state)) for state in Status}
+
+
+def _learned(learned: LearnedModel | None) -> dict[str, Any]:
+    if learned is None:
+        return {'model': None, 'noise_ratio': None, 'unexplained': None}
+    return {
+        'model': {
+            'numerator': list(learned.numerator), 'denominator': list(learned.denominator),
+            'delay_samples': learned.delay_samples,
+        },
+        'noise_ratio': learned.noise_ratio, 'unexplained': learned.unexplained,
     }
 
 
@@ -143,10 +174,15 @@ def write_run(run: RunRecord, directory: Path) -> None:
     """Write samples.csv for everyone, and record.npz with all that `report` can draw."""
     columns = [run.column(name) for name in SAMPLE_COLUMNS]
     write_table(directory / SAMPLES, SAMPLE_COLUMNS, np.column_stack(columns).tolist())
+    learned = run.learned.fields() if run.learned is not None else {}
+    arrays: dict[str, Any] = {
+        f'{LEARNED}{label}': np.array(values) for label, values in learned.items()
+    }
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer, columns=np.array(COLUMNS), rows=run.rows, sample_period=run.sample_period,
         lost_samples=run.lost_samples,
+        **arrays,
     )
     write_atomically(directory / RECORD, buffer.getvalue())
 
@@ -161,7 +197,14 @@ def read_record(path: Path) -> RunRecord:
             for i, name in enumerate(COLUMNS):
                 if name in given:
                     rows[:, i] = stored['rows'][:, given.index(name)]
-            return RunRecord(rows, float(stored['sample_period']), int(stored['lost_samples']))
+            fields = {
+                name.removeprefix(LEARNED): stored[name].tolist()
+                for name in stored.files if name.startswith(LEARNED)
+            }
+            return RunRecord(
+                rows, float(stored['sample_period']), int(stored['lost_samples']),
+                from_fields(fields) if fields else None,
+            )
     except (OSError, KeyError, ValueError, IndexError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f'{path}: is not a record of a run: {error}') from None
 

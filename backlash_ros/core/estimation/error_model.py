@@ -77,6 +77,17 @@ class ErrorModel:
                 column += 1
         return out
 
+    def responses(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """(1 - z^-1) F_i at the points z (M,), shape (M, K)."""
+        back = 1.0 / z
+        filtered = self.gain / np.polyval(self.stable[::-1], back)
+        columns = [
+            (1.0 - back) * factor * back**j
+            for factor, delays in ((1.0, 2), (filtered, self.taps), (filtered**2, self.taps))
+            for j in range(delays)
+        ][:self.count]
+        return np.array(columns, dtype=np.complex128).reshape(self.count, len(z)).T
+
 
 class ErrorFilter:
     """The filters F_i with their state: what comes in pieces comes out as if it were one."""

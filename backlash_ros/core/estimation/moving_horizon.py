@@ -115,6 +115,7 @@ class MovingHorizon:
         self._current: Fitted | None = None
         self._inherited = inherited
         self._candidate: Prior | None = None  # what the last search found
+        self._rejected: Fitted | None = None  # the last fit of a search that gave no estimate
         self._search_at = self._record.end + FIRST_SEARCH
         self._refit_at = 0.0  # length of the record at which all of it is fitted anew
         self._moved_at = 0  # ... from which a gap that moved is reason to do so
@@ -160,8 +161,37 @@ class MovingHorizon:
 
     @property
     def unexplained(self) -> float:
-        """Motion of u that no backlash and no G explains, over m times the gap; nan before."""
-        return self._current.fit.unexplained(self._current.solution) if self._current else nan
+        """Motion of u that no backlash and no G explains, over m times the gap.
+
+        Where there is no estimate: of the last fit that gave none, nan before.
+        """
+        fitted = self._current or self._rejected
+        return fitted.fit.unexplained(fitted.solution) if fitted is not None else nan
+
+    @property
+    def wrong_sign(self) -> bool:
+        """Whether there is no estimate because y moves against v."""
+        return self._rejected is not None and self._rejected.solution.m < 0.0
+
+    @property
+    def learned_model(self) -> StateModel:
+        """The G behind the newest estimates, whether or not a structure has taken it up."""
+        return self._around.model
+
+    def response_std(self, z: NDArray[np.complex128]) -> Array:
+        """Relative deviation of the true response from that of `learned_model` at z (M,).
+
+        Shape (M,); nan before anything is learned, 0 where G was told to be exact.
+        """
+        if self._current is None:
+            return np.full(len(z), nan)
+        return self._current.fit.response_std(self._current.solution, z)
+
+    @property
+    def waiting(self) -> int:
+        """Samples of the record that no fit has taken in yet."""
+        taken = self._current.fit.length if self._current is not None else 0
+        return len(self._record) - taken
 
     @property
     def adapting(self) -> bool:
@@ -522,7 +552,7 @@ class MovingHorizon:
         if result.fit.length >= LONGEST:
             self._refit_at = LONGEST
         self._moved_at = result.fit.length + BLOCK[1]
-        self._contradicted_from = None
+        self._contradicted_from = self._rejected = None
         self._reason = Status.TRACKING
         self._publish()
 
@@ -629,6 +659,7 @@ class MovingHorizon:
         """Say why there is no estimate, where the samples should suffice for one."""
         if self._record.end < UNDECIDED:
             return
+        self._rejected = result
         if result is None:
             self._reason = Status.NOT_EXCITED
             return

@@ -28,6 +28,11 @@ class Status(IntEnum):
     INCONSISTENT = 4  # frozen: y does not follow from v through G and a backlash
 
     @property
+    def word(self) -> str:
+        """Its name as people write it."""
+        return self.name.lower().replace('_', ' ')
+
+    @property
     def frozen(self) -> bool:
         """Whether the last good estimate is held."""
         return self >= Status.NOT_EXCITED

@@ -291,6 +291,28 @@ class WindowFit:
         cov = by @ posterior.cov[:known, :known] @ by.T
         return by @ posterior.mean[:known], cov * variance
 
+    def response_std(self, solution: Solution, z: NDArray[np.complex128]) -> Array:
+        """Relative deviation of the response of the true G from `model` at z (M,), shape (M,).
+
+        The root of the mean of |dG/G|^2 over the posterior of the error of G and of the leak of its
+        integrator. What is known of the error counts as well, as `model` goes without it. The gain
+        at rest is part of m. 0 where G is exact.
+        """
+        layout, posterior = self.layout, solution.posterior
+        error, m = self.around.error, solution.m
+        part = slice(layout.base, layout.base + layout.errors)
+        by: NDArray[np.complex128] = np.zeros((len(z), layout.unknowns), dtype=np.complex128)
+        if m != 0.0:
+            by[:, part] = error.responses(z) @ error.spread / m
+        if layout.leak:
+            by[:, layout.driven] = -1.0 / (z - 1.0)
+        known = by @ posterior.mean
+        if m != 0.0:
+            by[:, layout.n + 1] = -(by[:, part] @ posterior.mean[part]) / m
+        variance = np.einsum('mp,pq,mq->m', by, posterior.cov, by.conj()).real
+        spread = posterior.noise_std**2 * solution.inflation
+        return np.asarray(np.sqrt(np.abs(known) ** 2 + np.maximum(variance, 0.0) * spread))
+
     def plausible(self, solution: Solution) -> bool:
         """Whether the error of G is one that its prior with the largest scale expects."""
         layout, most = self.layout, self.around.most

@@ -1,0 +1,101 @@
+"""How wrong the response of G may still be, as the fit of a record has it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from records import Truth, output, resonance, swing
+from scipy.signal import lfilter
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
+
+from backlash_ros.core.estimation.error_model import ErrorModel
+from backlash_ros.core.estimation.pace import Pace
+from backlash_ros.core.estimation.record_fit import drained
+from backlash_ros.core.estimation.relabelling import Fitted, fitted
+from backlash_ros.core.estimation.window_fit import Around, Start
+from backlash_ros.core.learned_model import FREQUENCIES
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.transfer_function import TransferFunction
+
+Array = np.ndarray
+
+MODELS = {
+    'resonance': resonance(), 'integrating': TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR),
+    'no moving pole': TransferFunction([0.5, 0.5], [1.0, 0.0, 0.0]),
+}
+POINTS = np.exp(2j * np.pi * np.array(FREQUENCIES))
+TRUTH = Truth()
+NOISE = 1e-3
+LENGTH = 4000  # of the responses from which the tests tell a frequency response
+
+
+def transform(response: Array) -> Array:
+    """Fourier transform of responses (N, ..) at the points, shape (M, ..)."""
+    return np.power.outer(POINTS, -np.arange(len(response))) @ response
+
+
+def fit_of(true: TransferFunction, told: TransferFunction, uncertainty: float) -> Fitted:
+    model = StateModel(told)
+    v = swing(600)
+    around = Around(model, ErrorModel(model, uncertainty), NOISE)
+    y = output(true, v, TRUTH, NOISE)
+    start = Start(TRUTH.gap, TRUTH.start(v))
+    return drained(fitted(v, y, around, start, TRUTH.m, Pace()))
+
+
+@pytest.mark.parametrize('name', sorted(MODELS))
+def test_responses_of_the_error_are_those_of_its_filters(name: str) -> None:
+    error = ErrorModel(StateModel(MODELS[name]), 0.2)
+    difference = np.zeros(LENGTH)
+    difference[:2] = 1.0, -1.0
+    assert error.responses(POINTS) == pytest.approx(
+        transform(error.filtered(difference)), rel=1e-6, abs=1e-9
+    )
+
+
+def test_deviation_is_that_of_plants_drawn_from_the_posterior() -> None:
+    fit, solution = fit_of(resonance(5.1), resonance(), 0.2)
+    layout, posterior = fit.layout, solution.posterior
+    error, model = fit.around.error, fit.model.transfer_function
+    rng = np.random.default_rng(0)
+    cov = posterior.cov * posterior.noise_std**2 * solution.inflation
+    impulse = np.zeros(LENGTH)
+    impulse[0] = 1.0
+    told = lfilter(model.numerator, model.denominator, impulse)
+    moves = error.filtered(np.diff(told, prepend=0.0)) @ error.spread
+    squares = np.zeros(len(POINTS))
+    draws = rng.multivariate_normal(posterior.mean, cov, 2000)
+    for drawn in draws:
+        m, e = drawn[layout.n + 1], drawn[layout.base:layout.base + layout.errors]
+        # The record says m G (1 + Delta).
+        squares += np.abs(transform(told + moves @ (e / m)) / transform(told) - 1.0) ** 2
+    assert fit.response_std(solution, POINTS) == pytest.approx(
+        np.sqrt(squares / len(draws)), rel=0.1
+    )
+
+
+@pytest.mark.parametrize('frequency_hz', [4.5, 5.0, 5.1, 5.5])
+def test_true_response_lies_within_a_few_deviations(frequency_hz: float) -> None:
+    true = resonance(frequency_hz)
+    fit, solution = fit_of(true, resonance(), 0.2)
+    off = np.abs(true.response(POINTS) / resonance().response(POINTS) - 1.0)
+    std = fit.response_std(solution, POINTS)
+    assert np.all(off <= 3.0 * std)
+    # And they are no empty promise: where y moves G is known.
+    assert std[0] < 0.02 + 2.0 * off[0]
+
+
+def test_exact_model_has_no_deviation() -> None:
+    fit, solution = fit_of(resonance(), resonance(), 0.0)
+    assert fit.response_std(solution, POINTS).tolist() == [0.0] * len(FREQUENCIES)
+
+
+def test_leak_of_an_integrator_counts() -> None:
+    fit, solution = fit_of(MODELS['integrating'], MODELS['integrating'], 0.2)
+    layout, posterior = fit.layout, solution.posterior
+    assert layout.leak
+    leak = posterior.mean[layout.driven] ** 2 + posterior.cov[layout.driven, layout.driven] \
+        * posterior.noise_std**2 * solution.inflation
+    # Far below every other frequency only the leak is left.
+    low = np.exp(1j * np.array([1e-9]))
+    assert fit.response_std(solution, low) == pytest.approx([np.sqrt(leak) / 1e-9], rel=1e-3)
