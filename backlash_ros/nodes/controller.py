@@ -53,6 +53,9 @@ KEPT_S, KEPT_OUTPUTS = 0.1, 20
 # After the command the controller gives way for this share of a period: a busy processor is where
 # the driver, woken by the command, would have to wait.
 GIVE_WAY = 0.05
+# Learning goes on for this share of a period at most; what is not done then follows after the next
+# command.
+LEARNING = 0.3
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
 AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
 LOOK_S = 0.05  # between two looks for a silent plant_output or reference
@@ -302,7 +305,7 @@ class ControllerNode(ManagedNode):
         if not behind:
             time.sleep(self._give_way)
         if self._behind % PUT_OFF == 0:
-            loop.core.refine()
+            loop.core.refine(self._learning_s)
         self._follow_up(loop, step, was_silent)
 
     def _may_begin(self, loop: ControlLoop, output: Output) -> bool:
@@ -383,6 +386,7 @@ class ControllerNode(ManagedNode):
         """Take up what follows from the sample period."""
         period = p.real('sample_period')
         self._give_way, self._period_ns = GIVE_WAY * period, period * 1e9
+        self._learning_s = LEARNING * period
         self._counter = SampleCounter(period, from_zero)
 
     def _mind_rivals(self) -> None:
