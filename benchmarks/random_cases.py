@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from cramer_rao import cramer_rao
 from numpy.typing import NDArray
 
 from backlash_ros.core.closed_loop import build_closed_loop
@@ -13,7 +14,11 @@ from backlash_ros.core.parameters import Parameters
 Array = NDArray[np.float64]
 
 PERIODS = 3
-NOISE_TO_SWING = 0.002
+NOISE_TO_SWING = 0.002  # noise on y over its swing, at most
+TOLD = 0.004  # relative Cramér-Rao bound of the loop that knows the backlash, at most
+SPREAD = 0.1  # of the logarithm of each time constant and damping where G is off
+UNCERTAINTY = 0.2  # that is told then
+NEAR_ONE = 1e-6  # distance of a pole from 1 that makes it an integrator
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,12 @@ def random_plant(rng: np.random.Generator) -> tuple[Array, Array, str]:
 
 
 def random_case(seed: int, **fixed: object) -> Case:
-    """The case of a seed; `fixed` overrides parameters."""
+    """The case of a seed; `fixed` overrides parameters.
+
+    A case asks what the motion tells. Its noise is 0.2 % of the swing of y, or less where the
+    Cramér-Rao bound of the loop that knows the backlash is beyond 0.4 % for m, c_r or c_l after the
+    three periods, as for a small c_r beside a large c_l. No estimator has a part in that.
+    """
     rng = np.random.default_rng([seed, 20])
     numerator, denominator, kind = random_plant(rng)
     m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
@@ -79,19 +89,63 @@ def random_case(seed: int, **fixed: object) -> Case:
         'waveform': waveform, 'amplitude': amplitude, 'frequency': float(omega),
         'sample_period': period, 'seed': seed, 'plant.uncertainty': 0.0,
     })
-    noise = NOISE_TO_SWING * _swing(parameters, samples_per_period)
+    noise = _noise(parameters, samples_per_period)
     changes = {'output_noise_std': noise, 'estimator.output_noise_std': noise, **fixed}
     return Case(
         seed, parameters.replaced(changes), PERIODS * samples_per_period, f'{kind} {waveform}'
     )
 
 
-def _swing(parameters: Parameters, samples_per_period: int) -> float:
-    """Peak to peak of y in the last period of the loop that knows the backlash, without noise."""
-    known = parameters.replaced({
+def uncertain_case(seed: int) -> Case:
+    """The case of a seed with a plant that is another one than G, as `altered` says."""
+    case = random_case(seed)
+    p = case.parameters
+    numerator, denominator = altered(
+        np.array(p.reals('plant.numerator')), np.array(p.reals('plant.denominator')),
+        np.random.default_rng([seed, 21]),
+    )
+    return Case(seed, p.replaced({
+        'truth.numerator': numerator.tolist(), 'truth.denominator': denominator.tolist(),
+        'plant.uncertainty': UNCERTAINTY,
+    }), case.samples, case.kind)
+
+
+def altered(numerator: Array, denominator: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """G(z) with the time constant of every pole, and the damping of every pair, 10 % off.
+
+    Zeros, integrators and the gain at rest, or of the velocity, stay.
+    """
+    poles: list[complex] = []
+    before = np.roots(denominator)
+    for pole in before:
+        if abs(pole - 1.0) < NEAR_ONE:
+            poles.append(1.0)
+        elif pole.imag >= 0.0:
+            frequency, damping = np.exp(SPREAD * rng.standard_normal(2))
+            rate = np.log(complex(pole)) * frequency
+            if pole.imag == 0.0:
+                poles.append(float(np.exp(rate.real)))
+            else:
+                ratio = -damping * rate.real / abs(rate)
+                root = np.sqrt(complex(ratio**2 - 1.0))
+                poles += np.exp(abs(rate) * np.array([root - ratio, -root - ratio])).tolist()
+    gain = np.prod([1.0 - pole for pole in poles if pole != 1.0]) \
+        / np.prod([1.0 - pole for pole in before if abs(pole - 1.0) >= NEAR_ONE])
+    return np.real(gain) * numerator, np.asarray(np.real(np.poly(poles)))
+
+
+def _noise(parameters: Parameters, samples_per_period: int) -> float:
+    """Deviation of the noise on y, from the loop that knows the backlash, without noise."""
+    p = parameters.replaced({
         'estimator.law': 'fixed',
         **{f'estimator.initial.{name}': parameters[f'backlash.{name}']
            for name in ('m', 'c_r', 'c_l')},
     })
-    y = build_closed_loop(known).run(PERIODS * samples_per_period + 1).column('y')
-    return float(np.ptp(y[-samples_per_period:]))
+    run = build_closed_loop(p).run(PERIODS * samples_per_period + 1)
+    truth = p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
+    bound = cramer_rao(
+        run.column('v')[:-1], np.array(p.reals('plant.numerator')),
+        np.array(p.reals('plant.denominator')), truth, 1.0, u0=p.real('backlash.initial_u'),
+    )
+    swing = float(np.ptp(run.column('y')[-samples_per_period:]))
+    return min(NOISE_TO_SWING * swing, TOLD / float((bound / np.abs(truth)).max()))
