@@ -9,9 +9,8 @@ from math import sin
 import numpy as np
 from cramer_rao import cramer_rao
 from numpy.typing import NDArray
-from random_cases import Case, random_case, uncertain_case
+from random_cases import Case, bound_of, random_case, uncertain_case
 
-from backlash_ros.core.assembly import build_true_model
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.controller import Limits
 from backlash_ros.core.estimation.moving_horizon import MovingHorizon
@@ -153,23 +152,14 @@ def _run_case(case: Case) -> CaseResult:
         nothing = np.full(3, np.inf)
         return CaseResult(seed, case.kind, nothing, np.zeros(3), 0.0, 0, f'broke off: {error}')
     v = run.column('v')
-    bound = cramer_rao(
-        v[:-1], *_true_plant(p), truth, p.real('output_noise_std'),
-        u0=p.real('backlash.initial_u'),
-    )
+    bound = bound_of(p, v[:-1])
     off = _deviations(run)
     return CaseResult(
-        seed, case.kind, relative_errors(run)[-1], bound / np.abs(truth),
+        seed, case.kind, relative_errors(run)[-1], bound,
         float(np.ptp(v[len(v) * 2 // 3:])) / (truth[1] - truth[2]),
         int(run.column('status')[-1]), _trouble(run, p), (float(off[-1]), float(off.max())),
         float(np.mean(off > FIVE)),
     )
-
-
-def _true_plant(p: Parameters) -> tuple[Array, Array]:
-    """Numerator and denominator of the plant of a random case."""
-    model = build_true_model(p)
-    return model.numerator, model.denominator
 
 
 def _deviations(run: RunRecord) -> Array:

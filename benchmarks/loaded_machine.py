@@ -67,15 +67,15 @@ class Run:
     latencies_s: list[float] = field(default_factory=list)
 
     @property
-    def newest(self) -> int:
-        """Number of the newest sample, -1 before the first one."""
-        return max(self.errors, default=-1)
+    def samples(self) -> int:
+        """Samples from the first one heard to the newest; the driver has counted some before."""
+        return max(self.errors) - min(self.errors) + 1 if self.errors else 0
 
     def settled_s(self, limit: float) -> float:
         """Time from which on the error stays within the limit [s]; inf if it does not."""
         beyond = [k for k, error in self.errors.items() if not error <= limit]
         since = min((k for k in self.errors if k > max(beyond, default=-1)), default=None)
-        return inf if since is None else since * PERIOD_S
+        return inf if since is None else (since - min(self.errors)) * PERIOD_S
 
 
 class Listener(Node):
@@ -116,7 +116,7 @@ def listener(domain: int) -> Iterator[tuple[Listener, SingleThreadedExecutor]]:
         yield node, executor
     finally:
         executor.shutdown()
-        node.destroy_node()
+        node.destroy_node()  # type: ignore[no-untyped-call]
         rclpy.shutdown(context=context)
 
 
@@ -135,13 +135,13 @@ def measure(load: float, use: str, seconds: float) -> Run:
     }
     with processes(commands) as (supervisor, domain), listener(domain) as (heard, executor):
         deadline = time.monotonic() + START_S + SLOWEST * seconds
-        while heard.run.newest * PERIOD_S < seconds:
+        while heard.run.samples * PERIOD_S < seconds:
             executor.spin_once(timeout_sec=0.1)
             ended = [child.plan.name for child in supervisor.ended()]
             if ended or time.monotonic() > deadline:
                 raise RuntimeError(
                     f'{ended} ended' if ended else
-                    f'only {heard.run.newest + 1} samples came: is the machine too busy?'
+                    f'only {heard.run.samples} samples came: is the machine too busy?'
                 )
         return heard.run
 
@@ -159,19 +159,19 @@ def judge(load: float, use: str, runs: Sequence[Run]) -> Check:
 
 RUN_HEADER = (
     'load', 'reports', 'run', 'error at the end', 'deviations', 'tracking', 'inconsistent',
-    'no v, lost', 'y to v p50 [ms]', 'p99',
+    'not answered', 'y to v p50 [ms]', 'p99',
 )
 
 
 def row(load: float, use: str, number: int, run: Run) -> list[str]:
     """Cells of the table of runs."""
-    samples, newest = sum(run.states.values()), run.newest
+    answered, newest = sum(run.states.values()), max(run.errors)
     p50, p99 = 1e3 * np.quantile(run.latencies_s, [0.5, 0.99])
     return [
         f'{load:.0%}', use, str(number), f'{run.errors[newest]:.3%}', f'{run.off[newest]:.1f}',
-        f'{run.states[Status.TRACKING] / samples:.0%}',
-        f'{run.states[Status.INCONSISTENT] / samples:.0%}',
-        f'{1.0 - samples / (newest + 1):.0%}', f'{p50:.1f}', f'{p99:.1f}',
+        f'{run.states[Status.TRACKING] / answered:.0%}',
+        f'{run.states[Status.INCONSISTENT] / answered:.0%}',
+        f'{1.0 - answered / run.samples:.0%}', f'{p50:.1f}', f'{p99:.1f}',
     ]
 
 
