@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 from cramer_rao import cramer_rao
@@ -77,10 +78,11 @@ def random_case(seed: int, **fixed: object) -> Case:
 def uncertain_case(seed: int) -> Case:
     """The case of a seed with a plant that is another one than G, as `altered` says.
 
-    The bound that limits its noise holds for time constants and damping that are known as well as
-    they are spread, and is 0.6 %.
+    The reference is slower than every pole, omega tau <= 1: to a faster one a time constant is a
+    gain, which y does not tell from m. The bound that limits the noise is 0.6 %, for time constants
+    and damping that are known as well as they are spread.
     """
-    case, samples_per_period = _without_noise(seed)
+    case, samples_per_period = _without_noise(seed, below_corners=True)
     p = case.parameters
     numerator, denominator = altered(
         np.array(p.reals('plant.numerator')), np.array(p.reals('plant.denominator')),
@@ -94,8 +96,11 @@ def uncertain_case(seed: int) -> Case:
     return _with_noise(case, _noise(p, samples_per_period, TOLD_UNCERTAIN), {})
 
 
-def _without_noise(seed: int) -> tuple[Case, int]:
-    """The case, and the samples of a period."""
+def _without_noise(seed: int, below_corners: bool = False) -> tuple[Case, int]:
+    """The case, and the samples of a period.
+
+    below_corners: whether the reference is no faster than the slowest pole.
+    """
     rng = np.random.default_rng([seed, 20])
     numerator, denominator, kind = random_plant(rng)
     m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
@@ -104,6 +109,8 @@ def _without_noise(seed: int) -> tuple[Case, int]:
     factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
     first = (m * factors[0], c_r * factors[1], c_l * factors[2])
     samples_per_period = int(rng.integers(40, 200))
+    if below_corners:
+        samples_per_period = max(samples_per_period, ceil(2.0 * np.pi * _slowest(denominator)))
     period = 0.01
     omega = 2.0 * np.pi / (samples_per_period * period)
     waveform = str(rng.choice(['sine', 'multisine']))
@@ -124,6 +131,12 @@ def _without_noise(seed: int) -> tuple[Case, int]:
     })
     samples = PERIODS * samples_per_period
     return Case(seed, parameters, samples, f'{kind} {waveform}'), samples_per_period
+
+
+def _slowest(denominator: Array) -> float:
+    """Longest time constant of the poles that are no integrators [samples]."""
+    sizes = [abs(pole) for pole in np.roots(denominator) if abs(pole - 1.0) >= NEAR_ONE]
+    return float(-1.0 / np.log(max(sizes))) if sizes else 0.0
 
 
 def _with_noise(case: Case, noise: float, fixed: Mapping[str, object]) -> Case:
