@@ -6,6 +6,8 @@ scipy.signal from the true mode sequence, and the Fisher information is inverted
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, signal
@@ -31,10 +33,13 @@ def engaged_regressors(v: Array, m: float, c_r: float, c_l: float, u: float) -> 
 def cramer_rao(
     v: Array, numerator: Array, denominator: Array, truth: tuple[float, float, float],
     noise_std: float, received: NDArray[np.bool_] | None = None, u0: float = 0.0,
+    effects: Callable[[Array], Array] | None = None,
 ) -> Array:
     """Smallest standard deviations of (m, c_r, c_l) from y(0..N), v(0..N-1) applied, shape (3,).
 
     received: which of y(0..N) arrived. Unknown are x(0), theta and the u held at the start.
+    effects: what a standard deviation of each of K other unknowns does to y, shape (N+1, K), from
+    u(0..N); these are known beforehand to be normal around their true values (Van Trees).
     inf where y does not show a parameter.
     """
     m, c_r, c_l = truth
@@ -45,8 +50,13 @@ def cramer_rao(
     free = [signal.lfilter(np.ones(1), denominator, impulse) for impulse in impulses]
     held = [forced[3]] if np.any(forced[3]) else []
     sensitivity = np.column_stack([*forced[:3], *free, *held])
+    if effects is not None:
+        sensitivity = np.hstack([sensitivity, effects(phi @ [m, m * c_r, m * c_l, u0])])
     if received is not None:
         sensitivity = sensitivity[received]
+    if effects is not None:
+        prior = noise_std * np.eye(sensitivity.shape[1])[3 + len(free) + len(held):]
+        sensitivity = np.vstack([sensitivity, prior])
     jacobian = np.array([[1.0, 0, 0], [-c_r / m, 1 / m, 0], [-c_l / m, 0, 1 / m]])
     root, hidden = _theta_root(sensitivity)
     # Each column of root is one direction of the data: the norms are standard deviations.

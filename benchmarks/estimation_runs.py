@@ -9,7 +9,7 @@ from math import sin
 import numpy as np
 from cramer_rao import cramer_rao
 from numpy.typing import NDArray
-from random_cases import Case, random_case
+from random_cases import Case, bound_of, random_case, uncertain_case
 
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.controller import Limits
@@ -24,6 +24,7 @@ NAMES = ('m', 'c_r', 'c_l')
 EXACT = {'plant.uncertainty': 0.0}  # the promises beside the bound hold where G is known
 MARKS_S = (0.5, 1.0, 2.0, 6.0)
 QUIET_NOISE = 1e-4  # times the noise of a random case
+FIVE = 5.0  # published deviations beyond which an estimate is wrong
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,11 @@ class SeedResult:
 
 @dataclass(frozen=True)
 class CaseResult:
-    """End of a random case: relative errors (3,), relative bounds (3,), and what was wrong."""
+    """End of a random case: relative errors (3,), relative bounds (3,), and what was wrong.
+
+    deviations: largest error over its published deviation while tracking, at the end and of all
+    samples; 0 where it never tracked. overconfident: share of the samples beyond five.
+    """
 
     seed: int
     kind: str
@@ -60,6 +65,8 @@ class CaseResult:
     swing: float  # of v, in gaps
     status: int
     trouble: str
+    deviations: tuple[float, float] = (0.0, 0.0)
+    overconfident: float = 0.0
 
 
 def estimates(run: RunRecord) -> Array:
@@ -131,6 +138,11 @@ def run_random_case(seed: int) -> CaseResult:
     return _run_case(random_case(seed))
 
 
+def run_uncertain_case(seed: int) -> CaseResult:
+    """The random case with a plant that is another one than G."""
+    return _run_case(uncertain_case(seed))
+
+
 def _run_case(case: Case) -> CaseResult:
     seed, p = case.seed, case.parameters
     truth = p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
@@ -140,15 +152,21 @@ def _run_case(case: Case) -> CaseResult:
         nothing = np.full(3, np.inf)
         return CaseResult(seed, case.kind, nothing, np.zeros(3), 0.0, 0, f'broke off: {error}')
     v = run.column('v')
-    bound = cramer_rao(
-        v[:-1], np.array(p.reals('plant.numerator')), np.array(p.reals('plant.denominator')),
-        truth, p.real('output_noise_std'), u0=p.real('backlash.initial_u'),
-    )
+    bound = bound_of(p, v[:-1])
+    off = _deviations(run)
     return CaseResult(
-        seed, case.kind, relative_errors(run)[-1], bound / np.abs(truth),
+        seed, case.kind, relative_errors(run)[-1], bound,
         float(np.ptp(v[len(v) * 2 // 3:])) / (truth[1] - truth[2]),
-        int(run.column('status')[-1]), _trouble(run, p),
+        int(run.column('status')[-1]), _trouble(run, p), (float(off[-1]), float(off.max())),
+        float(np.mean(off > FIVE)),
     )
+
+
+def _deviations(run: RunRecord) -> Array:
+    """Largest error over its published deviation of every sample, 0 where it does not track."""
+    std = np.column_stack([run.column(f'std_{name}') for name in NAMES])
+    off = (np.abs(estimates(run) - truths(run)) / std).max(axis=1)
+    return np.where(run.column('status') == Status.TRACKING, off, 0.0)
 
 
 def _trouble(run: RunRecord, p: Parameters) -> str:

@@ -8,6 +8,7 @@ B1, B2 = 0.15678154198771987, 0.12688103331610767  # load behind the gear output
 A1, A2 = -1.2498255157872757, 0.5334880910911033
 ENCODER_STEP = 2.0 * math.pi / 2**14
 EARLY = 0.1  # of a period; timers are punctual to that
+LATE_START = 0.7  # of a period; by so much the first reading may have been late
 
 
 class SimulatedMotor:
@@ -32,6 +33,10 @@ class SimulatedMotor:
         now = time.monotonic()
         if self._sample < 0:
             self._begin, self._sample = now, 0
+        early = self._begin + (self._sample + 1) * self._period - now
+        if 0.0 < early < LATE_START * self._period:
+            # Timers are never early: the readings before were late.
+            self._begin -= early
         while self._sample < int((now - self._begin) / self._period + EARLY):
             self._step()
         return ENCODER_STEP * round(self._x1 / ENCODER_STEP)

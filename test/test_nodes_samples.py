@@ -128,6 +128,14 @@ def test_older_intervals_ended_in_time_though_the_newest_output_came_late() -> N
     assert over(commands, 2, end=2.3, due=2.3) == []
 
 
+def test_a_command_that_came_while_the_driver_was_held_up_missed_its_sample() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.publish(1.0, START_NS + 1)
+    commands.publish(2.0, START_NS + int(1.2 * PERIOD_NS))
+    # y(1) was due at 1.0 and taken at 1.5, before the driver looked at what had come.
+    assert over(commands, 1, end=1.5, due=1.0) == [1.0]
+
+
 @pytest.mark.parametrize(('passed_ns', 'late'), [
     (0, False), (PERIOD_NS // 10, True), (-PERIOD_NS, False), (100 * PERIOD_NS, True),
 ])

@@ -81,7 +81,8 @@ class CommandHistory:
         due_ns: when it should have ended, and so a whole number of periods after the others.
         Empty if it was the newest command in all of them, as usual.
         """
-        ends_ns = [due_ns - i * self._period_ns for i in range(intervals - 1, 0, -1)] + [end_ns]
+        # A driver that was held up reads y first, and then the commands that came meanwhile.
+        ends_ns = [min(due_ns, end_ns) - i * self._period_ns for i in range(intervals - 1, -1, -1)]
         # What left later than that was not there.
         latest_ns = [each - self._transit_ns for each in ends_ns]
         if self._published[-1][0] < latest_ns[0]:
