@@ -366,9 +366,9 @@ class MovingHorizon:
         solution = found[0].solution
         self._candidate = Prior(solution.theta, solution.theta_cov)
         self._search_at = end + BLOCK[0]
-        exact = not around.error.count
         again = before is not None and not _contradicts(solution, before)
-        if (exact or again) and found[0].fit.reversals >= (1 if exact else REVERSALS):
+        wanted = REVERSALS if around.error.count else 1
+        if again and found[0].decided and found[0].fit.reversals >= wanted:
             self._install(*found, first)
 
     def _confirmed(
@@ -409,7 +409,7 @@ class MovingHorizon:
         """Take in the samples that have come since the last block."""
         current = self._current
         assert current is not None
-        fit, solution = current
+        fit, solution = current.fit, current.solution
         number = self._record.first + fit.length
         v, y = self._record.since(number)
         v, y = v[:4 * BLOCK[1]], y[:4 * BLOCK[1]]
@@ -449,7 +449,7 @@ class MovingHorizon:
         current = self._current
         assert current is not None
         record, around = self._record, self._around
-        fit, solution = current
+        fit, solution = current.fit, current.solution
         start, first = fit.start, record.first
         if fit.length >= LONGEST:
             gone = LONGEST // 3
@@ -485,7 +485,7 @@ class MovingHorizon:
         current = self._current
         assert current is not None
         record = self._record
-        fit, solution = current
+        fit, solution = current.fit, current.solution
         self._next_try = record.end + max(fit.length // 4, BLOCK[1])
         half = fit.length // 2
         if half < RECOVERED:
@@ -612,7 +612,7 @@ class MovingHorizon:
         """Let play operator and observer stand where the fit says that the plant stands."""
         current = self._current
         assert current is not None
-        fit, solution = current
+        fit, solution = current.fit, current.solution
         estimate = self.estimate
         gap = estimate.c_r - estimate.c_l
         v = self._record.since(self._record.first + fit.length)[0]
@@ -644,7 +644,7 @@ class MovingHorizon:
         """State of a G that is not the one of the fit, from the samples of the fit."""
         current = self._current
         assert current is not None
-        fit, solution = current
+        fit, solution = current.fit, current.solution
         v, y = self._record.since(self._record.first)
         v, y = v[:fit.length], y[:fit.length]
         u = fit.input(solution, v)

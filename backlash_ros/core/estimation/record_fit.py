@@ -277,7 +277,7 @@ def _described(
     bounds: Bounds | None, v: Array, y: Array,
 ) -> RecordFit:
     """All there is to say about a fit of v (N,) and y (N,)."""
-    fit, solution = result.found
+    fit, solution, _ = result.found
     sign = result.sign
     theta = sign * solution.theta
     # theta / m has the same crossings and deviations for both signs.

@@ -14,7 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED, GROWTH, NO_GAP, WALKS
+from backlash_ros.core.estimation.constants import (
+    CANDIDATES,
+    ENGAGED,
+    GROWTH,
+    NO_GAP,
+    UNDECIDED_BY,
+    WALKS,
+    ZOOM,
+)
 from backlash_ros.core.estimation.low_order import OutputError, low_order
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.search import Candidate, search
@@ -40,10 +48,11 @@ SETTLED = 60  # samples at the start of a record that say little of G: what was 
 
 
 class Fitted(NamedTuple):
-    """A fit of a record with its solution."""
+    """A fit of a record with its solution. decided: whether no other gap is nearly as likely."""
 
     fit: WindowFit
     solution: Solution
+    decided: bool = True
 
 
 def fitted(
@@ -93,7 +102,16 @@ def searched(
                 or result.solution.posterior.evidence > best.solution.posterior.evidence:
             best = result
     assert best is not None
-    return (yield from with_better_model(v, y, around, best, pace))
+    result, around = yield from with_better_model(v, y, around, best, pace)
+    gap = result.solution.gap
+    likely = found.candidates[0].evidence - UNDECIDED_BY
+    # What is closer has led to this fit.
+    far = max(3.0 * result.solution.std_gap, ZOOM[0] * gap)
+    others = any(
+        candidate.evidence > likely and abs(candidate.gap - gap) > far
+        for candidate in found.candidates
+    )
+    return result._replace(decided=not others), around
 
 
 def _apart(candidates: list[Candidate]) -> list[Candidate]:
