@@ -40,7 +40,7 @@ TRUE_PLANTS: dict[str, dict[str, str]] = {
     'natural frequency × 0.8': {'truth.scale_frequency': '0.8'},
     'natural frequency × 1.2': {'truth.scale_frequency': '1.2'},
     'damping × 1.2': {'truth.scale_damping': '1.2'},
-    '5 ms of lag, a sample': {'truth.extra_lag': '0.005'},
+    '5 ms of lag (one sample)': {'truth.extra_lag': '0.005'},
     'natural frequency × 0.5': {'truth.scale_frequency': '0.5'},
     '20 ms of lag': {'truth.extra_lag': '0.02'},
 }
