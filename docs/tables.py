@@ -179,7 +179,7 @@ def _crossing_errors(run: RunRecord) -> str:
         error, std = run.column(name)[-1] - true, run.column(f'std_{name}')[-1]
         cells.append(f'{_percent(error / true)} ({_percent(std / true)})')
     status = Status(int(run.column('status')[-1]))
-    return ', '.join(cells) + ('' if status is Status.TRACKING else f', {status.name.lower()}')
+    return ', '.join(cells) + ('' if status is Status.TRACKING else f', {status.word}')
 
 
 def _response_errors(model: TransferFunction, true: TransferFunction, p: Parameters) -> str:
