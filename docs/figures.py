@@ -144,6 +144,40 @@ def draw_convergence() -> Figure:
     return figure
 
 
+def draw_uncertain_plant() -> Figure:
+    """Errors of the crossings where the true plant is not G: G believed, and the default."""
+    figure = new_figure(6.4)
+    rows = figure.add_gridspec(2, 1, height_ratios=[1.0, 0.01])
+    grid = np.asarray(rows[0].subgridspec(2, 2).subplots(sharex=True, sharey='row'))
+    kinds = (('plant.uncertainty: 0', '0.0', 50.0), ('default', '0.2', 0.4))
+    for line, (name, uncertainty, reach) in zip(grid, kinds, strict=True):
+        for axes, scale in zip(line, ('0.8', '1.2'), strict=True):
+            change = {'truth.scale_frequency': scale, 'plant.uncertainty': uncertainty}
+            _draw_crossing_errors(axes, simulate(6.0, change, 'geared_motor.yaml').record)
+            zero_line(axes)
+            axes.set_ylim(-reach, reach)
+            label(axes, f'true natural frequency × {scale}, {name}')
+        label(line[0], y='error [% of the truth]')
+    for axes in grid[1]:
+        label(axes, x=TIME)
+    legend_below(figure.add_subplot(rows[1]), grid[0][0])
+    return figure
+
+
+def _draw_crossing_errors(axes: Axes, run: RunRecord) -> None:
+    """Errors of c_r and c_l in per cent from the first estimate on, and two deviations."""
+    t = run.column('t')
+    for name in ('c_r', 'c_l'):
+        truth, std = run.column(f'true_{name}'), run.column(f'std_{name}')
+        # Before the first estimate there is no deviation, and so no curve.
+        percent = 100.0 * (run.column(name) - truth + 0.0 * std) / np.abs(truth)
+        around = 200.0 * std / np.abs(truth)
+        band(axes, t, percent - around, percent + around, COLOURS[name],
+             '±2 published standard deviations' if name == 'c_r' else '')
+        curve(axes, t, percent, COLOURS[name], f'${ESTIMATES[name]}$', STYLES[name], 1.6)
+    shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
+
+
 def draw_recovery() -> Figure:
     """c_r steps from 3 to 4 without a word to the estimator."""
     jump = {'output_noise_std': '1e-3', 'backlash.jump': '[0.0, 1.0, 0.0]',
@@ -189,7 +223,7 @@ def draw_tracking() -> Figure:
 FIGURES: dict[str, Callable[[], Figure]] = {
     'result': draw_result, 'figure_4': draw_figure_4, 'figure_5': draw_figure_5,
     'hysteresis': draw_loop, 'convergence': draw_convergence, 'recovery': draw_recovery,
-    'tracking': draw_tracking,
+    'tracking': draw_tracking, 'uncertain_plant': draw_uncertain_plant,
 }
 
 

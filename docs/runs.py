@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from backlash_ros.core.assembly import build_model
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
+from backlash_ros.core.transfer_function import TransferFunction
 from backlash_ros.tools.configuration import effective_parameters
 from backlash_ros.tools.simulation import prepare, run_loop
 
@@ -25,6 +27,7 @@ class Run:
     parameters: Parameters
     record: RunRecord
     delay: int  # samples by which y is meant to follow y_m
+    model: TransferFunction  # G at the end: the learned one where one is in use
 
 
 def simulate(
@@ -41,4 +44,6 @@ def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: st
     )
     loop = prepare(parameters)
     record = run_loop(loop, round(duration / parameters.real('sample_period')))
-    return Run(parameters, record, loop.controller.structure.delay)
+    learned = loop.controller.adopted
+    model = build_model(parameters) if learned is None else learned.transfer_function
+    return Run(parameters, record, loop.controller.structure.delay, model)

@@ -17,7 +17,11 @@ from printed_law import (
 )
 from runs import simulate
 
+from backlash_ros.core.assembly import build_model, build_true_model
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.metrics import control_error_rms, settling_time
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.run_record import RunRecord
 from backlash_ros.core.transfer_function import TransferFunction
 
 NAMES = ('m', 'c_r', 'c_l')
@@ -25,8 +29,29 @@ SECONDS = 10.0
 DISTURBANCE = 2.0
 ROOT = Path(__file__).resolve().parents[1]
 ESTIMATION = ROOT / 'backlash_ros' / 'core' / 'estimation'
+CONSTANTS = ESTIMATION / 'constants.py'
 OF_EVERY_LAW = ('protocol.py', 'storage.py')
-CONSTANT = re.compile(r'([A-Z][A-Z0-9_]*) = (.*?)(?:  # (.*))?')
+CONSTANT = re.compile(r'([A-Z][A-Z0-9_]*(?:, [A-Z][A-Z0-9_]*)*) = (.*?)(?:  # (.*))?')
+MOTOR = 'geared_motor.yaml'
+# True plants that differ from the G(z) of MOTOR, by what is set.
+TRUE_PLANTS: dict[str, dict[str, str]] = {
+    'as told': {},
+    'natural frequency × 0.98': {'truth.scale_frequency': '0.98'},
+    'natural frequency × 0.8': {'truth.scale_frequency': '0.8'},
+    'natural frequency × 1.2': {'truth.scale_frequency': '1.2'},
+    'damping × 1.2': {'truth.scale_damping': '1.2'},
+    '5 ms of lag (one sample)': {'truth.extra_lag': '0.005'},
+    'natural frequency × 0.5': {'truth.scale_frequency': '0.5'},
+    '20 ms of lag': {'truth.extra_lag': '0.02'},
+}
+RESPONSE_HZ = (2.5, 10.0)  # frequencies at which G is compared
+# Motions and noise for which a G that is not certain costs accuracy: file, what is set.
+MOTIONS: dict[str, tuple[str | None, dict[str, str]]] = {
+    'geared motor, multisine': (MOTOR, {}),
+    'geared motor, one sine': (MOTOR, {'waveform': 'sine'}),
+    'geared motor, triangle: one speed': (MOTOR, {'waveform': 'triangle'}),
+    'paper, one sine, noise 1e-3': (None, {'output_noise_std': '1e-3'}),
+}
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -127,13 +152,76 @@ def disturbance() -> str:
     return markdown(('', 'backlash alone', 'shifted by −d/m', 'estimated'), rows)
 
 
+def uncertain_plants() -> str:
+    """What is learned where the true plant is not G, with G believed and with the default."""
+    rows = []
+    for name, change in TRUE_PLANTS.items():
+        believed = simulate(2.0, {**change, 'plant.uncertainty': '0.0'}, MOTOR)
+        free = simulate(2.0, change, MOTOR)
+        true = build_true_model(free.parameters)
+        rows.append((
+            name, _crossing_errors(believed.record), _crossing_errors(free.record),
+            *(_response_errors(model, true, free.parameters)
+              for model in (build_model(free.parameters), free.model)),
+        ))
+    at = ' and '.join(f'{f:g}' for f in RESPONSE_HZ)
+    return markdown((
+        'true plant', 'c_r, c_l with `plant.uncertainty: 0`', 'c_r, c_l with 0.2',
+        f'G as told, at {at} Hz', 'G as learned',
+    ), rows)
+
+
+def _crossing_errors(run: RunRecord) -> str:
+    """Errors of c_r and c_l at the end, in parentheses their published deviations."""
+    cells = []
+    for name in ('c_r', 'c_l'):
+        true = run.column(f'true_{name}')[-1]
+        error, std = run.column(name)[-1] - true, run.column(f'std_{name}')[-1]
+        cells.append(f'{_percent(error / true)} ({_percent(std / true)})')
+    status = Status(int(run.column('status')[-1]))
+    return ', '.join(cells) + ('' if status is Status.TRACKING else f', {status.word}')
+
+
+def _response_errors(model: TransferFunction, true: TransferFunction, p: Parameters) -> str:
+    z = np.exp(2j * np.pi * np.array(RESPONSE_HZ) * p.real('sample_period'))
+    return ', '.join(map(_percent, model.response(z) / true.response(z) - 1.0))
+
+
+def _percent(share: complex) -> str:
+    percent = 100.0 * abs(share)
+    return f'{percent:.0f} %' if percent >= 10.0 or percent < 1e-9 else f'{percent:.2g} %'
+
+
+def freedom() -> str:
+    """What it costs, where G is right, that it might be wrong: deviations at 6 s."""
+    rows = []
+    for name, (config, change) in MOTIONS.items():
+        cells = []
+        for uncertainty in ('0.0', '0.2'):
+            run = simulate(6.0, {**change, 'plant.uncertainty': uncertainty}, config).record
+            cells.append(', '.join(
+                _percent(run.column(f'std_{n}')[-1] / run.column(f'true_{n}')[-1]) for n in NAMES
+            ))
+        rows.append((name, *cells))
+    return markdown(
+        ('G as told, motion', 'deviations of m, c_r, c_l with `plant.uncertainty: 0`', 'with 0.2'),
+        rows,
+    )
+
+
 def estimator_constants() -> str:
     """The constants of the method with the comments beside them, as they stand in the code."""
+    rows = [(f'`{name}`', value, what) for name, value, what in constants_of(CONSTANTS)]
+    return markdown(('constant', 'value', 'meaning'), rows)
+
+
+def estimator_details() -> str:
+    """The constants that belong to one file of the method alone."""
     rows: list[tuple[str, str, str, str]] = []
-    of_the_law = [path for path in ESTIMATION.glob('*.py') if path.name not in OF_EVERY_LAW]
-    for path in sorted(of_the_law, key=lambda path: (path.name != 'constants.py', path.name)):
-        link = f'[{path.name}](../{path.relative_to(ROOT)})'
-        rows += [(f'`{name}`', value, what, link) for name, value, what in constants_of(path)]
+    for path in sorted(ESTIMATION.glob('*.py')):
+        if path.name not in OF_EVERY_LAW and path != CONSTANTS:
+            link = f'[{path.name}](../{path.relative_to(ROOT)})'
+            rows += [(f'`{name}`', value, what, link) for name, value, what in constants_of(path)]
     return markdown(('constant', 'value', 'meaning', 'file'), rows)
 
 
@@ -159,5 +247,6 @@ TABLES: dict[str, Callable[[], str]] = {
     'plant_facts': plant_facts, 'laws': laws, 'printed_moves': printed_moves,
     'printed_not_finite': printed_not_finite, 'printed_growth': printed_growth,
     'printed_readings': printed_readings, 'disturbance': disturbance,
-    'estimator_constants': estimator_constants,
+    'uncertain_plants': uncertain_plants, 'freedom': freedom,
+    'estimator_constants': estimator_constants, 'estimator_details': estimator_details,
 }
