@@ -5,7 +5,7 @@ from __future__ import annotations
 # --- the record
 LONGEST = 1500  # samples of the record that is fitted; beyond it the oldest third is let go
 BLOCK = (8, 64)  # samples, fewest and most, that are taken in between two solutions
-BLOCK_SHARE = 16  # ... and in between: one block for so many samples of the record
+BLOCK_SHARE = 32  # ... and in between: one block for so many samples of the record
 GROWTH = 1.4  # of the record, after which all of it is fitted anew
 MOVED = 0.5  # standard deviations of the gap after which all of it is fitted anew
 

@@ -50,8 +50,9 @@ class ErrorModel:
         self.gain = float(self.stable.sum())
         self.taps = len(moving)
         self.count = 2 + 2 * self.taps if uncertainty > 0.0 else 0
-        integrates = bool(np.any(np.abs(model.transfer_function.poles - 1.0) < ON_CIRCLE))
-        self.leak = LEAK * uncertainty if integrates else 0.0
+        poles = model.transfer_function.poles
+        self.integrates = bool(np.any(np.abs(poles - 1.0) < ON_CIRCLE))
+        self.leak = LEAK * uncertainty if self.integrates else 0.0
         self.spread: Array = np.zeros((0, 0))
         # The same as a G of low order: spread of its taps and denominator (low_order.py).
         self.low_order_spread: Array = np.zeros((0, 0))

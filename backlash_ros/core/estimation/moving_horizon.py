@@ -260,7 +260,11 @@ class MovingHorizon:
         self._set_status()
 
     def _note(self, v: float, y: float) -> None:
-        if self._since_motion > self.model.memory:
+        memory = self.model.memory
+        if self._observer is None and self._since_motion > AT_REST * memory:
+            if not self._around.error.integrates:
+                return  # all is at rest: the next motion goes on from here as if at once
+        elif self._observer is not None and self._since_motion > memory:
             self._paused = True
             return
         if self._paused or len(self._record) == CAPACITY:
@@ -495,10 +499,23 @@ class MovingHorizon:
         start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
         newer = yield from fitted(v[half:], y[half:], around, start, solution.m, self._pace)
         whole = Prior(solution.theta, np.zeros((3, 3)))
-        if self._usable(newer, REPLACING) is not None and (
-            _contradicts(newer.solution, whole) or self._drifts_more(newer.solution, half)
-        ):
-            self._install(newer, around, record.first + half)
+        drifts = self._drifts_more(newer.solution, half)
+        if self._usable(newer, REPLACING) is None \
+                or not (_contradicts(newer.solution, whole) or drifts):
+            return
+        if self._drifts and not around.error.count:
+            # What the older half says holds as far as theta has not drifted since.
+            older = yield from fitted(
+                v[:half], y[:half], self._around._replace(walk=0.0), fit.start, solution.m,
+                self._pace,
+            )
+            prior = self._drifted(older.solution, half)
+            if older.solution.m > 0.0 and not _contradicts(newer.solution, prior):
+                around = around._replace(prior=prior)
+                newer = yield from fitted(
+                    v[half:], y[half:], around, newer.fit.start, solution.m, self._pace
+                )
+        self._install(newer, around, record.first + half)
 
     def _reconsider(self) -> Task:
         """Explain samples that contradict the fit: by all of them, or by a change of the plant."""
@@ -721,5 +738,6 @@ def _contradicts(solution: Solution, other: Prior) -> bool:
 
 
 CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
+AT_REST = 3  # memories of G after which nothing moves any more
 TOLD = 1.0  # scale of the error of G that was told
 FEW = 0.2  # share of a block that may be outliers

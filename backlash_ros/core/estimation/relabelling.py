@@ -105,6 +105,9 @@ def searched(
     result, around = yield from with_better_model(v, y, around, best, pace)
     gap = result.solution.gap
     likely = found.candidates[0].evidence - UNDECIDED_BY
+    if around.error.count:
+        # The evidence of a search is that of the best error of G for each gap: too flat to tell.
+        return result, around
     # What is closer has led to this fit.
     far = max(3.0 * result.solution.std_gap, ZOOM[0] * gap)
     others = any(
