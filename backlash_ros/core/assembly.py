@@ -191,8 +191,8 @@ def _moving_horizon(p: Parameters, initial: Estimate) -> Estimator:
         )
     return MovingHorizon(
         initial, _bounds(p), build_state_model(p), p.real('estimator.output_noise_std'),
-        p.triple('estimator.drift_std'), p.real('sample_period'), p.real('plant.uncertainty'),
-        observer,
+        p.real('estimator.input_noise_std'), p.triple('estimator.drift_std'),
+        p.real('sample_period'), p.real('plant.uncertainty'), observer,
     )
 
 

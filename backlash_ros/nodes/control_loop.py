@@ -220,7 +220,7 @@ class ControlLoop:
             core.estimator.step_f = p.real('lms.step_f')
         if isinstance(core.estimator, MovingHorizon):
             core.estimator.set_noise(
-                p.real('estimator.output_noise_std'),
+                p.real('estimator.output_noise_std'), p.real('estimator.input_noise_std'),
                 np.array(p.triple('estimator.drift_std')) * p.real('sample_period')**0.5,
             )
         if any(p[name] != before[name] for name in OF_THE_STRUCTURE):

@@ -69,13 +69,15 @@ class MovingHorizon:
 
     initial: a first guess, or with its deviations what was learned before. model: G as told.
     uncertainty: relative spread of its time constants, damping and delay, 0 where it is exact.
-    noise_std: of y, a first guess. drift_std: random walk of m, c_r, c_l per square root of a
+    noise_std: of y, a first guess. walk_std: by which a disturbance of u walks within a record, a
+    first guess. drift_std: random walk of m, c_r, c_l per square root of a
     second. observer: gives the state of G until the backlash is known, for structures that want it.
     """
 
     def __init__(
         self, initial: Estimate, bounds: Bounds, model: StateModel, noise_std: float,
-        drift_std: tuple[float, float, float], sample_period: float, uncertainty: float,
+        walk_std: float, drift_std: tuple[float, float, float], sample_period: float,
+        uncertainty: float,
         observer: FixedBacklash | None = None,
     ) -> None:
         self.estimate = replace(initial, status=Status.ACQUIRING)
@@ -91,6 +93,7 @@ class MovingHorizon:
         self._around = Around(
             model, build_error_model(model, uncertainty), max(noise_std, SMALLEST_NOISE)
         )
+        self._told_walk = walk_std
         self._before = observer
         self._observer: Observer | None = None
         self._no_state = [0.0] * model.order
@@ -217,8 +220,12 @@ class MovingHorizon:
         if self._before is not None:
             self._before = self._before.with_model(model)
 
-    def set_noise(self, noise_std: float, drift_std: Array) -> None:
-        """Take another first guess of the noise; whatever was learned stays."""
+    def set_noise(self, noise_std: float, walk_std: float, drift_std: Array) -> None:
+        """Take another first guess of the noise and the walk; whatever was learned stays.
+
+        drift_std: random walk of m, c_r, c_l per square root of a sample, shape (3,).
+        """
+        self._told_walk = walk_std
         self._around = self._around._replace(told_std=max(noise_std, SMALLEST_NOISE))
         self._drift, self._drifts = drift_std, bool(drift_std.any())
 
@@ -349,7 +356,7 @@ class MovingHorizon:
         first = max(record.first, end - SEARCHED)
         record.forget_before(first)
         v, y = record.since(first)
-        around = self._around._replace(prior=None, most=inf, walk=0.0)
+        around = self._around._replace(prior=None, most=inf, walk=self._told_walk)
         found = yield from searched(v, y, around, self._widest, self._pace)
         if self._inherited is not None:
             half = len(v) // 2

@@ -1,0 +1,27 @@
+"""What a script without ROS may import from the core."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+import backlash_ros.core as core
+
+
+@pytest.mark.parametrize('name', core.__all__)
+def test_every_public_name_is_there(name: str) -> None:
+    assert getattr(core, name).__doc__
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(AttributeError, match='nonsense'):
+        _ = core.nonsense
+
+
+def test_example_of_the_package_runs() -> None:
+    assert core.__doc__ is not None
+    code = '\n'.join(line.strip() for line in core.__doc__.splitlines()[2:])
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert 2.0 < float(done.stdout) < 4.0
