@@ -142,6 +142,20 @@ def test_page_tells_the_summary_and_the_parameters(page: Path) -> None:
     assert 'law: lms' in html
 
 
+def test_page_tells_what_is_known_of_the_fit(run: RunRecord, tmp_path: Path) -> None:
+    believed_then = LearnedModel((0.1,), (1.0, -0.5), 0, (0.1,) * 5, 1.234, 0.0567)
+    pages = {}
+    for name, learned in (('known', believed_then), ('unknown', None)):
+        (tmp_path / name).mkdir()
+        report.report_run(replace(run, learned=learned), tmp_path / name, PARAMETERS)
+        pages[name] = (tmp_path / name / 'report.html').read_text(encoding='utf-8')
+    assert '<td>noise on y, learned / told</td><td>1.23</td>' in pages['known']
+    assert '<td>unexplained motion of u</td><td>5.67 % of m times the gap</td>' in pages['known']
+    assert '<td>unexplained motion of u</td><td>–</td>' in pages['unknown']
+    for html in pages.values():
+        assert '<td>state at the end</td><td>tracking</td>' in html
+
+
 def test_summary_of_a_bag_tells_latency_losses_and_truth(page: Path) -> None:
     summary = json.loads((page.parent / 'summary.json').read_text())
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 0.4, 'p99': 0.4})

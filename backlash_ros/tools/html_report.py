@@ -6,6 +6,7 @@ import base64
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from math import isfinite
 from typing import Any
 
 NAMES = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
@@ -123,6 +124,7 @@ def _facts_table(summary: Mapping[str, Any]) -> str:
     latency = summary['loop_latency_ms']
     control, tracking = summary['control_error_rms'], summary['tracking_error_rms']
     duration = summary['samples'] + summary['lost_samples']
+    unexplained, share = summary['unexplained'], summary['status_share']
     facts = [
         ('samples', f'{summary["samples"]} in {duration * summary["sample_period"]:.6g} s'),
         ('lost samples', str(summary['lost_samples'])),
@@ -136,6 +138,12 @@ def _facts_table(summary: Mapping[str, Any]) -> str:
          NOTHING if latency is None else f'{latency["p50"]:.3g} ms'),
         ('latency y → v, 99th percentile',
          NOTHING if latency is None else f'{latency["p99"]:.3g} ms'),
+        ('state at the end', escape(summary['final_status'] or NOTHING)),
+        ('noise on y, learned / told', _number(summary['noise_ratio'], 3)),
+        ('unexplained motion of u', NOTHING if unexplained is None or not isfinite(unexplained)
+         else f'{100.0 * unexplained:.3g} % of m times the gap'),
+        ('samples in state tracking',
+         NOTHING if share is None else f'{100.0 * share["tracking"]:.3g} %'),
     ]
     rows = [(*facts[i], *facts[i + 1]) for i in range(0, len(facts), 2)]
     body = ''.join(f'<tr>{"".join(f"<td>{cell}</td>" for cell in row)}</tr>' for row in rows)

@@ -17,6 +17,7 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.constants import (
     CANDIDATES,
     ENGAGED,
+    FAR,
     GROWTH,
     NO_GAP,
     UNDECIDED_BY,
@@ -94,37 +95,37 @@ def searched(
     )
     if not found.candidates or found.candidates[0].evidence < found.null + ENGAGED:
         return None
-    best: Fitted | None = None
+    fits = []
     for candidate in _apart(found.candidates):
         start = Start(candidate.gap, candidate.start)
-        result = yield from fitted(v, y, around, start, candidate.m, pace)
-        if best is None \
-                or result.solution.posterior.evidence > best.solution.posterior.evidence:
-            best = result
-    assert best is not None
+        fits.append((yield from fitted(v, y, around, start, candidate.m, pace)))
+    best = max(fits, key=lambda fit: fit.solution.posterior.evidence)
+    # With an error of G the evidence is that of the best error for each gap: too flat to tell.
+    if not around.error.count:
+        best = best._replace(decided=not any(_rivals(best, other) for other in fits))
+    decided = best.decided
     result, around = yield from with_better_model(v, y, around, best, pace)
-    gap = result.solution.gap
-    likely = found.candidates[0].evidence - UNDECIDED_BY
-    if around.error.count:
-        # The evidence of a search is that of the best error of G for each gap: too flat to tell.
-        return result, around
-    # What is closer has led to this fit.
-    far = max(3.0 * result.solution.std_gap, ZOOM[0] * gap)
-    others = any(
-        candidate.evidence > likely and abs(candidate.gap - gap) > far
-        for candidate in found.candidates
+    return result._replace(decided=decided), around
+
+
+def _rivals(best: Fitted, other: Fitted) -> bool:
+    """Whether the gap of another fit is nearly as likely, and not the same."""
+    behind = best.solution.posterior.evidence - other.solution.posterior.evidence
+    apart = abs(other.solution.gap - best.solution.gap)
+    return behind < UNDECIDED_BY and apart > 3.0 * best.solution.std_gap + ZOOM[0] * abs(
+        best.solution.gap
     )
-    return result._replace(decided=not others), around
 
 
 def _apart(candidates: list[Candidate]) -> list[Candidate]:
-    """The best candidates whose gaps are no neighbours."""
+    """The best candidates whose gaps are no neighbours, and the best ones far from them."""
     chosen: list[Candidate] = []
-    for candidate in candidates:
-        if all(abs(candidate.gap - other.gap) > NEIGHBOURS * other.gap for other in chosen):
-            chosen.append(candidate)
-        if len(chosen) == CANDIDATES:
-            break
+    for least, count in ((NEIGHBOURS, CANDIDATES), (ZOOM[0], CANDIDATES + FAR)):
+        for candidate in candidates:
+            if len(chosen) == count:
+                break
+            if all(abs(candidate.gap - other.gap) > least * other.gap for other in chosen):
+                chosen.append(candidate)
     return chosen
 
 
