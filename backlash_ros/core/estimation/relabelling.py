@@ -99,7 +99,8 @@ def searched(
     for candidate in _apart(found.candidates):
         start = Start(candidate.gap, candidate.start)
         fits.append((yield from fitted(v, y, around, start, candidate.m, pace)))
-    best = max(fits, key=lambda fit: fit.solution.posterior.evidence)
+    # Those far away only tell whether the choice is clear.
+    best = max(fits[:CANDIDATES], key=lambda fit: fit.solution.posterior.evidence)
     # With an error of G the evidence is that of the best error for each gap: too flat to tell.
     if not around.error.count:
         best = best._replace(decided=not any(_rivals(best, other) for other in fits))
