@@ -101,7 +101,7 @@ def test_losing_a_fifth_of_y_costs_no_more_than_its_information() -> None:
 
 
 def test_quantised_output_still_gives_two_per_mille_after_one_second() -> None:
-    run = build_closed_loop(Parameters({'output_quantum': 1e-3})).run(101)
+    run = build_closed_loop(Parameters({**EXACT, 'output_quantum': 1e-3})).run(101)
     assert relative_errors(run)[-1].max() <= 0.002
 
 

@@ -106,4 +106,7 @@ def test_what_was_learned_is_held_while_the_data_contradict_it() -> None:
     learned = Loop(p).run(build_controller(p), 400)[-1]
     after = Loop(p).run(build_controller(p, learned), 300, deaf=300)
     assert after[-1].status == Status.INCONSISTENT
-    assert {(e.m, e.c_r, e.c_l) for e in after} == {(learned.m, learned.c_r, learned.c_l)}
+    # What fits before y has to move is learned from: it moves nothing by more than its deviation.
+    for name in ('m', 'c_r', 'c_l'):
+        held, std = getattr(learned, name), getattr(learned, f'std_{name}')
+        assert max(abs(getattr(e, name) - held) for e in after) < std
