@@ -273,6 +273,9 @@ class MovingHorizon:
                 return  # all is at rest: the next motion goes on from here as if at once
         elif self._observer is not None and self._since_motion > memory:
             self._paused = True
+            if self._current is not None and self._since_motion % BLOCK[1] == 0:
+                # No fit says any more where the state is.
+                self._observer.settle(self._current.solution.posterior.noise_std)
             return
         if self._paused or len(self._record) == CAPACITY:
             # The samples between are missing, or there was no time to take any in.
