@@ -12,6 +12,6 @@ def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> No
     latencies = np.random.default_rng(3).gamma(2.0, 1e-4, 40)
     statistics = LoopStatistics()
     for latency in latencies:
-        statistics.note(0.0, False, float(latency))
+        statistics.note(0.0, 0.0, False, float(latency))
     reported = _latency_ms(latencies)
     assert reported == {'p50': statistics.latency_ms(0.5), 'p99': statistics.latency_ms(0.99)}

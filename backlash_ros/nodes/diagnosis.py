@@ -16,7 +16,7 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import stated_deviations
 from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.nodes.causes import Finding, Level, LoopFigures, Peer, findings_of
+from backlash_ros.nodes.causes import LONGEST_TEXT, Finding, Level, LoopFigures, Peer, findings_of
 from backlash_ros.nodes.control_loop import ControlLoop
 from backlash_ros.nodes.driver_io import DriverIo
 from backlash_ros.nodes.loop_statistics import Lately
@@ -96,10 +96,11 @@ class Diagnosis:
         io = self._io
         if not io.skipped:
             return []
-        return [Finding(
-            Level.ERROR, 'joint', f'{io.topics.output} has no {p.word("io.field")} of joint '
-            f'{p.word("io.joint")!r}: set io.joint, io.field',
-        )]
+        text = (
+            f'{io.topics.output} has no {p.word("io.field")} of joint {p.word("io.joint")!r} but '
+            f'{io.seen}: set io.joint, io.field'
+        )
+        return [Finding(Level.ERROR, 'joint', text[:LONGEST_TEXT])]
 
 
 def _details(findings: list[Finding], figures: LoopFigures) -> dict[str, object]:

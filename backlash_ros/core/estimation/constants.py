@@ -20,7 +20,7 @@ GAPS = 32  # gaps that are compared, geometric between NO_GAP and 1 times the sw
 STARTS = 5  # places within each gap at which the play output may have begun
 ZOOM = (0.2, 17)  # second look: relative reach around the best gap, and gaps within it
 ENGAGED = 15.0  # log-likelihood by which a gap must beat a constant u
-UNDECIDED_BY = 6.0  # log-likelihood by which another gap may fall behind: the best of some 300 is ahead
+UNDECIDED_BY = 6.0  # log-likelihood by which another gap may fall behind: some 300 are compared
 CANDIDATES = 3  # best gaps of a search that are fitted
 FAR = 2  # ... and gaps far from them
 
