@@ -89,11 +89,10 @@ class MovingHorizon:
         self._bounds = bounds
         self._drift = np.array(drift_std) * sample_period**0.5
         self._drifts = any(drift_std)
-        self._told = model
         self._around = Around(
             model, build_error_model(model, uncertainty), max(noise_std, SMALLEST_NOISE)
         )
-        self._told_walk = walk_std
+        self._told, self._told_walk = self._around, walk_std
         self._before = observer
         self._observer: Observer | None = None
         self._no_state = [0.0] * model.order
@@ -482,6 +481,17 @@ class MovingHorizon:
             v, y, around, start.with_gap(solution.gap, v), solution.m, self._pace
         )
         result, around = yield from with_better_model(v, y, around, result, self._pace)
+        if around.model is not self._told.model:
+            # A G that was moved step by step may have gone astray: what fits best from the one
+            # that was told is as good a beginning.
+            told = around._replace(
+                model=self._told.model, error=self._told.error, scale=0.0
+            )
+            begin = start.with_gap(result.solution.gap, v)
+            afresh = yield from fitted(v, y, told, begin, result.solution.m, self._pace)
+            again = yield from with_better_model(v, y, told, afresh, self._pace)
+            if _evidence(again[0]) > _evidence(result):
+                result, around = again
         result, around = yield from with_walk(v, y, around, result, self._pace)
         if len(v) <= SEARCHED and around.prior is None:
             # The gap of a short record may be one of several.

@@ -3,7 +3,7 @@
     y = X_b b + X_e e + noise,  noise ~ N(0, sigma^2),  e ~ N(0, (s m)^2 I)
 
 b has no prior. sigma^2 is inverse gamma with few degrees of freedom around the told one; all scales
-s of a grid are weighed by their evidence. X is kept as the triangle of its QR decomposition, so
+s of a grid, s ~ N(0, 1), are weighed by their evidence. X is kept as the triangle of its QR decomposition, so
 that rows may come in pieces.
 All of it in closed form from one singular value decomposition.
 
@@ -116,6 +116,8 @@ class Triangle:
         left = squares + shrink @ (z * z)
         evidence = 0.5 * np.log(shrink).sum(axis=1) - 0.5 * weight * np.log(left / weight)
         scales = np.sqrt(ratios[:, 0] * left / freedom)
+        # The uncertainty that was told is the deviation of what s = 1 stands for.
+        evidence -= 0.5 * scales**2
         # Half a step of the grid beyond is the same. None at all, and the largest one, remain.
         evidence[:-1][scales[:-1] < least_scale * SAME] = -np.inf
         evidence[1:][scales[1:] > most_scale / SAME] = -np.inf

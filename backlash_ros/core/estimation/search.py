@@ -148,6 +148,7 @@ class _Comparison:
         shrink = 1.0 / (1.0 + ratios * s[:, None, :])
         left = squares[:, None] + (shrink * z2[:, None, :]).sum(axis=2)
         evidence = 0.5 * np.log(shrink).sum(axis=2) + self._log_likelihood(left)
+        evidence -= 0.5 * np.append(0.0, SCALES**2)  # as regression.py has it
         return evidence.max(axis=1), slopes
 
     def _log_likelihood(self, squares: Array | float) -> Array:
