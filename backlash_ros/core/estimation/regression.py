@@ -3,9 +3,8 @@
     y = X_b b + X_e e + noise,  noise ~ N(0, sigma^2),  e ~ N(0, (s m)^2 I)
 
 b has no prior. sigma^2 is inverse gamma with few degrees of freedom around the told one; all scales
-s of a grid, s ~ N(0, 1), are weighed by their evidence. X is kept as the triangle of its QR decomposition, so
-that rows may come in pieces.
-All of it in closed form from one singular value decomposition.
+s of a grid are weighed by their evidence, with s ~ N(0, 1). X is kept as the triangle of its QR
+decomposition, so that rows may come in pieces; all else is one singular value decomposition.
 
 Reference: A. Gelman et al., Bayesian Data Analysis, 3rd ed., ch. 14; the evidence for s: D. MacKay,
 Bayesian interpolation, Neural Computation 4 (1992) 415-447.
