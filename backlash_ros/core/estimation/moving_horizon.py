@@ -204,6 +204,8 @@ class MovingHorizon:
     def adapting(self, adapting: bool) -> None:
         if adapting and not self._adapting:
             self._restart_record()
+        elif not adapting:
+            self._task = None  # a fit that is under way would still move the estimate
         self._adapting = adapting
 
     def adopt(self, model: StateModel) -> None:
