@@ -62,6 +62,10 @@ Array = NDArray[np.float64]
 Task = Generator[None, None, None]
 
 CAPACITY = 2 * LONGEST  # samples kept: those that are fitted, and those that come meanwhile
+CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
+AT_REST = 3  # memories of G after which nothing moves any more
+TOLD = 1.0  # scale of the error of G that was told
+FEW = 0.2  # share of a block that may be outliers
 
 
 class MovingHorizon:
@@ -416,8 +420,7 @@ class MovingHorizon:
             least = min(least, free[0].solution.rms)
         solution = kept.solution
         good = solution.rms <= AS_GOOD * least and kept.fit.plausible(solution)
-        moved = solution.theta - prior.theta
-        same = float(moved @ np.linalg.solve(prior.cov, moved)) <= CHI2
+        same = not _beyond_chance(solution.theta - prior.theta, prior.cov)
         return (kept, around) if good and same else None
 
     def _take_block(self) -> Task:
@@ -754,12 +757,10 @@ def _evidence(result: Fitted) -> float:
 
 
 def _contradicts(solution: Solution, other: Prior) -> bool:
-    """Whether two estimates of theta differ by more than chance, 1 in 1,000."""
-    difference = solution.theta - other.theta
-    return float(difference @ np.linalg.solve(solution.theta_cov + other.cov, difference)) > CHI2
+    """Whether two estimates of theta differ by more than chance."""
+    return _beyond_chance(solution.theta - other.theta, solution.theta_cov + other.cov)
 
 
-CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
-AT_REST = 3  # memories of G after which nothing moves any more
-TOLD = 1.0  # scale of the error of G that was told
-FEW = 0.2  # share of a block that may be outliers
+def _beyond_chance(difference: Array, cov: Array) -> bool:
+    """Whether a difference (3,) of this covariance (3, 3) is one in 1,000 or rarer."""
+    return float(difference @ np.linalg.solve(cov, difference)) > CHI2

@@ -42,6 +42,10 @@ class Start(NamedTuple):
     side: int = 0
     v_a: float = 0.0
 
+    def labels(self, v: Array) -> Labels:
+        """What the play operator says of v (N,) from here on."""
+        return labels_of(v, self.gap, self.p, self.side, self.v_a)
+
     def with_gap(self, gap: float, v: Array) -> Start:
         """The same for another gap, before v (N,): a side that was engaged stays so."""
         gap = max(gap, 0.0)
@@ -160,7 +164,7 @@ class WindowFit:
         `take` is to follow.
         """
         play = self._play
-        labels = labels_of(v, play.gap, play.p, play.side, play.v_a)
+        labels = play.labels(v)
         self._advance(labels)
         self._highest = max(self._highest, float(v.max()))
         self._lowest = min(self._lowest, float(v.min()))
@@ -217,7 +221,7 @@ class WindowFit:
     def start_after(self, v: Array) -> Start:
         """Where the play operator stands after v (N,), the first samples of this fit."""
         start = self.start
-        labels = labels_of(v, start.gap, start.p, start.side, start.v_a)
+        labels = start.labels(v)
         side = int(labels.right[-1] - labels.left[-1])
         return Start(start.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
 
@@ -334,7 +338,7 @@ class WindowFit:
     def input(self, solution: Solution, v: Array) -> Array:
         """u as the fit has it, shape (N,). v: the samples taken in."""
         start, n = self.start, self.layout.n
-        labels = labels_of(v, start.gap, start.p, start.side, start.v_a)
+        labels = start.labels(v)
         mean = solution.posterior.mean
         held, m, right, left = mean[n:n + 4]
         walked = mean[self.layout.walk] @ self._regressors.ramps(0, len(v))
