@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from math import inf, pi
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -19,11 +20,13 @@ from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.pole_placement import PolePlacement, place_poles
 from backlash_ros.core.proportional import Proportional
 from backlash_ros.core.simulated_plant import SimulatedPlant
+from backlash_ros.core.slope_tolerance import margin_in_pieces
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import Adoption, Structure
 from backlash_ros.core.tracking import Tracking
 from backlash_ros.core.tracking_design import (
     Replay,
+    TrackingDesign,
     Weights,
     better_design_in_pieces,
     design,
@@ -31,6 +34,7 @@ from backlash_ros.core.tracking_design import (
 from backlash_ros.core.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
+T = TypeVar('T')
 
 PERIOD, NOISE = 0.005, 1e-4
 WEIGHTS = Weights(1e-2, 0.0, 60)
@@ -204,24 +208,44 @@ def test_replay_is_what_the_structure_would_have_done() -> None:
         assert q_replayed == pytest.approx(q, rel=1e-9, abs=1e-9)
 
 
-def redesigned(told: TransferFunction, better: TransferFunction, weights: Weights) -> bool:
-    pieces = better_design_in_pieces(StateModel(better), weights, design(StateModel(told), weights))
+def finished(pieces: Generator[None, None, T]) -> T:
     while True:
         try:
             next(pieces)
         except StopIteration as done:
-            return done.value is not None
+            result: T = done.value
+            return result
 
 
-def test_a_design_with_less_margin_than_the_present_one_is_refused() -> None:
-    assert redesigned(motor(), motor(0.5), WEIGHTS)
-    # With an integral the loop around a motor half as fast keeps 0.24 where it kept 0.31.
-    assert not redesigned(motor(), motor(0.5), Weights(1e-2, 1e-3, 60))
+def redesigned(
+    told: TransferFunction, better: TransferFunction, weights: Weights,
+) -> TrackingDesign | None:
+    return finished(better_design_in_pieces(
+        StateModel(better), weights, design(StateModel(told), weights)
+    ))
+
+
+def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> None:
+    safe = redesigned(motor(), motor(0.5), WEIGHTS)
+    assert safe is not None
+    assert safe.feedback.gain == pytest.approx(safe.gains.state)
+    # With an integral the loop around a motor half as fast would keep 0.24 where it kept 0.31.
+    weights = Weights(1e-2, 1e-3, 60)
+    present = design(StateModel(motor()), weights)
+    softer = redesigned(motor(), motor(0.5), weights)
+    assert softer is not None
+    nominal = design(softer.model, weights)
+    had = finished(margin_in_pieces(present.model, present.feedback))
+    assert finished(margin_in_pieces(softer.model, nominal.feedback)) < had
+    assert finished(margin_in_pieces(softer.model, softer.feedback)) >= had
+    # The trajectory is not slower for it.
+    assert softer.gains.preview == pytest.approx(nominal.gains.preview)
 
 
 def test_a_model_without_gains_is_refused() -> None:
     # The zero cancels the pole at 1.2, which no feedback can move then.
-    assert not redesigned(motor(), TransferFunction([1.0, -1.2], [1.0, -1.7, 0.6]), WEIGHTS)
+    unmoved = TransferFunction([1.0, -1.2], [1.0, -1.7, 0.6])
+    assert redesigned(motor(), unmoved, WEIGHTS) is None
 
 
 def adoptions(structure: Structure) -> Iterator[Adoption | None]:

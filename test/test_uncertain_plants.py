@@ -134,6 +134,16 @@ def positions(load: CoastingLoad, control: np.ndarray) -> np.ndarray:
     return np.array(result)
 
 
+@pytest.mark.parametrize('seed', [0, 1])
+def test_first_swap_waits_until_the_gap_was_crossed_with_the_first_estimate(seed: int) -> None:
+    [job] = motor_jobs(
+        {'case': {'truth.scale_frequency': 0.8}}, [seed], 4.0, structure='tracking'
+    )
+    figures = run_job(job)
+    assert figures.swaps > 0
+    assert figures.worst_swap <= 1.0
+
+
 def test_load_that_is_pushed_follows_like_the_told_plant() -> None:
     load = CoastingLoad(Backlash(0.1, 0.5, -0.4), PERIOD)
     # Away from the gap, rising ever slower, it stays in contact.

@@ -182,7 +182,7 @@ class AdaptiveController:
                 break
             else:
                 proposal = learner.proposal
-                if proposal is None or proposal is self._considered:
+                if proposal is None or proposal is self._considered or not self.structure.settled:
                     return
                 self._considered, self._design = proposal, self.structure.design(proposal)
 

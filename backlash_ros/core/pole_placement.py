@@ -116,6 +116,11 @@ class PolePlacement:
         self._reach = 0.0  # largest of it so far
         self.delay = round(_delay_of(blocks.reference))
 
+    @property
+    def settled(self) -> bool:
+        """Nothing here changes with G."""
+        return True
+
     def design(self, model: StateModel) -> Iterator[Adoption | None]:
         """The gains stay those of the G that was told."""
         return iter(())

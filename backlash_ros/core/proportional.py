@@ -39,6 +39,11 @@ class Proportional:
         if isinstance(other, Proportional):
             self._estimate = other._estimate
 
+    @property
+    def settled(self) -> bool:
+        """Nothing here changes with G."""
+        return True
+
     def design(self, model: StateModel) -> Iterator[Adoption | None]:
         """Nothing here depends on G."""
         yield lambda source: None

@@ -68,6 +68,10 @@ class Structure(Protocol):
     def needs_output(self) -> bool:
         """Whether u_d(k) depends on y(k); else v(k) may leave before y(k) was learned from."""
 
+    @property
+    def settled(self) -> bool:
+        """Whether v moves as the present estimate and design ask, not still on its way there."""
+
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""
 

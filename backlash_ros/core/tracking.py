@@ -40,6 +40,8 @@ WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is un
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
 # wrong is contradicted by then. Until then feedback hardens step by step.
 TRUSTED_AFTER = 40
+# Samples after which the first crossing of the gap that an estimate asks for is over.
+SETTLED_AFTER = 150
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
 
@@ -84,6 +86,7 @@ class Tracking:
         self._width = 1.0  # bound on feedback in reaches, while the backlash is unknown
         self._known = False  # whether the estimate comes from data
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
+        self._in_use_for = 0  # samples since an estimate is known
         self._level = self._free = 0  # softer while v does not follow, samples since it last did
         self._softness = 0  # of the gain in use
         self._u_d = 0.0  # of the sample before
@@ -96,15 +99,20 @@ class Tracking:
         """The model of G whose gains are in use."""
         return self._design.model
 
+    @property
+    def settled(self) -> bool:
+        """Whether the estimate has been in use for long enough to have moved v."""
+        return self._in_use_for >= SETTLED_AFTER
+
     def _use(self, chosen: TrackingDesign) -> None:
-        model, gains = chosen.model, chosen.gains
+        model, gains, feedback = chosen.model, chosen.gains, chosen.feedback.gain
         self._design = chosen
         self._a: list[list[float]] = model.a.tolist()
         self._b: list[float] = model.b.tolist()
         self._k: list[float] = gains.state.tolist()
-        self._soft: list[list[float]] = [gain.tolist() for gain in (gains.state, *chosen.softer)]
+        self._soft: list[list[float]] = [gain.tolist() for gain in (feedback, *chosen.softer)]
         # What an error of y calls for that would not matter at rest: never too much feedback.
-        self._tolerated = TOLERANCE * self._noise_std * sqrt(dot(self._k, self._k))
+        self._tolerated = TOLERANCE * self._noise_std * float(np.linalg.norm(feedback))
         self._careful = None if chosen.careful is None else chosen.careful.tolist()
         self._x_cov: Array | None = None
         self._x_std = self._feedback_std = 0.0  # of x_hat and of K x_hat, as in x_cov
@@ -123,6 +131,7 @@ class Tracking:
         self._rest.go_on_from(other._rest)
         if state_known:
             self._trusted_for, self._width = other._trusted_for, other._width
+            self._in_use_for = other._in_use_for
             self._asked, self._known = other._asked, other._known
             self._resumes, self._blind_for = other._resumes, other._blind_for
         else:
@@ -157,7 +166,7 @@ class Tracking:
         else:
             feedback = self._careful_feedback(deviation)
         if trusted and gains.integral:
-            feedback += gains.integral * (self._integral - self._q)
+            feedback += self._design.feedback.integral * (self._integral - self._q)
         most = LARGEST_FEEDBACK * max(self._reach, self._tolerated)
         self._bounded_before = bounded = not -most <= feedback <= most
         if bounded:
@@ -222,7 +231,7 @@ class Tracking:
         else:
             feedback = self._bounded(deviation)
         if self._trusted_for >= TRUSTED_AFTER:
-            feedback += new.gains.integral * (self._integral - q)
+            feedback += new.feedback.integral * (self._integral - q)
         # The plant is at the next sample when the next command is made.
         self._q += window.item(0) - new.model.c * x[0]
         self._ideal, self._x = ideal, onward
@@ -286,8 +295,9 @@ class Tracking:
         """
         self._known = _is_known(estimate, self._known)
         if not (self._known and estimate.learned):
-            self._trusted_for = 0
+            self._trusted_for = self._in_use_for = 0
             return False
+        self._in_use_for += 1
         if first:
             self._trusted_for = TRUSTED_AFTER
         if self._trusted_for < TRUSTED_AFTER:
@@ -301,7 +311,8 @@ class Tracking:
             self._x_std = self._feedback_std = 0.0
             return
         rows: list[list[float]] = x_cov.tolist()
-        variance = dot(self._k, [dot(row, self._k) for row in rows])
+        gain = self._soft[0]
+        variance = dot(gain, [dot(row, gain) for row in rows])
         self._feedback_std = sqrt(max(variance, 0.0))
         self._x_std = sqrt(max(sum(row[i] for i, row in enumerate(rows)), 0.0))
 

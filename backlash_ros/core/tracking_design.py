@@ -17,9 +17,12 @@ from backlash_ros.core.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-# Times the input weight while v meets its limits or the estimate is new; the last one while the
-# backlash is unknown.
+# Times the input weight of the feedback while v meets its limits or the estimate is new; the last
+# one while the backlash is unknown.
 SOFTER = (1e1, 1e2, 1e3, 1e4)
+# Times the input weight with which feedback around a better G is tried in turn until its loop is
+# as safe as the one it replaces. The trajectory keeps the weight that was asked for.
+SAFER = (1.0, 3.0, 10.0, 30.0, 100.0)
 # Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
 # are led astray by any feedback that would help, and learn faster than they go astray without.
 WRONG_SLOPE = 1.35
@@ -44,8 +47,9 @@ class Weights:
 class TrackingDesign:
     """Gains of one model of G.
 
-    softer: gains (n,) to replace that of the state with, step by step, while v meets its limits,
-    where full feedback would cycle between them, and while the estimate is new.
+    gains: of the ideal trajectory. feedback: of the deviations from it. softer: gains (n,) to
+    replace that of the state with, step by step, while v meets its limits, where full feedback
+    would cycle between them, and while the estimate is new.
     careful: gain (n,) while the backlash is unknown; None where no feedback is better.
     gentle: gain (n,) that leads y back while the reference rests. push: |x| after REST_HORIZON
     samples of u = 1.
@@ -53,30 +57,28 @@ class TrackingDesign:
 
     model: StateModel
     gains: PreviewGains
+    feedback: Feedback
     softer: tuple[Array, ...]
     careful: Array | None
     gentle: Array
     push: float
 
-    @property
-    def feedback(self) -> Feedback:
-        """Full feedback of the state and of the integral."""
-        return Feedback(self.model, self.gains.state, self.gains.integral)
-
 
 def design_in_pieces(
-    model: StateModel, weights: Weights,
+    model: StateModel, weights: Weights, softness: float = 1.0,
 ) -> Generator[None, None, TrackingDesign]:
     """Return the design; stops after each Riccati equation.
 
-    Raises ParameterError where no gains exist.
+    softness: see `feedback_around`. Raises ParameterError where no gains exist.
     """
-    rho = weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
+    rho = input_weight(model, weights)
     gains = lq_gains(model, rho, weights.integral_weight, weights.preview)
+    yield
+    feedback = feedback_around(model, weights, softness)
     yield
     softer = []
     for more in SOFTER:
-        softer.append(lq_gains(model, more * rho).state)
+        softer.append(lq_gains(model, max(more, softness) * rho).state)
         yield
     bears_wrong_slope = _bears_wrong_slope(model, SOFTER[-1] * rho)
     yield
@@ -84,9 +86,8 @@ def design_in_pieces(
     gentle = lq_gains(model, power_gain(model.transfer_function, REST_BANDWIDTH)).state
     yield
     push = float(np.linalg.norm(powers(model.a, model.b, REST_HORIZON).sum(axis=0)))
-    return TrackingDesign(
-        model, gains, tuple(softer), softer[-1] if bears_wrong_slope else None, gentle, push
-    )
+    careful = softer[-1] if bears_wrong_slope else None
+    return TrackingDesign(model, gains, feedback, tuple(softer), careful, gentle, push)
 
 
 def better_design_in_pieces(
@@ -96,20 +97,26 @@ def better_design_in_pieces(
 
     It replaces the present one where its loop around the better G keeps a modulus margin that is
     usual (SAFE_MARGIN), or at least as large as that of the present loop around the G it was made
-    for or around the better one. A loop that is unstable around the better G is replaced by any
-    stable one; an unstable one replaces none.
+    for or around the better one; feedback is made as soft as this takes. A loop that is unstable
+    around the better G is replaced by any stable one; an unstable one replaces none.
     """
-    try:
-        new = yield from design_in_pieces(model, weights)
-    except ParameterError:
-        return None
     needed = SAFE_MARGIN
-    margin = yield from margin_in_pieces(model, new.feedback)
-    for plant in (present.model, model):
-        if 0.0 < margin < needed:
-            theirs = yield from margin_in_pieces(plant, present.feedback)
-            needed = min(needed, theirs)
-    return new if margin > 0.0 and needed <= margin else None
+    compared = False
+    for softness in SAFER:
+        try:
+            feedback = feedback_around(model, weights, softness)
+        except ParameterError:
+            return None
+        yield
+        margin = yield from margin_in_pieces(model, feedback)
+        if margin < needed and not compared:
+            compared = True
+            for plant in (present.model, model):
+                theirs = yield from margin_in_pieces(plant, present.feedback)
+                needed = min(needed, theirs)
+        if margin > 0.0 and margin >= needed:
+            return (yield from design_in_pieces(model, weights, softness))
+    return None
 
 
 def design(model: StateModel, weights: Weights) -> TrackingDesign:
@@ -160,6 +167,21 @@ def powers(a: Array, b: Array, count: int) -> Array:
         stack = np.concatenate([stack, factor @ stack if b.ndim > 1 else stack @ factor.T])
         factor = factor @ factor
     return stack[:count]
+
+
+def feedback_around(model: StateModel, weights: Weights, softness: float) -> Feedback:
+    """Of deviations from the trajectory, as if the input weighed `softness` times as much.
+
+    Raises ParameterError where no gains exist.
+    """
+    rho = softness * input_weight(model, weights)
+    gains = lq_gains(model, rho, weights.integral_weight)
+    return Feedback(model, gains.state, gains.integral)
+
+
+def input_weight(model: StateModel, weights: Weights) -> float:
+    """rho of the trajectory."""
+    return weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
 
 
 def power_gain(model: TransferFunction, frequency: float) -> float:
