@@ -125,6 +125,7 @@ class MovingHorizon:
         self._search_at = self._record.end + FIRST_SEARCH
         self._refit_at = 0.0  # length of the record at which all of it is fitted anew
         self._moved_at = 0  # ... from which a gap that moved is reason to do so
+        self._refitted = False  # whether it was fitted anew since it contradicts itself
         self._contradicted_from = None
 
     # --- what it tells -------------------------------------------------------------------------
@@ -353,6 +354,12 @@ class MovingHorizon:
             return self._refit()
         aged = solution.correlation > 0.0 or self._drifts_more(solution, length)
         if aged and record.end >= self._next_try:
+            if self._around.error.count and not self._refitted:
+                # What contradicts may be a G that went astray: the plant has changed only where
+                # the best fit of all says so.
+                self._refitted = True
+                return self._refit()
+            self._refitted = False
             return self._halve()
         return None
 
@@ -482,21 +489,20 @@ class MovingHorizon:
                 prior = self._drifted(part.solution, len(v) - gone)
             around = around._replace(prior=prior, most=around.most if prior else inf)
         v, y = record.since(first)
-        result = yield from fitted(
-            v, y, around, start.with_gap(solution.gap, v), solution.m, self._pace
-        )
-        result, around = yield from with_better_model(v, y, around, result, self._pace)
-        if around.model is not self._told.model:
+        start = start.with_gap(solution.gap, v)
+        if around.model is self._told.model:
+            result, around = yield from self._fitted(v, y, around, start, solution.m)
+        else:
             # A G that was moved step by step may have gone astray: what fits best from the one
             # that was told is as good a beginning.
             told = around._replace(
                 model=self._told.model, error=self._told.error, scale=0.0
             )
-            begin = start.with_gap(result.solution.gap, v)
-            afresh = yield from fitted(v, y, told, begin, result.solution.m, self._pace)
-            again = yield from with_better_model(v, y, told, afresh, self._pace)
-            if _evidence(again[0]) > _evidence(result):
-                result, around = again
+            afresh = yield from self._fitted(v, y, told, start, solution.m)
+            around = around._replace(scale=afresh[1].scale)
+            result, around = yield from self._fitted(v, y, around, start, solution.m)
+            if _evidence(afresh[0]) > _evidence(result):
+                result, around = afresh
         result, around = yield from with_walk(v, y, around, result, self._pace)
         if len(v) <= SEARCHED and around.prior is None:
             # The gap of a short record may be one of several.
@@ -505,6 +511,13 @@ class MovingHorizon:
                     and _evidence(other[0]) > _evidence(result):
                 result, around = other
         self._install(result, around, first)
+
+    def _fitted(
+        self, v: Array, y: Array, around: Around, start: Start, slope: float,
+    ) -> Generator[None, None, tuple[Fitted, Around]]:
+        """The fit of a record, with the better G that follows from it."""
+        result = yield from fitted(v, y, around, start, slope, self._pace)
+        return (yield from with_better_model(v, y, around, result, self._pace))
 
     def _halve(self) -> Task:
         """Let the older half of the record go where the newer one contradicts the whole.

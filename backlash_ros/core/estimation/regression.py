@@ -12,8 +12,8 @@ Bayesian interpolation, Neural Computation 4 (1992) 415-447.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import log, sqrt
+from dataclasses import dataclass, replace
+from math import exp, log, log1p, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ NOISE_WEIGHT = 1.0  # samples that the told noise level counts for
 # Scales s of the error of G that are compared, besides none, in units of the spread of the prior.
 SCALES = np.geomspace(1e-4, 10.0, 21)
 SAME = 0.7  # ratio of scales that the grid does not tell apart
+LARGEST_EXPONENT = 700.0  # of a number that still is one
 VAGUE = 1e-9  # weight of a prior, as a share of the norm of a column, that is no information
 
 
@@ -69,6 +70,18 @@ class Triangle:
         rows[:, where] = root
         self.append(rows, root @ mean, 0.0)
 
+    def without(self, column: int) -> Triangle:
+        """The same where this unknown is 0."""
+        size = len(self.r) - 1
+        other = Triangle(np.zeros(size - 1))
+        other.count = self.count
+        other.r = np.triu(lapack.dgeqrf(np.delete(self.r, column, axis=1))[0][:size])
+        return other
+
+    def log_precision(self, first: int, last: int) -> float:
+        """Of these unknowns given all before them: how sharply the rows tell them."""
+        return float(np.log(np.abs(np.diag(self.r)[first:last])).sum())
+
     def with_prior(self, where: slice, std: float, told_std: float) -> tuple[Triangle, float]:
         """The same with independent priors of these unknowns, and what that adds to the evidence.
 
@@ -85,8 +98,7 @@ class Triangle:
         other = Triangle(np.zeros(size))
         other.r, other.count = self.r, self.count
         other.append(rows, np.zeros(count), 0.0)
-        known = np.abs(np.diag(other.r)[where])
-        return other, count * log(sigma / std) - float(np.log(known).sum())
+        return other, count * log(sigma / std) - other.log_precision(where.start, where.stop)
 
     def posterior(
         self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,
@@ -143,3 +155,27 @@ class Triangle:
             np.concatenate([target - through @ e, e]), cov, sqrt(noise_var),
             float(scales[best]), float(evidence[best]),
         )
+
+
+def with_zero(posterior: Posterior, where: int) -> Posterior:
+    """The same with one more unknown, which is known to be 0."""
+    return replace(
+        posterior, mean=np.insert(posterior.mean, where, 0.0),
+        cov=np.insert(np.insert(posterior.cov, where, 0.0, axis=0), where, 0.0, axis=1),
+    )
+
+
+def mixture(one: Posterior, other: Posterior, bonus: float) -> Posterior:
+    """Of two models that were equally likely. bonus: what the evidence of the other leaves out."""
+    bonus += other.evidence - one.evidence
+    share = 1.0 / (1.0 + exp(-bonus)) if bonus > -LARGEST_EXPONENT else 0.0
+    noise_var = (1.0 - share) * one.noise_std**2 + share * other.noise_std**2
+    mean = (1.0 - share) * one.mean + share * other.mean
+    cov = np.zeros_like(one.cov)
+    for part, weight in ((one, 1.0 - share), (other, share)):
+        off = part.mean - mean
+        cov += (weight / noise_var) * (part.noise_std**2 * part.cov + np.outer(off, off))
+    return Posterior(
+        mean, cov, sqrt(noise_var), (one if share < 0.5 else other).scale,
+        one.evidence + max(bonus, 0.0) + log1p(exp(-abs(bonus))),
+    )

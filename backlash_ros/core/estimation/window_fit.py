@@ -19,7 +19,13 @@ from backlash_ros.core.estimation.constants import GATE, SLOW
 from backlash_ros.core.estimation.crossings import Crossings, crossings_of
 from backlash_ros.core.estimation.error_model import ErrorModel
 from backlash_ros.core.estimation.play import Labels, labels_of
-from backlash_ros.core.estimation.regression import VAGUE, Posterior, Triangle
+from backlash_ros.core.estimation.regression import (
+    VAGUE,
+    Posterior,
+    Triangle,
+    mixture,
+    with_zero,
+)
 from backlash_ros.core.estimation.regressors import RAMPS, Regressors
 from backlash_ros.core.state_model import StateModel
 
@@ -145,15 +151,13 @@ class WindowFit:
         return max(self._highest - self._lowest, 0.0)
 
     def _vague(self, y_reach: float, v_reach: float) -> Array:
-        """Weights of priors that are no information, and that of a leak."""
+        """Weights of priors that are no information."""
         n, layout = self.layout.n, self.layout
         weights = np.zeros(layout.unknowns)
         told_std = self.around.told_std
         weights[:n] = told_std / (FAR * (y_reach + told_std))
         unit = VAGUE * step_norm(self.model)
         weights[n:layout.driven] = unit
-        if layout.leak:
-            weights[layout.driven] = told_std / self.around.error.leak
         weights[n + 1] = unit * (v_reach or 1.0)
         weights[layout.walk] = unit
         return weights
@@ -246,10 +250,7 @@ class WindowFit:
         if layout.ramps:
             step = (walk or self.around.walk) / sqrt(layout.ramps)
             triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
-        posterior = triangle.posterior(
-            layout.base, self.slope, spreads, self.around.told_std, self.around.scale,
-            self.around.most,
-        )
+        posterior = self._posterior(triangle, spreads)
         posterior = replace(posterior, evidence=posterior.evidence + offset)
         residual = self.residual(posterior)
         squares = float(residual @ residual)
@@ -272,6 +273,28 @@ class WindowFit:
             float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
             inflation, sqrt(squares / max(count, 1.0)),
         )
+
+    def _posterior(self, triangle: Triangle, spreads: Array) -> Posterior:
+        """Of all unknowns: where G integrates, of an integrator that leaks and of one that does not.
+
+        One of both is as likely as the other before the data speak.
+        """
+        layout, around = self.layout, self.around
+
+        def of(part: Triangle, base: int) -> Posterior:
+            return part.posterior(
+                base, self.slope, spreads, around.told_std, around.scale, around.most
+            )
+
+        if not layout.leak:
+            return of(triangle, layout.base)
+        where, base = layout.driven, layout.base
+        leaking, offset = triangle.with_prior(
+            slice(where, where + 1), around.error.leak, around.told_std
+        )
+        tight = triangle.without(where)
+        offset += tight.log_precision(where, base - 1) - leaking.log_precision(where + 1, base)
+        return mixture(with_zero(of(tight, base - 1), where), of(leaking, base), offset)
 
     def _theta_now(self) -> Array:
         """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""
