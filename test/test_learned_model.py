@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
 from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.controller import AdaptiveController, Limits
+from backlash_ros.core.controller import LONGEST_WAIT, AdaptiveController, Limits
 from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
 from backlash_ros.core.estimation.protocol import Estimate, Interval
 from backlash_ros.core.inverse import BacklashInverse
@@ -147,7 +147,7 @@ TRUE = {
 def test_after_the_swap_y_follows_as_if_the_true_model_had_been_told(name: str) -> None:
     ideal = run(TRUE[name], TRUE[name], 10_000)
     swapped = run(motor(), TRUE[name], 600)
-    assert swapped.learner.adopted_at == 600
+    assert 600 <= swapped.learner.adopted_at <= 600 + LONGEST_WAIT + 1
     assert swapped.error(900) <= 1.03 * ideal.error(900)
     assert swapped.structure.delay == ideal.structure.delay
 
@@ -165,7 +165,7 @@ def test_no_move_at_a_swap_is_larger_than_the_largest_of_the_second_before(
     swapped = run(motor(), TRUE[name], after, 900, reference)
     moves = np.abs(np.diff(swapped.v))
     at = swapped.learner.adopted_at
-    assert at == after
+    assert after <= at <= after + LONGEST_WAIT + 1
     # Where the reference stops short, the true model asks for a larger move than any before.
     asked = np.abs(np.diff(run(TRUE[name], TRUE[name], 10_000, 900, reference).v))[at:at + 40]
     assert moves[at:at + 40].max() <= max(moves[at - 200:at].max(), 1.02 * asked.max())

@@ -14,6 +14,9 @@ from backlash_ros.core.inverse import BacklashInverse
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import Adoption, Situation, Structure
 
+# Samples after which a better design takes over though v crosses the gap: an unstable loop never
+# stops to.
+LONGEST_WAIT = 200
 LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 
 
@@ -100,6 +103,8 @@ class AdaptiveController:
         self._learner = learner
         self._considered: StateModel | None = None  # the proposal that was designed for last
         self._design: Iterator[Adoption | None] = iter(())
+        self._adoption: Adoption | None = None  # of the finished design, until it may take over
+        self._waited = 0  # samples for which it could not
         self._interval: Interval | None = None
         # y(k), the interval before it, samples lost before it and what was applied, as long as
         # it is still to be learned from.
@@ -174,17 +179,25 @@ class AdaptiveController:
         while time.perf_counter() < until:
             # A design that is begun is ended: a proposal a second would never be used otherwise.
             for adoption in self._design:
-                if adoption is not None and self._considered is not None:
-                    # At once and together: x_hat and gains of two models do not fit each other.
-                    learner.adopt(self._considered)
-                    self.adopted = self._considered
-                    adoption(self.estimator)
+                self._adoption = adoption
                 break
             else:
                 proposal = learner.proposal
-                if proposal is None or proposal is self._considered or not self.structure.settled:
+                if proposal is not None and proposal is not self._considered:
+                    self._considered, self._design = proposal, self.structure.design(proposal)
+                    self._adoption, self._waited = None, 0
+                    continue
+                if self._adoption is None:
                     return
-                self._considered, self._design = proposal, self.structure.design(proposal)
+                self._waited += 1
+                if self.structure.may_change or self._waited > LONGEST_WAIT:
+                    # At once and together: x_hat and gains of two models do not fit each other.
+                    assert self._considered is not None
+                    learner.adopt(self._considered)
+                    self.adopted = self._considered
+                    self._adoption(self.estimator)
+                    self._adoption = None
+                return
 
     def _learn(self) -> None:
         lesson, self._lesson = self._lesson, None

@@ -117,7 +117,7 @@ class PolePlacement:
         self.delay = round(_delay_of(blocks.reference))
 
     @property
-    def settled(self) -> bool:
+    def may_change(self) -> bool:
         """Nothing here changes with G."""
         return True
 

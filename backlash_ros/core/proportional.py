@@ -40,7 +40,7 @@ class Proportional:
             self._estimate = other._estimate
 
     @property
-    def settled(self) -> bool:
+    def may_change(self) -> bool:
         """Nothing here changes with G."""
         return True
 

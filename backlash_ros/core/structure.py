@@ -69,8 +69,8 @@ class Structure(Protocol):
         """Whether u_d(k) depends on y(k); else v(k) may leave before y(k) was learned from."""
 
     @property
-    def settled(self) -> bool:
-        """Whether v moves as the present estimate and design ask, not still on its way there."""
+    def may_change(self) -> bool:
+        """Whether a design for a better model may take over at this sample."""
 
     def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""
@@ -79,8 +79,8 @@ class Structure(Protocol):
         """Prepare for a better model of G, a piece of some 0.3 ms each time it is asked on.
 
         Yields None as long as there is more to do, and last what makes the structure use the
-        result at once and without a jump. Where the result would be less safe than what is in
-        use, or the structure does not adapt to G, it ends without that.
+        result at once and without a jump, when it `may_change`. Where the result would be less
+        safe than what is in use, or the structure does not adapt to G, it ends without that.
         """
 
     def go_on_from(self, other: Structure, state_known: bool = True) -> None:

@@ -40,8 +40,10 @@ WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is un
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
 # wrong is contradicted by then. Until then feedback hardens step by step.
 TRUSTED_AFTER = 40
-# Samples after which the first crossing of the gap that an estimate asks for is over.
-SETTLED_AFTER = 150
+# A better design takes over when v does not move much: samples after the first estimate, by then v
+# has crossed the gap with it; samples since the end of a crossing in which the next one is not yet
+# to be expected; samples without any after which none is.
+SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, 20, 200
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
 
@@ -87,6 +89,7 @@ class Tracking:
         self._known = False  # whether the estimate comes from data
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
         self._in_use_for = 0  # samples since an estimate is known
+        self._engaged_for = 0  # samples since v has crossed the gap
         self._level = self._free = 0  # softer while v does not follow, samples since it last did
         self._softness = 0  # of the gain in use
         self._u_d = 0.0  # of the sample before
@@ -100,9 +103,12 @@ class Tracking:
         return self._design.model
 
     @property
-    def settled(self) -> bool:
-        """Whether the estimate has been in use for long enough to have moved v."""
-        return self._in_use_for >= SETTLED_AFTER
+    def may_change(self) -> bool:
+        """Whether v neither crosses the gap nor is about to."""
+        since = self._engaged_for
+        return self._in_use_for >= SETTLED_AFTER and (
+            0 < since <= ENGAGED_SINCE or since >= NO_CROSSING
+        )
 
     def _use(self, chosen: TrackingDesign) -> None:
         model, gains, feedback = chosen.model, chosen.gains, chosen.feedback.gain
@@ -131,7 +137,7 @@ class Tracking:
         self._rest.go_on_from(other._rest)
         if state_known:
             self._trusted_for, self._width = other._trusted_for, other._width
-            self._in_use_for = other._in_use_for
+            self._in_use_for, self._engaged_for = other._in_use_for, other._engaged_for
             self._asked, self._known = other._asked, other._known
             self._resumes, self._blind_for = other._resumes, other._blind_for
         else:
@@ -170,7 +176,7 @@ class Tracking:
         most = LARGEST_FEEDBACK * max(self._reach, self._tolerated)
         self._bounded_before = bounded = not -most <= feedback <= most
         if bounded:
-            feedback = most if feedback > 0.0 else -most
+            feedback = min(max(feedback, -most), most) if feedback == feedback else 0.0
         u_d = ideal - feedback
         rest = self._rest
         if self._resumes:
@@ -198,7 +204,10 @@ class Tracking:
             inverse.widen_band(0.0)
         self._ideal, self._x, self._u_d = ideal, onward, u_d
         c_r, c_l = cautious_crossings(estimate, caution, self._known)
+        side = inverse.side
         v = inverse.step(u_d, estimate.m, c_r, c_l)
+        crosses = inverse.taking_up or inverse.side is not side
+        self._engaged_for = 0 if crosses else self._engaged_for + 1
         if gains.integral:
             self._integrate(window.item(0), situation.y, x[0], trusted, bounded or inverse.limited)
         return Command(u_d, v, 0.0)

@@ -315,7 +315,8 @@ class MovingHorizon:
                 if self._task is None:
                     return
             try:
-                next(self._task)
+                with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
+                    next(self._task)  # what is not finite is refused by the posterior
             except StopIteration:
                 self._task = None
             except np.linalg.LinAlgError:

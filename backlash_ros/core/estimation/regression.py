@@ -107,7 +107,8 @@ class Triangle:
         """Posterior with the first `base` columns as b and the others as e.
 
         slope: m in the prior of e. spreads: prior deviation of each e at s = 1 and m = 1.
-        least_scale, most_scale: those that are considered.
+        least_scale, most_scale: those that are considered; the first one counts where they
+        contradict each other. Raises LinAlgError where numbers get too large.
         """
         r, size = self.r, len(self.r) - 1
         weight = self.count + NOISE_WEIGHT
@@ -131,8 +132,10 @@ class Triangle:
         evidence -= 0.5 * scales**2
         # Half a step of the grid beyond is the same. None at all, and the largest one, remain.
         evidence[:-1][scales[:-1] < least_scale * SAME] = -np.inf
-        evidence[1:][scales[1:] > most_scale / SAME] = -np.inf
+        evidence[1:][scales[1:] > max(most_scale, least_scale) / SAME] = -np.inf
         best = int(np.argmax(evidence))
+        if not np.isfinite(evidence[best]):
+            raise np.linalg.LinAlgError('the samples leave no finite posterior')
         share = np.exp(evidence - evidence[best])
         share /= share.sum()
         noise_var = float(share @ left) / freedom

@@ -275,9 +275,9 @@ class WindowFit:
         )
 
     def _posterior(self, triangle: Triangle, spreads: Array) -> Posterior:
-        """Of all unknowns: where G integrates, of an integrator that leaks and of one that does not.
+        """Of all unknowns; where G integrates, it may leak or not.
 
-        One of both is as likely as the other before the data speak.
+        One is as likely as the other before the data speak.
         """
         layout, around = self.layout, self.around
 
