@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import replace
-from math import inf, nan
+from math import inf, log, nan
 from time import perf_counter
 
 import numpy as np
@@ -566,33 +566,82 @@ class MovingHorizon:
         end = record.end
         self._next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
         v, y = record.since(record.first)
-        if len(v) <= SEARCHED:
-            found = yield from searched(v, y, around, self._widest, self._pace)
-        else:
-            start = current.fit.start.with_gap(current.solution.gap, v)
-            result = yield from fitted(v, y, around, start, current.solution.m, self._pace)
-            found = result, around
-        if found is not None and self._usable(found[0]) and found[0].solution.rms <= bound:
-            self._install(*found, record.first)
+        whole = yield from self._best_of_all(v, y, around)
+        if whole is not None and whole[0].solution.rms <= bound:
+            self._install(*whole, record.first)
             return
+        changes = []
         for first in (since, (since + end) // 2):
             first = max(first, end - SEARCHED)
             if end - first < RECOVERED:
                 continue
             v, y = record.since(first)
             found = yield from searched(v, y, around, self._widest, self._pace)
+            changes += [found[0]] if found is not None else []
             sharp = found is not None and self._usable(found[0], REPLACING)
-            if found is not None and sharp and found[0].solution.rms <= bound:
+            if found is not None and sharp and found[0].solution.rms <= bound \
+                    and self._has_changed(found[0], whole):
                 self._install(*found, first)
                 return
             # The same backlash, but something has moved the plant meanwhile.
             kept = yield from self._confirmed(v, y, self.estimate, found)
-            if kept is not None and kept[0].solution.rms <= bound:
+            if kept is not None and kept[0].solution.rms <= bound \
+                    and self._has_changed(kept[0], whole):
                 self._install(*kept, first)
                 return
+        if whole is not None and changes and not any(
+            self._has_changed(change, whole) for change in changes
+        ):
+            self._install(*whole, record.first)
+            return
+        if end - since >= RECOVERED:
             self._reason = Status.INCONSISTENT
         if end - since > SEARCHED:
             self._begin_acquisition(self.estimate)
+
+    def _best_of_all(
+        self, v: Array, y: Array, around: Around,
+    ) -> Generator[None, None, tuple[Fitted, Around] | None]:
+        """The most likely usable fit of a record by one plant."""
+        current = self._current
+        assert current is not None
+        found = []
+        for beginning in self._beginnings(around):
+            if len(v) <= SEARCHED:
+                result = yield from searched(v, y, beginning, self._widest, self._pace)
+            else:
+                start = current.fit.start.with_gap(current.solution.gap, v)
+                result = yield from self._fitted(v, y, beginning, start, current.solution.m)
+            if result is not None and self._usable(result[0]):
+                found.append(result)
+        return max(found, key=lambda result: _evidence(result[0]), default=None)
+
+    def _beginnings(self, around: Around) -> list[Around]:
+        """This one, and that of the G that was told where it is another one.
+
+        A G that was moved step by step may have gone astray.
+        """
+        told = self._told
+        if around.model is told.model:
+            return [around]
+        return [around, around._replace(model=told.model, error=told.error, scale=0.0)]
+
+    def _has_changed(self, newer: Fitted, whole: tuple[Fitted, Around] | None) -> bool:
+        """Whether two plants, the present fit and one of the newer samples, are more likely.
+
+        Than one for the whole record. Every unknown of the newer one costs half the logarithm of
+        its samples (G. Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978)
+        461-464).
+        """
+        current = self._current
+        assert current is not None
+        if whole is None:
+            return True
+        fit = newer.fit
+        unknowns = fit.layout.driven + fit.around.error.count
+        told = fit.around.told_std / newer.solution.posterior.noise_std
+        both = _evidence(current) + _evidence(newer) + log(told)
+        return both - 0.5 * unknowns * log(fit.length) > _evidence(whole[0])
 
     # --- what comes out --------------------------------------------------------------------------
 
