@@ -41,9 +41,9 @@ WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is un
 # wrong is contradicted by then. Until then feedback hardens step by step.
 TRUSTED_AFTER = 40
 # A better design takes over when v does not move much: samples after the first estimate, by then v
-# has crossed the gap with it; samples since the end of a crossing in which the next one is not yet
-# to be expected; samples without any after which none is.
-SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, 20, 200
+# has crossed the gap with it; samples since the end of a crossing between which its last moves are
+# over and the next one is not yet to be expected; samples without any after which none is.
+SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, (5, 20), 200
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
 
@@ -105,9 +105,9 @@ class Tracking:
     @property
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
-        since = self._engaged_for
+        since, (first, last) = self._engaged_for, ENGAGED_SINCE
         return self._in_use_for >= SETTLED_AFTER and (
-            0 < since <= ENGAGED_SINCE or since >= NO_CROSSING
+            first <= since <= last or since >= NO_CROSSING
         )
 
     def _use(self, chosen: TrackingDesign) -> None:
