@@ -21,7 +21,7 @@ PERIODS = 3
 NOISE_TO_SWING = 0.002  # noise on y over its swing, at most
 TOLD = 0.004  # relative Cramér-Rao bound of the loop that knows the backlash, at most
 TOLD_UNCERTAIN = 0.006  # the same where G is off, and more error is allowed
-SPREAD = 0.1  # of the logarithm of each time constant and damping where G is off
+SPREAD = 0.1  # by which each time constant is off, up or down, where G is
 UNCERTAINTY = 0.2  # that is told then
 STEP = 1e-3  # of the logarithm of a time constant, for a derivative
 ITERATIONS, CLOSER = 50, 0.99  # to the noise of a bound
@@ -86,7 +86,7 @@ def uncertain_case(seed: int) -> Case:
     p = case.parameters
     numerator, denominator = altered(
         np.array(p.reals('plant.numerator')), np.array(p.reals('plant.denominator')),
-        SPREAD * np.random.default_rng([seed, 21]).standard_normal(DRAWS),
+        _off(np.random.default_rng([seed, 21])),
     )
     p = p.replaced({
         'truth.numerator': numerator.tolist(), 'truth.denominator': denominator.tolist(),
@@ -94,6 +94,12 @@ def uncertain_case(seed: int) -> Case:
     })
     case = replace(case, parameters=p)
     return _with_noise(case, _noise(p, samples_per_period, TOLD_UNCERTAIN), {})
+
+
+def _off(rng: np.random.Generator) -> Array:
+    """Logarithms for `altered`: every time constant off by SPREAD, the damping as it was."""
+    signs = rng.choice([-1.0, 1.0], DRAWS // 2)
+    return np.column_stack([signs * np.log1p(SPREAD), np.zeros(DRAWS // 2)]).ravel()
 
 
 def _without_noise(seed: int, below_corners: bool = False) -> tuple[Case, int]:

@@ -129,8 +129,8 @@ def _fit(
             continue
         xi, length, best = trial, 1.0, (cost, b, a)
         slopes = problem.slopes(a, answer, delay, taps, prior)
-        step = np.asarray(np.linalg.solve(
-            slopes.T @ slopes + np.eye(len(xi)), slopes.T @ residual - xi
-        ), dtype=np.float64)
+        step = np.linalg.lstsq(
+            np.concatenate([slopes, np.eye(len(xi))]), np.append(residual, -xi), rcond=None
+        )[0]
         yield
     return best

@@ -120,12 +120,7 @@ class Regressors:
         if layout.ramps:
             signals[n + SIGNALS:] = self.ramps(self._count, count)
         self._count += count
-        # A filter without direct feedthrough answers a sample late; its last state is the rest.
-        late, self._states = lfilter(
-            self._numerator, self._denominator, signals, zi=self._states
-        )
-        answers = np.empty_like(signals)
-        answers[:, :-1], answers[:, -1] = late[:, 1:], self._states[:, 0]
+        answers, self._states = self._answers(signals, self._states)
         rows = np.empty((count, layout.unknowns))
         rows[:, :driven] = answers[:driven].T
         if layout.leak:
@@ -137,6 +132,21 @@ class Regressors:
             if layout.jump:
                 rows[:, end:] = self._jumps.filtered(answers[driven + 1]) @ spread
         return rows
+
+    def begin_after(self, moves: Array) -> None:
+        """Begin where the error of G still answers to these moves of p (N,), the newest last."""
+        driven = self.layout.driven
+        states: Array = self._states[driven:driven + 1]
+        answers, self._states[driven:driven + 1] = self._answers(moves[None], states)
+        self._errors.filtered(answers[0])
+
+    def _answers(self, signals: Array, states: Array) -> tuple[Array, Array]:
+        """Outputs of G after each sample of the signals (M, N), and its states after the last."""
+        # A filter without direct feedthrough answers a sample late; its last state is the rest.
+        late, after = lfilter(self._numerator, self._denominator, signals, zi=states)
+        answers = np.empty_like(signals)
+        answers[:, :-1], answers[:, -1] = late[:, 1:], after[:, 0]
+        return answers, after
 
     def _leak(self, y: Array) -> Array:
         """Minus the sum of all y before, a lost one counting as the one before it."""

@@ -31,6 +31,8 @@ from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
 
+NO_PAST: Array = np.empty(0)
+PAST = 3  # memories of G for which what its error does may last
 FAR = 1e3  # prior of x0, in units of the largest output and of the noise
 LINEAR = 0.05  # scale of the error of G up to which the response is linear in it
 SETTLING = 64  # samples over which the size of a column is told
@@ -40,24 +42,34 @@ class Start(NamedTuple):
     """Where the play operator begins. gap: of the labels.
 
     p: play output before the first sample. side: 1 or -1 where one was engaged before, at v_a; 0
-    where the plant was left somewhere in its gap.
+    where the plant was left somewhere in its gap. past: v before the record, from where all this
+    holds on: what it did to the error of G lasts.
     """
 
     gap: float
     p: float
     side: int = 0
     v_a: float = 0.0
+    past: Array = NO_PAST
 
     def labels(self, v: Array) -> Labels:
         """What the play operator says of v (N,) from here on."""
         return labels_of(v, self.gap, self.p, self.side, self.v_a)
+
+    def after(self, v: Array) -> Start:
+        """Where the play operator stands after v (N,)."""
+        if not len(v):
+            return self
+        labels = self.labels(v)
+        side = int(labels.right[-1] - labels.left[-1])
+        return Start(self.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
 
     def with_gap(self, gap: float, v: Array) -> Start:
         """The same for another gap, before v (N,): a side that was engaged stays so."""
         gap = max(gap, 0.0)
         if self.side != 0:
             return self._replace(gap=gap, p=self.v_a + (gap if self.side < 0 else 0.0))
-        low = float(v[0])
+        low = float(self.past[0] if len(self.past) else v[0])
         return self._replace(gap=gap, p=min(max(self.p, low), low + gap))
 
 
@@ -132,11 +144,15 @@ class WindowFit:
         self.around, self.start, self.slope, self.reach = around, start, slope, reach
         self.model = around.model
         ramp = max(-(-samples // RAMPS), SLOW) if around.walk > 0.0 else 0
-        self._regressors = Regressors(around.model, around.error, start.side == 0, ramp)
+        past = start.past
+        self._begun = begun = start.after(past)
+        self._regressors = Regressors(around.model, around.error, begun.side == 0, ramp)
+        if len(past):
+            self._regressors.begin_after(np.diff(start.labels(past).p, prepend=start.p))
         self.layout = self._regressors.layout
         self.length = 0  # samples
         self.reversals = 0
-        self._play = start
+        self._play = begun
         self._highest, self._lowest = -inf, inf
         self._rows: Array = np.empty((0, self.layout.unknowns))
         self._y: Array = np.empty(0)
@@ -224,10 +240,13 @@ class WindowFit:
 
     def start_after(self, v: Array) -> Start:
         """Where the play operator stands after v (N,), the first samples of this fit."""
-        start = self.start
-        labels = start.labels(v)
-        side = int(labels.right[-1] - labels.left[-1])
-        return Start(start.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
+        after = self._begun.after(v)
+        if not self.layout.errors or after.side == 0:
+            return after
+        history = np.concatenate([self.start.past, v])
+        gone = max(len(history) - PAST * self.model.memory, 0)
+        begin = self.start._replace(past=NO_PAST).after(history[:gone])
+        return begin._replace(past=history[gone:])
 
     def restarted(self, around: Around, start: Start) -> WindowFit:
         """A fit of samples yet to come, with the prior of `around`, after a break."""
@@ -266,7 +285,7 @@ class WindowFit:
         m = float(theta[0])
         held = float(posterior.mean[layout.n])
         start = self.start.p
-        if self.start.side == 0 and m != 0.0:
+        if self._begun.side == 0 and m != 0.0:
             start = (held + float(posterior.mean[layout.n + 2])) / m
         return Solution(
             posterior, theta, cov, crossings_of(theta, cov),
@@ -360,8 +379,8 @@ class WindowFit:
 
     def input(self, solution: Solution, v: Array) -> Array:
         """u as the fit has it, shape (N,). v: the samples taken in."""
-        start, n = self.start, self.layout.n
-        labels = start.labels(v)
+        n = self.layout.n
+        labels = self._begun.labels(v)
         mean = solution.posterior.mean
         held, m, right, left = mean[n:n + 4]
         walked = mean[self.layout.walk] @ self._regressors.ramps(0, len(v))
