@@ -162,8 +162,9 @@ def _prior(
     for i in range(DRAWN):
         stable = monic(_moved(moving, uncertainty, rng))
         true = np.cumsum(lfilter(numerator * (stable.sum() / error.gain), stable, impulse))
-        lag = uncertainty * delay * float(rng.standard_normal())
-        lagged = np.interp(k - lag, k, true)
+        # Faster plants are among those of the poles; none answers before it is driven.
+        lag = uncertainty * delay * abs(float(rng.standard_normal()))
+        lagged = np.interp(k - lag, k, true, left=0.0)
         off[:, i] = lagged - told
         coefficients[:taps, i] = _taps(lagged, stable, start, taps)
         coefficients[taps:, i] = stable[1:]

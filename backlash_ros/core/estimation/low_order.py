@@ -5,8 +5,9 @@ Gauss-Newton steps on the output error:
 
     y = (B/A) u,   dy/db_j = z^-j (1/A) u,   dy/da_i = -z^-i (1/A) y
 
-Integrators of G, and its gain at rest, stay as they are. What G did before the record shows as a
-polynomial where G integrates; elsewhere the samples in which it dies out are left out.
+Integrators of G, and its gain at rest, stay as they are. What G did before the record, its free
+response, is projected out (G. H. Golub, V. Pereyra, The differentiation of pseudo-inverses and
+nonlinear least squares problems whose variables separate, SIAM J. Numer. Anal. 10 (1973) 413-432).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from backlash_ros.core.transfer_function import TransferFunction
 Array = NDArray[np.float64]
 
 SHIFTS = (0, 1, 2, -1)  # samples of delay more than G has that are compared
-ITERATIONS = 6  # Gauss-Newton steps, those that were too long included
+ITERATIONS = 10  # Gauss-Newton steps, those that were too long included
 SHORTER = 0.3  # share of a step that is tried where the whole step leads uphill
 NO_TAP = 1e-6  # share of the largest tap below which the last ones are none
 
@@ -44,17 +45,13 @@ class OutputError:
         self._rows = np.flatnonzero(weights > 0.0)
         self._u, self._y = u, y[self._rows]
         self._root = np.sqrt(weights[self._rows]) / noise_std
-        time = np.linspace(-1.0, 1.0, len(u))[self._rows]
-        drift = np.stack([time**i for i in range(self.integrators)], axis=1) \
-            if self.integrators else np.zeros((len(time), 0))
-        self._drift = np.linalg.qr(drift * self._root[:, None])[0]
 
     def residual(self, b: Array, a: Array, delay: int) -> tuple[Array, Array]:
-        """Weighted residual without drift, and the response (N,)."""
+        """Weighted residual without the free response, and the response (N,)."""
         answer = lfilter(
             np.append(np.zeros(delay - 1), b), np.convolve(a, self.integrate), self._u
         )
-        return self._without_drift((self._y - answer[self._rows]) * self._root), answer
+        return self._without_free((self._y - answer[self._rows]) * self._root, a), answer
 
     def slopes(self, a: Array, answer: Array, delay: int, taps: int, prior: Array) -> Array:
         """Derivatives of the weighted response in the directions of the prior, shape (N, ..)."""
@@ -66,10 +63,16 @@ class OutputError:
             columns[delay - 1 + j:, j] = by_input[:count - delay + 1 - j]
         for i in range(1, n + 1):
             columns[i:, taps + i - 1] = -by_output[:-i]
-        return self._without_drift((columns[self._rows] @ prior) * self._root[:, None])
+        return self._without_free((columns[self._rows] @ prior) * self._root[:, None], a)
 
-    def _without_drift(self, rows: Array) -> Array:
-        return np.asarray(rows - self._drift @ (self._drift.T @ rows))
+    def _without_free(self, rows: Array, a: Array) -> Array:
+        denominator = np.convolve(a, self.integrate)
+        order = len(denominator) - 1
+        if order == 0:
+            return rows
+        free = lfilter([1.0], denominator, np.eye(order, len(self._u)))
+        basis = np.linalg.qr(free[:, self._rows].T * self._root[:, None])[0]
+        return np.asarray(rows - basis @ (basis.T @ rows))
 
 
 def low_order(

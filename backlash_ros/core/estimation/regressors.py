@@ -100,7 +100,7 @@ class Regressors:
         self._numerator, self._denominator = transfer.numerator, transfer.denominator
         # One filter for all: x0 are states, the others inputs. lfilter keeps the state of the
         # observer form.
-        self._states = np.zeros((n + SIGNALS + self.layout.ramps, n))
+        self._states: Array = np.zeros((n + SIGNALS + self.layout.ramps, n))
         self._states[:n] = model.to_observer.T
         self._errors, self._jumps = ErrorFilter(error), ErrorFilter(error)
         self._sum = self._y = 0.0  # of all y so far, and the newest one

@@ -45,7 +45,6 @@ STANDS = 0.02  # standard deviations by which the gap may still move
 FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
 NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
 MODELS = 6  # times that G may move in one fit
-SETTLED = 60  # samples at the start of a record that say little of G: what was before is not known
 
 
 class Fitted(NamedTuple):
@@ -143,9 +142,7 @@ def with_better_model(
         transfer = around.model.transfer_function
         u = result.fit.input(solution, v)
         newest = slice(-max(pace.pieces(around.error.taps + 2), FEWEST_ROWS), None)
-        compared = weights[newest].copy()
-        compared[:min(len(v) // 4, SETTLED)] = 0.0
-        problem = OutputError(transfer, u[newest], y[newest], compared, posterior.noise_std)
+        problem = OutputError(transfer, u[newest], y[newest], weights[newest], posterior.noise_std)
         yield
         better = yield from low_order(transfer, around.error, problem, posterior.scale)
         if better is None or not _allowed(better):
