@@ -27,7 +27,7 @@ FAR = 2  # ... and gaps far from them
 # --- what is published
 PRECISE_SLOPE = 0.2  # relative deviation of m below which an estimate is published
 PRECISE_GAP = 0.3  # relative deviation of the gap below which it is
-REPLACING = 0.05  # of these deviations: those of an estimate that replaces one that held
+REPLACING = 0.04  # of these deviations: those of an estimate that replaces one that held
 NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
 REVERSALS = 2  # changes of the engaged side before the first estimate where G is uncertain
 

@@ -449,14 +449,17 @@ class MovingHorizon:
         fits = misfit <= MISFIT
         fit.take(rows, np.where(valid & fits, y, nan), weights_of(y))
         yield
-        self._judge(fits, number, len(v), misfit)
+        self._judge(fits, number, len(v), number + _change(squares))
         solution = fit.solve()
         self._current = Fitted(fit, solution)
         if fits:
             self._publish()
 
-    def _judge(self, fits: bool, number: int, count: int, misfit: float) -> None:
-        """Note from when on the samples contradict the fit, or that they fit again."""
+    def _judge(self, fits: bool, number: int, count: int, change: int) -> None:
+        """Note from when on the samples contradict the fit, or that they fit again.
+
+        change: sample from which those that do not fit do not.
+        """
         if fits:
             self._consistent += count
             since = self._contradicted_from
@@ -468,7 +471,7 @@ class MovingHorizon:
             return
         self._consistent = 0
         if self._contradicted_from is None:
-            self._contradicted_from = self._next_try = number
+            self._contradicted_from = self._next_try = change
 
     def _refit(self) -> Task:
         """Fit the whole record anew; a long one loses its oldest third first."""
@@ -567,7 +570,8 @@ class MovingHorizon:
         self._next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
         v, y = record.since(record.first)
         whole = yield from self._best_of_all(v, y, around)
-        if whole is not None and whole[0].solution.rms <= bound:
+        if whole is not None and whole[0].solution.rms <= bound \
+                and whole[0].fit.misfit(whole[0].solution, since - record.first) <= MISFIT:
             self._install(*whole, record.first)
             return
         changes = []
@@ -817,6 +821,16 @@ def _prior_of(estimate: Estimate) -> Prior:
 
 def _evidence(result: Fitted) -> float:
     return result.solution.posterior.evidence
+
+
+def _change(squares: Array) -> int:
+    """Where samples begin to contradict a fit, from the normalised squares of residuals (N,).
+
+    The likeliest sample of a change after which their mean is beyond MISFIT (cumulative sum test:
+    E. S. Page, Continuous inspection schemes, Biometrika 41 (1954) 100-115).
+    """
+    excess = np.where(np.isfinite(squares), squares - MISFIT, 0.0)
+    return int(np.argmax(np.cumsum(excess[::-1])[::-1]))
 
 
 def _contradicts(solution: Solution, other: Prior) -> bool:

@@ -328,6 +328,14 @@ class WindowFit:
         rows, y = self._rows[since:self.length], self._y[since:self.length]
         return np.asarray(y - rows @ posterior.mean)
 
+    def misfit(self, solution: Solution, since: int) -> float:
+        """Mean square of the residual from sample `since` on, over that of all samples."""
+        newest = self.residual(solution.posterior, since)
+        known = np.count_nonzero(newest)
+        if not known or solution.rms == 0.0:
+            return 0.0
+        return float(newest @ newest) / known / solution.rms**2
+
     def state(self, solution: Solution) -> tuple[Array, Array]:
         """State of G after the newest sample, shape (n,), and its honest covariance (n, n)."""
         posterior = solution.posterior
