@@ -100,13 +100,13 @@ def over(
 ) -> list[float]:
     """v over intervals of which the last one ended at `end`, in time unless told [samples]."""
     end_ns, due_ns = (START_NS + int(t * PERIOD_NS) for t in (end, end if due is None else due))
-    return commands.over(intervals, end_ns, due_ns)
+    return commands.over(intervals, end_ns, due_ns)[0]
 
 
 def test_a_command_in_time_needs_no_correction() -> None:
     commands = CommandHistory(PERIOD_S)
     commands.publish(1.0, START_NS + 1)
-    assert over(commands, 3, 3.0) == []
+    assert over(commands, 3, 3.0) == [1.0, 1.0, 1.0]
     assert commands.late == 0
 
 
@@ -125,7 +125,7 @@ def test_older_intervals_ended_in_time_though_the_newest_output_came_late() -> N
     commands.publish(2.0, START_NS + int(1.1 * PERIOD_NS))
     # y(1) was missed, y(2) is taken late: 2.0 came after the end of the first interval.
     assert over(commands, 2, end=2.3, due=2.0) == [1.0, 2.0]
-    assert over(commands, 2, end=2.3, due=2.3) == []
+    assert over(commands, 2, end=2.3, due=2.3) == [2.0, 2.0]
 
 
 def test_a_command_that_came_while_the_driver_was_held_up_missed_its_sample() -> None:
@@ -147,10 +147,27 @@ def test_command_that_was_under_way_when_its_interval_ended_came_too_late(
         commands.note_transit(passed_ns)
     commands.publish(1.0, START_NS)
     commands.publish(2.0, START_NS + PERIOD_NS - PERIOD_NS // 20)
-    assert over(commands, 1, 1.0) == ([1.0] if late else [])
+    assert over(commands, 1, 1.0) == ([1.0] if late else [2.0])
     # However long messages seem to be under way, what leaves early in an interval is there in time.
     commands.publish(3.0, START_NS + PERIOD_NS + PERIOD_NS // 2)
-    assert over(commands, 1, 2.0) == []
+    assert over(commands, 1, 2.0) == [3.0]
+
+
+def test_the_command_next_to_the_one_in_use_may_have_acted_instead() -> None:
+    commands = CommandHistory(PERIOD_S)
+    for k, sent in enumerate((0.2, 1.2, 2.9)):
+        commands.publish(float(k), START_NS + int(sent * PERIOD_NS))
+    ends_ns = START_NS + 3 * PERIOD_NS
+    v, instead = commands.over(3, ends_ns, ends_ns)
+    assert v == [0.0, 1.0, 2.0]
+    assert instead == [1.0, 0.0, 1.0]
+    # What leaves just after a sample may have come before it by the clock of another machine.
+    v, instead = commands.over(1, START_NS + int(2.8 * PERIOD_NS), START_NS + 2.8 * PERIOD_NS)
+    assert (v, instead) == ([1.0], [2.0])
+    # One that left more than a period before has arrived.
+    v, instead = commands.over(1, START_NS + 4 * PERIOD_NS, START_NS + 4.0 * PERIOD_NS)
+    assert v == [2.0]
+    assert isnan(instead[0])
 
 
 def reported(end: int, *reports: tuple[float, float]) -> list[list[float]]:
@@ -189,6 +206,17 @@ def test_reports_over_lost_outputs_are_used_one_by_one() -> None:
     for k in (1, 2, 3):
         commands.report(10.0 * k, START_NS + k * PERIOD_NS - 1000)
     assert commands.reported_over(3, START_NS + 3 * PERIOD_NS) == [10.0, 20.0, 30.0]
+
+
+def test_the_report_of_an_interval_that_took_longer_holds_for_all_of_it() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.begin(START_NS)
+    commands.report(10.0, START_NS + 3 * PERIOD_NS - 1000)
+    # Two samples were never taken: the driver was held up from the first to the third.
+    assert commands.reported_over(3, START_NS + 3 * PERIOD_NS, unsent=2) == [10.0, 10.0, 10.0]
+    commands.report(20.0, START_NS + 5 * PERIOD_NS - 1000)
+    # One was taken and lost, with its report.
+    assert commands.reported_over(2, START_NS + 5 * PERIOD_NS) == []
 
 
 def uses(pattern: list[bool], use: ReportUse = ReportUse.AUTO) -> tuple[list[bool], int]:

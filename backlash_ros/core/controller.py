@@ -108,16 +108,20 @@ class AdaptiveController:
         self._interval: Interval | None = None
         # y(k), the interval before it, samples lost before it and what was applied, as long as
         # it is still to be learned from.
-        self._lesson: tuple[float, Interval, int, Sequence[float]] | None = None
+        self._lesson: (
+            tuple[float, Interval, int, Sequence[float], Sequence[float]] | None
+        ) = None
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
+        instead: Sequence[float] = (),
     ) -> ControlStep:
         """Return the command for sample k.
 
         y, y_m: output and reference, finite. lost: samples that never arrived since the last
         call; the plant went on with the last v through all of them. applied: the v that was
-        really applied in each of the lost + 1 intervals since then, if it is known.
+        really applied in each of the lost + 1 intervals since then, if it is known. instead: what
+        may have been applied in each of them, nan where there is no doubt.
         """
         if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST) or (
             applied and not all(map(plausible, applied))
@@ -126,12 +130,14 @@ class AdaptiveController:
                 f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite and no larger than '
                 f'{LARGEST:g}'
             )
-        if lost < 0 or (applied and len(applied) != lost + 1):
-            raise ValueError(f'lost={lost!r} must be >= 0 and applied have lost + 1 values')
+        if lost < 0 or any(len(each) != lost + 1 for each in (applied, instead) if each):
+            raise ValueError(
+                f'lost={lost!r} must be >= 0, applied and instead have lost + 1 values each'
+            )
         if self._lesson is not None:
             self._learn()
         if self._interval is not None:
-            self._lesson = y, self._interval, lost, applied
+            self._lesson = y, self._interval, lost, applied, instead
             if self.structure.needs_output:
                 self._learn()
         estimator, inverse = self.estimator, self.inverse
@@ -202,9 +208,10 @@ class AdaptiveController:
     def _learn(self) -> None:
         lesson, self._lesson = self._lesson, None
         assert lesson is not None
-        y, interval, lost, applied = lesson
-        for i in range(lost):
+        y, interval, lost, applied, instead = lesson
+        for i in range(lost + 1):
             passed = interval._replace(v=applied[i]) if applied else interval
-            self.estimator.update(None, passed)
+            if instead:
+                passed = passed._replace(other=instead[i])
+            self.estimator.update(y if i == lost else None, passed)
         self.lost_samples += lost
-        self.estimator.update(y, interval._replace(v=applied[-1]) if applied else interval)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from enum import Enum
-from math import nan
+from math import inf, nan
 
 from backlash_ros.core.parameters import Parameters
 
@@ -75,20 +75,22 @@ class CommandHistory:
         """Note an applied v and when the driver said so, just before the output it led to."""
         self._reported.append((stamp_ns, v))
 
-    def over(self, intervals: int, end_ns: int, due_ns: float) -> list[float]:
+    def over(
+        self, intervals: int, end_ns: int, due_ns: float,
+    ) -> tuple[list[float], list[float]]:
         """v over each of the newest `intervals`, oldest first; the last one ended at end_ns.
 
         due_ns: when it should have ended, and so a whole number of periods after the others.
-        Empty if it was the newest command in all of them, as usual.
+        And for each the command that left next to it, where that was within a period of the time
+        that decides: nobody knows how long it was under way. nan where there is none.
         """
         # A driver that was held up reads y first, and then the commands that came meanwhile.
         ends_ns = [min(due_ns, end_ns) - i * self._period_ns for i in range(intervals - 1, -1, -1)]
         # What left later than that was not there.
         latest_ns = [each - self._transit_ns for each in ends_ns]
-        if self._published[-1][0] < latest_ns[0]:
-            return []
-        self.late += 1
-        return [self._at(each) for each in latest_ns]
+        self.late += self._published[-1][0] >= latest_ns[0]
+        pairs = [self._at(each) for each in latest_ns]
+        return [v for v, _ in pairs], [other for _, other in pairs]
 
     def begin(self, end_ns: int) -> None:
         """Note the first output: reports up to here belong to nothing."""
@@ -104,10 +106,12 @@ class CommandHistory:
         stamp_ns, v = self._reported[-1]
         return v if stamp_ns > end_ns - FRESH * self._period_ns else nan
 
-    def reported_over(self, intervals: int, end_ns: int) -> list[float]:
+    def reported_over(self, intervals: int, end_ns: int, unsent: int = 0) -> list[float]:
         """Reports since the last output, one per interval; empty where they are not to be used.
 
-        Empty, and counted, where there is not one per interval though they are used.
+        unsent: intervals at whose end the driver was held up: it has neither measured nor reported
+        then, and the v of its next report was in use all the time. Empty, and counted, where there
+        is not one per interval though they are used.
         """
         begin_ns, self._output_ns = self._output_ns, end_ns
         stamp_ns, reports = begin_ns, []
@@ -115,6 +119,8 @@ class CommandHistory:
             stamp_ns, v = self._reported.popleft()
             if stamp_ns > begin_ns:
                 reports.append(v)
+        if reports and len(reports) == intervals - unsent:
+            reports += reports[-1:] * unsent
         # The report of the newest interval may still be under way while older ones are here.
         complete = len(reports) == intervals and stamp_ns > end_ns - 0.5 * self._period_ns
         self._contrary = 0 if complete is self.uses_reports else self._contrary + 1
@@ -125,8 +131,17 @@ class CommandHistory:
         self.unreported += not complete
         return reports if complete else []
 
-    def _at(self, time_ns: float) -> float:
-        for stamp_ns, v in reversed(self._published):
+    def _at(self, time_ns: float) -> tuple[float, float]:
+        """The newest v that had left by then, and the one beside it that may have been in use."""
+        later_ns, later = inf, nan
+        for i in range(len(self._published) - 1, -1, -1):
+            stamp_ns, v = self._published[i]
             if stamp_ns < time_ns:
-                return v
-        return self._published[0][1]
+                since, until = time_ns - stamp_ns, later_ns - time_ns
+                if min(since, until) > self._period_ns:
+                    return v, nan
+                # It may not have arrived yet, or the next one had by the clock of another machine.
+                older = self._published[i - 1][1] if i else nan
+                return v, older if since <= until else later
+            later_ns, later = stamp_ns, v
+        return self._published[0][1], nan

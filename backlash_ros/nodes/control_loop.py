@@ -61,6 +61,7 @@ class ControlLoop:
         self._p, self._send, self._now_ns = p, send, now_ns
         self._lockstep = p.flag('lockstep')
         self._missing = 0  # outputs since the newest one that was used
+        self._unsent = 0  # those of them that were never published
         self._anew = False  # whether sender or clock began anew since then
         self._begun = False  # whether the present core has taken a step
         self.core = build_controller(p, inherited)
@@ -235,6 +236,7 @@ class ControlLoop:
 
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
+        self._unsent += arrival.unsent
         self._anew = self._anew or arrival.anew
         # What came before the first sample that is used was not lost: nobody listened.
         if self._begun and not (self.silent or arrival.anew):
@@ -256,6 +258,7 @@ class ControlLoop:
         """Step the core over the missing outputs to y, with the v that was really applied."""
         core, commands = self.core, self.commands
         lost, self._missing = self._missing, 0
+        unsent, self._unsent = self._unsent, 0
         if not self._begun:
             self._begun = True
             if not self._lockstep:
@@ -265,6 +268,8 @@ class ControlLoop:
             return core.step(y, y_m)
         if self._lockstep:
             return core.step(y, y_m, lost)
-        applied = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
-        return core.step(y, y_m, lost, commands.reported_over(lost + 1, stamp_ns) or applied)
+        reported = commands.reported_over(lost + 1, stamp_ns, unsent)
+        if reported:
+            return core.step(y, y_m, lost, reported)
+        return core.step(y, y_m, lost, *commands.over(lost + 1, stamp_ns, self.counter.due_ns))
 

@@ -33,6 +33,7 @@ REVERSALS = 2  # changes of the engaged side before the first estimate where G i
 
 # --- what does not fit
 SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
+ODDS = 20.0  # against the older one of two commands that may have acted over an interval
 GATE = 6.0  # standard deviations of an innovation beyond which y is an outlier
 OUTLIERS = 5  # outliers in a row that are none
 MISFIT = 3.0  # mean normalised square of the residuals of a block that contradicts the fit

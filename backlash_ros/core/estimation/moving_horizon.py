@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.backlash import clamp
+from backlash_ros.core.estimation.attribution import Attribution, attributed
 from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
 from backlash_ros.core.estimation.constants import (
     AS_GOOD,
@@ -99,6 +100,8 @@ class MovingHorizon:
         self._told, self._told_walk = self._around, walk_std
         self._before = observer
         self._observer: Observer | None = None
+        self._attribution: Attribution | None = None  # of an observer
+        self.reattributed = 0  # intervals over which another v acted than was said
         self._no_state = [0.0] * model.order
         self._known = initial.learned
         self._covariance: Array | None = None
@@ -239,21 +242,39 @@ class MovingHorizon:
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
-        v = interval.v
+        v, other = interval.v, interval.other
         self._lost_in_a_row = self._lost_in_a_row + 1 if y is None else 0
         observer = self._observer
         accepted = y
         if observer is not None:
             estimate = self.estimate
-            p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
+            gap = estimate.c_r - estimate.c_l
+            p = clamp(self._p, v, v + gap)
             self._since_motion = self._since_motion + 1 if p == self._p else 0
+            attribution, there = self._attribution, p
+            if attribution is None and other == other:
+                attribution = self._attribution = Attribution(observer)
+            if attribution is not None:
+                if other == other:
+                    there = clamp(self._p, other, other + gap)
+                attribution.note(estimate.m * (there - p))
             self._p = p
             self._u = u = estimate.m * (p - estimate.c_r)
             expected = observer.predict(u)
             if y is None:
                 self.innovation = nan
             else:
-                self.innovation = innovation = y - expected
+                innovation = y - expected
+                explained = attribution.is_other(innovation) if attribution is not None else 0.0
+                if attribution is not None and explained != 0.0:
+                    innovation -= explained
+                    self.reattributed += 1
+                    if attribution.delay == 1:
+                        v, other = other, v
+                        self._p, self._u = there, estimate.m * (there - estimate.c_r)
+                    else:
+                        self._record.exchange(self._record.end + 1 - attribution.delay)
+                self.innovation = innovation
                 if innovation * innovation <= GATE**2 * observer.variance:
                     self._refused = 0
                     observer.correct(innovation)
@@ -269,10 +290,10 @@ class MovingHorizon:
                 self._before.update(y, interval)
         self._v = v
         if self._adapting:
-            self._note(v, nan if accepted is None else accepted)
+            self._note(v, nan if accepted is None else accepted, other)
         self._set_status()
 
-    def _note(self, v: float, y: float) -> None:
+    def _note(self, v: float, y: float, other: float) -> None:
         memory = self.model.memory
         if self._observer is None and self._since_motion > AT_REST * memory:
             if not self._around.error.integrates:
@@ -287,7 +308,7 @@ class MovingHorizon:
             # The samples between are missing, or there was no time to take any in.
             self._paused = False
             self._restart_record()
-        self._record.append(v, y)
+        self._record.append(v, y, other)
 
     def _set_status(self) -> None:
         if self._lost_in_a_row >= NO_DATA:
@@ -477,6 +498,7 @@ class MovingHorizon:
         """Fit the whole record anew; a long one loses its oldest third first."""
         current = self._current
         assert current is not None
+        yield from self._attribute(current)
         record, around = self._record, self._around
         fit, solution = current.fit, current.solution
         start, first = fit.start, record.first
@@ -515,6 +537,22 @@ class MovingHorizon:
                     and _evidence(other[0]) > _evidence(result):
                 result, around = other
         self._install(result, around, first)
+
+    def _attribute(self, current: Fitted) -> Task:
+        """Let those v have acted over the record that the estimates speak for."""
+        record, found = self._record, current.solution.crossings
+        others = record.others(record.first)
+        if found is None or np.isnan(others).all():
+            return
+        # The observer begins at rest: what it expects says nothing yet.
+        others[:self._around.model.memory] = nan
+        v, y = record.since(record.first)
+        observer = Observer(self._around.model, current.solution.posterior.noise_std)
+        chosen = yield from attributed(
+            v, y, others, (current.solution.start, found.gap), found.m, found.m * found.c_r,
+            observer, self._pace.pieces(1),
+        )
+        record.attribute(record.first, chosen)
 
     def _fitted(
         self, v: Array, y: Array, around: Around, start: Start, slope: float,
@@ -733,6 +771,7 @@ class MovingHorizon:
         noise = solution.posterior.noise_std
         if observer is None:
             observer = self._observer = Observer(self.model, noise)
+            self._attribution = None
             if exact is None:
                 exact, cov = self._replayed(), None
         else:

@@ -89,6 +89,8 @@ class Observer:
         self.variance = (self._gain.innovation * noise_std) ** 2  # of the innovation, measured
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
         self.cov: Array = self.noise_cov  # of the state
+        self._once = self._response(transfer.delay)  # state as soon as y shows u = 1 over a period
+        self.first = self._once[0]
 
     @property
     def state(self) -> list[float]:
@@ -132,6 +134,20 @@ class Observer:
         for i, k in enumerate(self._gain.gain):
             x[i] += k * innovation
         self.variance += (innovation * innovation - self.variance) / MEMORY
+
+    def shift(self, u: float) -> None:
+        """Move the state to where so much more u would have led, over the newest period y shows."""
+        x = self._x
+        for i, once in enumerate(self._once):
+            x[i] += once * u
+
+    def _response(self, periods: int) -> list[float]:
+        self._x = [0.0] * self._n
+        self.predict(1.0)
+        for _ in range(periods - 1):
+            self.predict(0.0)
+        response, self._x = self._x, [0.0] * self._n
+        return response
 
     def settle(self, noise_std: float) -> None:
         """Go a step towards the smallest gain that explains the innovations.

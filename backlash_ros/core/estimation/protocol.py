@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from math import inf, isnan
+from math import inf, isnan, nan
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -93,13 +93,15 @@ class Bounds:
 class Interval(NamedTuple):
     """What the controller did between two samples: v was applied, y_m and u_d led to it.
 
-    f: the gain of (3.2) that was in use.
+    f: the gain of (3.2) that was in use. other: v that may have been applied instead, nan where
+    there is no doubt.
     """
 
     v: float
     y_m: float
     u_d: float
     f: float
+    other: float = nan
 
 
 class StateSource(Protocol):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import nan
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,11 +11,15 @@ Array = NDArray[np.float64]
 
 
 class Record:
-    """v and y of the newest samples. length: how many; first: number of the oldest one."""
+    """v and y of the newest samples. length: how many; first: number of the oldest one.
+
+    And the v that may have acted instead, nan where there is none.
+    """
 
     def __init__(self, capacity: int) -> None:
         self._v: Array = np.empty(2 * capacity)
         self._y: Array = np.empty(2 * capacity)
+        self._other: Array = np.empty(2 * capacity)
         self._begin = self._end = 0
         self.first = 0
 
@@ -25,17 +31,33 @@ class Record:
         """Number of the next sample."""
         return self.first + len(self)
 
-    def append(self, v: float, y: float) -> None:
+    def append(self, v: float, y: float, other: float = nan) -> None:
         """Take in a sample, y = nan where it was lost."""
         if self._end == len(self._v):
             self._compact()
-        self._v[self._end], self._y[self._end] = v, y
+        self._v[self._end], self._y[self._end], self._other[self._end] = v, y, other
         self._end += 1
 
     def since(self, number: int) -> tuple[Array, Array]:
         """v and y of the samples from this number on; they stay what they are."""
         part = slice(self._begin + number - self.first, self._end)
         return self._v[part].copy(), self._y[part].copy()
+
+    def others(self, number: int) -> Array:
+        """What may have acted instead of v, from this number on."""
+        return self._other[self._begin + number - self.first:self._end].copy()
+
+    def attribute(self, number: int, v: Array) -> None:
+        """From this number on these v acted, the ones before them may have been it instead."""
+        part = slice(self._begin + number - self.first, self._begin + number - self.first + len(v))
+        changed = v != self._v[part]
+        self._other[part][changed] = self._v[part][changed]
+        self._v[part] = v
+
+    def exchange(self, number: int) -> None:
+        """The other v acted over this interval."""
+        if number >= self.first:
+            self.attribute(number, self.others(number)[:1])
 
     def lose(self, numbers: NDArray[np.intp]) -> None:
         """Count y of these samples as lost."""
@@ -50,6 +72,6 @@ class Record:
         kept = len(self)
         if 2 * kept > len(self._v):
             raise OverflowError(f'record of {kept} samples: let old ones go first')
-        for values in (self._v, self._y):
+        for values in (self._v, self._y, self._other):
             values[:kept] = values[self._begin:self._end].copy()
         self._begin, self._end = 0, kept

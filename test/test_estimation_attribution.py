@@ -1,0 +1,89 @@
+"""Commands that may have come too late: which of two acted is told by y."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
+from uncertain_cases import motor_jobs
+
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.estimation.attribution import attributed
+from backlash_ros.core.estimation.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation.observer import Observer
+from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.transfer_function import TransferFunction
+
+LATE = 0.07  # share of the commands that come one sample too late
+SECONDS = 6.0
+M, C_R, C_L, NOISE = 0.1, 0.6, -0.4, 1e-4
+
+
+def worst_error(structure: str, told: bool, delay: int = 0) -> tuple[float, int]:
+    """Largest relative error of c_r, c_l from 4 s on, and how many commands were re-attributed.
+
+    told: whether the controller is told that the command before may have acted instead.
+    """
+    [job] = motor_jobs(
+        {'late': {'truth.delay_samples': delay}}, [1], SECONDS, structure=structure
+    )
+    loop = build_closed_loop(job.parameters)
+    controller, plant = loop.controller, loop.plant
+    estimator = controller.estimator
+    assert isinstance(estimator, MovingHorizon)
+    truth = plant.backlash
+    rng = np.random.default_rng(4)
+    before, worst = 0.0, 0.0
+    instead: tuple[float, ...] = ()
+    for k in range(job.samples):
+        t = k * loop.sample_period
+        v = controller.step(plant.measure(), loop.reference(t), instead=instead).v
+        controller.refine()
+        plant.step(before if rng.random() < LATE else v)
+        instead = (before,) if told else ()
+        before = v
+        estimate = estimator.estimate
+        error = max(abs(estimate.c_r / truth.c_r - 1.0), abs(estimate.c_l / truth.c_l - 1.0))
+        worst = max(worst, error) if t >= 4.0 else 0.0
+    return worst, estimator.reattributed
+
+
+@pytest.mark.parametrize(('structure', 'delay'), [
+    ('proportional', 0), ('tracking', 0), ('proportional', 1),
+])
+def test_late_commands_cost_little_where_they_may_be_told(structure: str, delay: int) -> None:
+    misled, none = worst_error(structure, told=False, delay=delay)
+    right, found = worst_error(structure, told=True, delay=delay)
+    assert none == 0
+    assert found > 0.5 * LATE * SECONDS / 0.005
+    assert right < 2e-3 < misled
+
+
+@pytest.mark.parametrize('delay', [1, 2])
+def test_what_acted_is_found_in_a_record(delay: int) -> None:
+    model = TransferFunction([0.5], [1.0, -0.5, *[0.0] * (delay - 1)])
+    rng = np.random.default_rng(3)
+    sent = 5.0 * np.sin(0.1 * np.arange(400))
+    before = np.append(0.0, sent[:-1])
+    acted = np.where(rng.random(400) < 0.2, before, sent)
+    p, y, state = 0.0, [], Observer(StateModel(model), NOISE)
+    for value in acted.tolist():
+        p = min(max(p, value), value + C_R - C_L)
+        y.append(state.predict(M * (p - C_R)))
+    measured = np.array(y) + NOISE * rng.standard_normal(400)
+    pieces = attributed(
+        sent, measured, before, (0.0, C_R - C_L), M, M * C_R, Observer(StateModel(model), NOISE),
+        10**6,
+    )
+    with pytest.raises(StopIteration) as ended:
+        next(pieces)
+    # While v turns, or is in the gap, one acts like the other.
+    tells = np.abs(sent - before) > 0.2
+    tells[:20] = False
+    wrong = np.count_nonzero((ended.value.value != acted) & tells)
+    assert np.count_nonzero((sent != acted) & tells) > 40
+    assert wrong <= 4
