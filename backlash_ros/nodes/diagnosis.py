@@ -176,6 +176,7 @@ def _of_the_fit(loop: ControlLoop) -> dict[str, object]:
         'unexplained motion / (m * gap)': estimator.unexplained,
         'samples that wait for a fit': estimator.waiting,
         'outliers': estimator.outliers,
+        'commands found to be late': estimator.reattributed,
         'failed fits': estimator.failed_fits,
         'G(z)': 'as told' if _same(moved, loop.told) else 'learned',
     }
