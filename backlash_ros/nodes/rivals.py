@@ -14,11 +14,12 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
+from backlash_ros.nodes.presence import Presence
 from backlash_ros.nodes.spin import ProcessNode
 
 LOOK_S = 0.2  # between two looks at the graph
-# What discovery takes between processes of one machine: a publisher that is found so soon after the
-# start of a node was there before it.
+# What discovery mostly takes: a publisher that is found so soon after the start of a node was there
+# before it. Controllers of this machine are waited for however long it takes.
 SETTLE_S = 0.7
 HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
 SILENT_S = 3.0  # periods of /diagnostics, after which a controller that has said something is gone
@@ -113,6 +114,8 @@ class RivalWatch:
         self._node, self._changed = node, changed
         own = _identity_made_by(node, self.topic, advertise)
         self._rivals = Rivals(own, time.monotonic() + SETTLE_S)
+        self._presence = Presence(node.context.get_domain_id(), self.topic, own)
+        self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
         self._others: frozenset[str] = frozenset()
         self._hello_until = -inf
         self._diagnostics: Subscription | None = None  # listened to only beside others
@@ -120,8 +123,13 @@ class RivalWatch:
 
     @property
     def settled(self) -> bool:
-        """Whether those who were there before the node have been found."""
+        """Whether the time is over in which those who were there before the node are found."""
         return time.monotonic() >= self._rivals.settled_at
+
+    @property
+    def complete(self) -> bool:
+        """Whether all controllers of this machine that were there at activation are found."""
+        return not self._awaited
 
     @property
     def claim(self) -> dict[str, object]:
@@ -135,11 +143,14 @@ class RivalWatch:
 
     def begin(self) -> None:
         """The controller has become active."""
+        # Of two that begin at once the one that is listed later waits for the other at least.
+        self._awaited = self._presence.others()
         self._rivals.begin(time.time_ns(), time.monotonic())
         self.look()
 
     def end(self) -> None:
         """It is not active any more."""
+        self._awaited = frozenset()
         self._rivals.end()
         self.look()
 
@@ -147,6 +158,10 @@ class RivalWatch:
         """Look at the graph."""
         now, before = time.monotonic(), self.found
         others = self._other_publishers()
+        if self._awaited:
+            self._awaited = self._awaited & self._presence.others() - others.keys()
+            # Whoever has been found while it was waited for was there before.
+            self._rivals.settled_at = max(self._rivals.settled_at, now)
         if self._others != others.keys():
             self._others, self._hello_until = frozenset(others), now + HELLO_S
         self._listen(bool(others))
