@@ -14,6 +14,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
+from backlash_ros.nodes.causes import UNNAMED
 from backlash_ros.nodes.presence import Presence
 from backlash_ros.nodes.spin import ProcessNode
 
@@ -26,7 +27,6 @@ SILENT_S = 3.0  # periods of /diagnostics, after which a controller that has sai
 OWN_S = 1.0  # for the graph to show a publisher of this very process
 # Keys in /diagnostics by which controllers know each other.
 ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
-UNNAMED = 'a node without a name'
 
 
 class Rival(NamedTuple):
