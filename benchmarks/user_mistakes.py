@@ -4,7 +4,8 @@
 
 Controller, reference and examples/motor_driver.py run with config/geared_motor.yaml, each as a
 process. Each case makes one mistake; the line that names it must be in the terminal and in
-/diagnostics within 3 s. What is wrong from the start counts from the first output on.
+/diagnostics within 3 s. What is wrong from the start counts from the first output on. The last
+case is no mistake: half of every processor is taken by something else, and nothing may be an error.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from math import inf, isfinite
 from pathlib import Path
 
@@ -28,12 +30,12 @@ os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from loop_latency import NODES
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from reporting import CHECK_HEADER, ROOT, Check, machine, text_table
+from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
 
 from backlash_ros import topics
 from backlash_ros.loopback import prefer_loopback
@@ -45,6 +47,7 @@ LONGEST_S = 15.0  # that a line is waited for
 START_S = 30.0  # for the processes to begin
 SOUND_S = 3.0  # of the loop before a mistake that is made while it runs
 LOOK_S = 0.02
+LOAD, LOADED_S, BUSY = 0.5, 25.0, 'busy machine'
 STALL_S = 0.012  # the controller is held up so long, after every look
 # Of a load that is five times as slow as the one that is there.
 SLOW_LOAD = ('plant.numerator:=[0.0069, 0.0062]', 'plant.denominator:=[1.0, -1.8593, 0.8724]')
@@ -103,7 +106,7 @@ class Scene:
 
     def __init__(self, folder: Path, domain: int, stack: ExitStack) -> None:
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
-        self.said: list[tuple[float, str]] = []  # messages of /diagnostics, with their time [s]
+        self.said: list[tuple[float, DiagnosticStatus]] = []  # in /diagnostics, with the time [s]
         self.stalled = False  # the controller is held up again and again
         self._folder, self._stack = folder, stack
         self._environment = child_environment(folder, domain)
@@ -159,7 +162,7 @@ class Scene:
 
     def _hear(self, message: DiagnosticArray) -> None:
         self.said += [
-            (time.monotonic(), status.message) for status in message.status
+            (time.monotonic(), status) for status in message.status
             if status.name == 'controller'
         ]
 
@@ -228,19 +231,22 @@ def watch(mistake: Mistake) -> Seen:
             deadline = time.monotonic() + SOUND_S
             on.wait_for(lambda: time.monotonic() > deadline, 2.0 * SOUND_S)
             mistake.made(on)
-        begin, terminal_s = time.monotonic(), inf
+        begin, terminal_s, before = time.monotonic(), inf, len(on.lines())
 
         def diagnostics_s() -> float:
-            return next((at - begin for at, text in on.said if mistake.words in text), inf)
+            return next((
+                at - begin for at, status in on.said
+                if at > begin and mistake.words in status.message
+            ), inf)
 
         def named() -> bool:
             nonlocal terminal_s
-            if any(mistake.words in line for line in on.lines()):
+            if any(mistake.words in line for line in on.lines()[before:]):
                 terminal_s = min(terminal_s, time.monotonic() - begin)
             return isfinite(terminal_s) and isfinite(diagnostics_s())
 
         on.wait_for(named, LONGEST_S)
-        lines = on.lines()
+        lines = on.lines()[before:]
         found = [line for line in lines if mistake.words in line]
         return Seen(terminal_s, diagnostics_s(), found[0] if found else '\n'.join(lines))
 
@@ -254,11 +260,34 @@ def judge(mistake: Mistake, seen: Seen) -> Check:
     )
 
 
+def check_load() -> Check:
+    """Whether a loop that is merely late is never called an error."""
+    with scene() as on:
+        on.start_node('controller')
+        on.start_node('reference')
+        on.wait_for(lambda: on.said, START_S)
+        for i in range(processors()):
+            on.start(f'load {i}', [str(Path(__file__).with_name('busy_loop.py')), str(LOAD)])
+        on.start('driver', ['-c', DRIVER, 'none'])
+        on.wait_for(lambda: on.node.count_publishers(topics.PLANT_OUTPUT), START_S)
+        deadline = time.monotonic() + LOADED_S
+        on.wait_for(lambda: time.monotonic() > deadline, 2.0 * LOADED_S)
+        levels = [status.level for _, status in on.said]
+        print('\n  '.join([f'{LOAD:.0%} of the processors taken:', *on.lines()]), flush=True)
+        changes = sum(a != b for a, b in pairwise(levels))
+        errors = levels.count(DiagnosticStatus.ERROR)
+        return Check(
+            f'{LOAD:.0%} of the processors taken for {LOADED_S:g} s', 'no ERROR',
+            f'{errors} of {len(levels)} are ERROR, {changes} changes of the level', errors == 0,
+        )
+
+
 def main() -> int:
     """Return 0 if every bound holds, else 1."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--case', choices=[each.name for each in MISTAKES], action='append',
+    parser.add_argument('--case', choices=[*(each.name for each in MISTAKES), BUSY],
+                        action='append',
                         help='instead of all; may be repeated')
     arguments = parser.parse_args()
     print(machine())
@@ -269,6 +298,8 @@ def main() -> int:
         seen = watch(mistake)
         print(f'{mistake.name}:\n  {seen.line}', flush=True)
         checks.append(judge(mistake, seen))
+    if not arguments.case or BUSY in arguments.case:
+        checks.append(check_load())
     print()
     print(text_table(CHECK_HEADER, [check.row for check in checks]))
     return 0 if all(check.holds for check in checks) else 1
