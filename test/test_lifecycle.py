@@ -133,6 +133,7 @@ def test_frozen_estimates_stay_and_learning_goes_on_afterwards(tmp_path: Path) -
         held = driver.estimate()
         driver.run(0.3)
         assert driver.estimate() == held
+        driver.run_until(lambda: driver.text('state') == 'held', 'the state in words')
         assert asked.set('freeze_adaptation', False)
         driver.run_until(lambda: driver.estimate() != held, 'a change')
         driver.run_until_known(0.02)
