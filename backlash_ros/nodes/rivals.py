@@ -112,7 +112,7 @@ class RivalWatch:
         self.topic = node.resolve_topic_name(topic)
         self.found: tuple[Rival, ...] = ()
         self._node, self._changed = node, changed
-        own = _identity_made_by(node, self.topic, advertise)
+        own = identity_made_by(node, self.topic, advertise)
         self._rivals = Rivals(own, time.monotonic() + SETTLE_S)
         self._presence = Presence(node.context.get_domain_id(), self.topic, own)
         self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
@@ -176,7 +176,7 @@ class RivalWatch:
         infos = self._node.get_publishers_info_by_topic(self.topic)
         return {
             identity: name_of(info) for info in infos
-            if (identity := _identity(info)) != self._rivals.own
+            if (identity := identity_of(info)) != self._rivals.own
         }
 
     def _listen(self, wanted: bool) -> None:
@@ -207,24 +207,25 @@ def names_of(infos: Iterable[TopicEndpointInfo]) -> str:
     return ', '.join(sorted({name_of(info) for info in infos}))
 
 
-def _identity(info: TopicEndpointInfo) -> str:
+def identity_of(info: TopicEndpointInfo) -> str:
+    """Identity of an endpoint, one and the same for all who see it."""
     return bytes(info.endpoint_gid).hex()
 
 
-def _identity_made_by(
+def identity_made_by(
     node: Node, topic: str, advertise: Callable[[], Publisher],
 ) -> str:
     """Identity of the publisher that advertise makes; rclpy has no way to ask for it."""
     def seen() -> list[TopicEndpointInfo]:
         return list(node.get_publishers_info_by_topic(topic))
 
-    own_name, before = node.get_fully_qualified_name(), set(map(_identity, seen()))
+    own_name, before = node.get_fully_qualified_name(), set(map(identity_of, seen()))
     advertise()
     deadline = time.monotonic() + OWN_S
     while time.monotonic() < deadline:
         # A namesake that is discovered at this very moment has no name yet.
         for info in seen():
-            if _identity(info) not in before and name_of(info) == own_name:
-                return _identity(info)
+            if identity_of(info) not in before and name_of(info) == own_name:
+                return identity_of(info)
         time.sleep(1e-3)
     raise RuntimeError(f'the graph does not show the own publisher of {topic} within {OWN_S:g} s')
