@@ -18,6 +18,8 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 RUN := .venv/bin/python
+# Tests that start processes mostly wait, each in a ROS domain of its own.
+WORKERS := -n 2 --maxschedchunk 1
 # A Python that was not asked for by name leaves an existing .venv of another Python as it is.
 KEEP := $(if $(filter file,$(origin PYTHON)),--keep-python)
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 10))
@@ -38,7 +40,7 @@ demo: run-environment
 	@$(RUN) -m backlash_ros.tools.bringup --duration 10 $(ARGS)
 
 test: dev-environment
-	@$(RUN) -m pytest $(ARGS)
+	@$(RUN) -m pytest $(WORKERS) $(ARGS)
 
 bench: dev-environment
 	@$(RUN) benchmarks/run.py $(ARGS)

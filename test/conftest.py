@@ -1,4 +1,4 @@
-"""For all tests: property tests draw the same examples on every machine and run; a fixture."""
+"""For all tests: what examples property tests draw, the order of the tests, a fixture."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +14,19 @@ settings.register_profile(
 # For a hunt by hand: pytest --hypothesis-profile=search
 settings.register_profile('search', deadline=None, max_examples=1000)
 settings.load_profile('repeatable')
+
+STARTS_PROCESSES = {'bringup_processes', 'paced_driver', 'ros_processes'}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put tests with processes at the end: beside each other, not beside those that compute."""
+    items.sort(key=_starts_processes)
+
+
+def _starts_processes(item: pytest.Item) -> bool:
+    assert isinstance(item, pytest.Function)
+    helpers = {getattr(each, '__module__', '') for each in vars(item.module).values()}
+    return 'start' in item.fixturenames or bool(helpers & STARTS_PROCESSES)
 
 
 @pytest.fixture

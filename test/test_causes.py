@@ -13,6 +13,7 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.nodes.causes import (
     LONGEST_TEXT,
     STATES,
+    UNNAMED,
     Finding,
     Level,
     LoopFigures,
@@ -151,6 +152,26 @@ def test_a_contradiction_is_named_by_what_the_fit_has_found(
 def test_a_loop_that_is_merely_late_is_never_an_error(changes: dict[str, Any]) -> None:
     for status in Status:
         assert worst_level(replace(WELL, status=status, **changes)) == Level.WARN
+
+
+def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
+    for known in ({'wrong_sign': True}, {'unexplained': 0.2}):
+        figures = replace(INCONSISTENT, unreported=30, inconsistent_s=10.0, **known)
+        assert [finding.kind for finding in findings_of(figures)] == ['model', 'unreported']
+
+
+def test_no_lateness_turns_the_sign() -> None:
+    finding = first(replace(INCONSISTENT, late=30, wrong_sign=True))
+    assert finding.text.startswith('plant_output moves against v')
+    assert finding.level == Level.ERROR
+
+
+def test_a_rival_whose_name_is_not_known_yet_is_no_line_of_the_log_at_once() -> None:
+    for standing_down in (False, True):
+        unnamed = first(replace(WELL, rivals=(UNNAMED,), standing_down=standing_down))
+        assert unnamed.lasting
+        assert unnamed.level == Level.ERROR
+        assert not first(replace(WELL, rivals=('/b',), standing_down=standing_down)).lasting
 
 
 def test_lateness_is_no_excuse_for_a_contradiction_that_lasts() -> None:

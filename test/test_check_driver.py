@@ -9,16 +9,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from made_up_driver import LIMITS, PERIOD_S, parameters
-from ros_processes import Probe
+from ros_processes import Probe, wait_until
 from std_msgs.msg import Float64
 
 from backlash_ros.nodes.check_driver import main
+from backlash_ros.nodes.presence import LISTED, Presence
 from backlash_ros.tools.processes import child_environment, free_domain
 
 HERE = Path(__file__).resolve().parent
@@ -281,6 +282,18 @@ def test_a_controller_that_drives_already_is_not_disturbed(tmp_path: Path) -> No
             probe.close()
     assert process.returncode == 2
     assert '/control is published by ' in err
+
+
+@pytest.mark.skipif(not LISTED.exists(), reason='needs Linux')
+def test_a_controller_that_discovery_has_not_found_is_not_disturbed(tmp_path: Path) -> None:
+    with bench(tmp_path, 'none') as beside, \
+            closing(Presence(beside.domain, '/control', 'f' * 32)) as hidden:
+        process = beside.start('--drive')
+        # Who comes after it knows of it likewise.
+        wait_until(hidden.others, 'its presence', lambda: time.sleep(0.02))
+        err = process.communicate(timeout=DEADLINE_S)[1]
+    assert process.returncode == 2
+    assert '/control is published by a controller of this machine' in err
 
 
 @pytest.mark.parametrize(('options', 'word'), [

@@ -63,12 +63,13 @@ def test_deviation_is_that_of_plants_drawn_from_the_posterior() -> None:
     impulse[0] = 1.0
     told = lfilter(model.numerator, model.denominator, impulse)
     moves = error.filtered(np.diff(told, prepend=0.0)) @ error.spread
+    shares = transform(moves) / transform(told)[:, None]
     squares = np.zeros(len(POINTS))
     draws = rng.multivariate_normal(posterior.mean, cov, 2000)
     for drawn in draws:
         m, e = drawn[layout.n + 1], drawn[layout.base:layout.base + layout.errors]
         # The record says m G (1 + Delta).
-        squares += np.abs(transform(told + moves @ (e / m)) / transform(told) - 1.0) ** 2
+        squares += np.abs(shares @ (e / m)) ** 2
     assert fit.response_std(solution, POINTS) == pytest.approx(
         np.sqrt(squares / len(draws)), rel=0.1
     )

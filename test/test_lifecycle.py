@@ -105,7 +105,10 @@ def test_reactivation_keeps_the_estimates_and_makes_no_jump(
 ) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(
-            world, structure=structure, **{'control.rate_max': RATE_MAX, 'on_stop': 'ramp'}
+            world, structure=structure, **{
+                'control.rate_max': RATE_MAX, 'on_stop': 'ramp',
+                'timeout.ramp': 30.0,  # a loop that is held up may be far from 0
+            },
         )
         asked = Asked(driver)
         driver.learn()
@@ -133,6 +136,7 @@ def test_frozen_estimates_stay_and_learning_goes_on_afterwards(tmp_path: Path) -
         held = driver.estimate()
         driver.run(0.3)
         assert driver.estimate() == held
+        driver.run_until(lambda: driver.text('state') == 'held', 'the state in words')
         assert asked.set('freeze_adaptation', False)
         driver.run_until(lambda: driver.estimate() != held, 'a change')
         driver.run_until_known(0.02)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from backlash_ros.nodes.loop_statistics import LoopStatistics
+from backlash_ros.nodes.loop_statistics import Lately, LoopStatistics
 from backlash_ros.tools.results import _latency_ms
 
 
@@ -15,3 +15,12 @@ def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> No
         statistics.note(0.0, 0.0, False, float(latency))
     reported = _latency_ms(latencies)
     assert reported == {'p50': statistics.latency_ms(0.5), 'p99': statistics.latency_ms(0.99)}
+
+
+def test_what_was_gained_lately_is_never_negative_after_a_new_beginning() -> None:
+    lately = Lately()
+    for t in range(10):
+        gained = lately.gained({'used': 100 * t, 'lost': 0}, float(t))
+    assert gained['used'] > 100
+    assert lately.gained({'used': 40, 'lost': 3}, 10.0) == {'used': 40, 'lost': 3}
+    assert lately.gained({'used': 90, 'lost': 3}, 11.0) == {'used': 50, 'lost': 0}

@@ -184,7 +184,10 @@ def test_stall_of_less_than_a_tenth_of_a_second_loses_nothing_that_was_sent(
         stall = time.monotonic() - begin
         probe.wait_until(lambda: nodes['plant'].events('done'), 'the end of the run')
         stop_loop(nodes)
+    # A stall of more than a tenth of a second shows in how late the oldest kept output is answered.
+    latency = topics.SIGNAL_LABELS.index('latency_s')
+    stall = max(stall, *(message.data[latency] for message in signals))
     if stall > 0.09:
-        pytest.skip(f'the machine made the stall {stall:.3f} s long')
+        pytest.skip(f'the machine made a stall {stall:.3f} s long')
     counted = dict(re.findall(r'([a-z][a-z ]*): (\d+)', nodes['controller'].stderr))
     assert counted.get('lost', '0') == counted.get('of these never sent', '0')

@@ -190,7 +190,12 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path, storage:
         listener = Listener(probe)
         diagnostics = probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
         nodes = start_loop(world, bag, storage)
-        listener.wait_for(60)
+
+        def recorded() -> int:
+            told = nodes['recorder'].events('progress')
+            return int(told[-1]['received'][topics.SIGNALS]) if told else 0
+
+        probe.wait_until(lambda: recorded() > 60, 'a recording')
         # As a file system does that is full: what goes beyond is refused.
         size = max(path.stat().st_size for path in bag.iterdir())
         limit = (size + 20_000,) * 2

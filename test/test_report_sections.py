@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 from test_report import MULTI_ARRAY, PARAMETERS, TYPES, rows_of
 
@@ -32,6 +33,7 @@ class Piece:
     begin_s: float = 0.0
     first: int = 0
     namespace: str = ''
+    node: str = 'controller'
     truth_first: int | None = None
 
 
@@ -48,7 +50,8 @@ def write_pieces(path: Path, *pieces: Piece) -> Path:
             rows = rows_of(piece.run, labels, frozenset(), prefix, first)
             messages += [
                 (START_NS + int(piece.begin_s * 1e9) + k * PERIOD_NS, len(messages) + k,
-                 f'/{piece.namespace}{topic}', raw) for k, raw in rows
+                 f'/{piece.namespace}{topic.replace("controller", piece.node)}', raw)
+                for k, raw in rows
             ]
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         names = {name for _, _, name, _ in messages}
@@ -100,6 +103,43 @@ def test_from_and_to_choose_the_other_part(
     assert report.main([str(bag), '--from', '9', '--out', str(tmp_path / 'none')]) == 2
     assert 'holds no sample between --from and --to' in capsys.readouterr().err
     assert report.main([str(bag), '--from', '2', '--to', '1']) == 2
+
+
+def test_bag_of_a_renamed_controller_gives_a_report(tmp_path: Path, first: RunRecord) -> None:
+    bag = write_pieces(tmp_path / 'bag', Piece(first, node='left'))
+    assert same(read_bag(bag).run, first)
+    assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
+
+
+def test_a_controller_that_keeps_its_name_goes_before_a_renamed_one(
+    tmp_path: Path, first: RunRecord, second: RunRecord,
+) -> None:
+    bag = write_pieces(tmp_path / 'bag', Piece(first, node='a'), Piece(second, node='controller'))
+    found = read_bag(bag)
+    assert same(found.run, second)
+    assert 'holds /controller/signals, /a/signals: this is controller' in found.notes[0]
+    assert same(read_bag(bag, axis='a').run, first)
+
+
+def test_topics_of_others_with_the_same_ending_are_left_alone(
+    tmp_path: Path, first: RunRecord,
+) -> None:
+    bag = write_pieces(tmp_path / 'bag', Piece(first))
+    path = tmp_path / 'with others'
+    with AnyReader([bag]) as reader, \
+            Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        other = writer.add_connection('/a/signals', MULTI_ARRAY, typestore=TYPES)
+        connections = {
+            each.id: writer.add_connection(each.topic, MULTI_ARRAY, typestore=TYPES)
+            for each in reader.connections
+        }
+        for connection, stamp_ns, raw in reader.messages():
+            writer.write(connections[connection.id], stamp_ns, raw)
+        empty = TYPES.types['std_msgs/msg/MultiArrayLayout']([], 0)
+        message = TYPES.types[MULTI_ARRAY](empty, np.ones(3))
+        writer.write(other, START_NS, TYPES.serialize_cdr(message, MULTI_ARRAY))
+    assert same(read_bag(path).run, first)
+    assert read_bag(path).notes == ()
 
 
 def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> None:

@@ -15,6 +15,8 @@ from backlash_ros.tools.processes import DOMAIN_0_PORT, PORTS_PER_DOMAIN
 SIZE = 52400  # of the file of a port
 HALF_MADE, COMPLETE = bytes(SIZE), b'\x02' + bytes(SIZE - 1)
 FIRST_USER_PORT = 11  # of a domain
+# Nodes of other tests that start at the same moment may be first to remove what is left.
+ATTEMPTS = 5
 
 
 def leave(path: Path, content: bytes, age_s: float = MAKING_TAKES_S + 1.0) -> Path:
@@ -53,9 +55,12 @@ def test_node_starts_where_a_killed_one_has_left_its_port_half_made(tmp_path: Pa
     with ros_world(tmp_path) as world:
         number = DOMAIN_0_PORT + PORTS_PER_DOMAIN * world.domain + FIRST_USER_PORT
         port = SHARED_MEMORY / f'fastrtps_port{number}'
-        port.unlink(missing_ok=True)
-        leave(port, HALF_MADE)
-        reference = world.start('reference', {'wait_for_subscribers': 0})
-        reference.wait_for('ready')
-        assert reference.stop() == 0
-    assert f'{port}: removed' in reference.stderr
+        for _ in range(ATTEMPTS):
+            port.unlink(missing_ok=True)
+            leave(port, HALF_MADE)
+            reference = world.start('reference', {'wait_for_subscribers': 0})
+            reference.wait_for('ready')
+            assert reference.stop() == 0
+            if f'{port}: removed' in reference.stderr:
+                return
+    pytest.fail(f'the node does not say that it has removed {port}:\n{reference.stderr}')

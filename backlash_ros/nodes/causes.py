@@ -17,6 +17,7 @@ RATE_TOLERANCE = 0.1
 TROUBLE = 0.01
 UNEXPLAINED = 0.05  # share of m times the gap from which on unexplained motion is worth naming
 LIMITED = 0.5  # share of limited commands that leaves too little motion
+UNNAMED = 'a node without a name'
 STILL_SAMPLES = 20  # equal values of y in a row, while v moves on
 # A contradiction between y and G(z) that lasts longer is not put down to late or lost samples [s].
 PATIENCE_S = 3.0
@@ -124,7 +125,9 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     state = _state(f, causes)
     found = causes
     if state.kind == 'model':
-        late = [cause for cause in causes if cause.kind in LATENESS]
+        # What the fit has found out itself says more than reports that are missing.
+        lesser = LATENESS if state == STATES[Status.INCONSISTENT] else (*LATENESS, 'unreported')
+        late = [cause for cause in causes if cause.kind in lesser]
         found = [cause for cause in causes if cause not in late] + [state, *late]
     elif state.level != Level.OK or not causes:
         found = [*causes, state]
@@ -154,7 +157,9 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
         # What is not there yet is among the causes; else all is about to begin.
         return Finding(Level.OK, 'begins', 'the loop begins')
     kinds = {cause.kind for cause in causes}
-    briefly = f.inconsistent_s < PATIENCE_S and not kinds.isdisjoint(LATENESS)
+    # No lateness turns the sign.
+    briefly = f.inconsistent_s < PATIENCE_S and not kinds.isdisjoint(LATENESS) \
+        and not f.wrong_sign
     if f.status == Status.INCONSISTENT and (briefly or 'rate' in kinds):
         return Finding(
             Level.WARN, 'held', f'{f.output.name} does not follow from v while samples are late or '
@@ -230,15 +235,16 @@ def _bad_numbers(f: LoopFigures) -> list[Finding]:
 
 def _second_senders(f: LoopFigures) -> list[Finding]:
     found = []
+    unnamed = UNNAMED in f.rivals  # most get their name soon after they are found
     if f.standing_down:
         found.append(Finding(
             Level.ERROR, 'rivals', f'standing down: {f.rivals[0] if f.rivals else "another node"} '
-            f'published {f.control.name} before: stop one',
+            f'published {f.control.name} before: stop one', lasting=unnamed,
         ))
     elif f.rivals:
         found.append(Finding(
             Level.ERROR, 'rivals', f'{1 + len(f.rivals)} publishers of {f.control.name}, '
-            f'also {f.rivals[0]}: stop one',
+            f'also {f.rivals[0]}: stop one', lasting=unnamed,
         ))
     senders = len(f.output.heard)
     if senders > 1:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import yaml
+from rclpy.publisher import Publisher
 from rclpy.qos import (
     QoSCompatibility,
     QoSProfile,
@@ -40,8 +41,9 @@ from backlash_ros.nodes.driver_motion import record_of
 from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
 from backlash_ros.nodes.gentle_drive import GentleDrive, drive_range
 from backlash_ros.nodes.messages import DEPTH
+from backlash_ros.nodes.presence import Presence
 from backlash_ros.nodes.prompt_executor import PromptExecutor
-from backlash_ros.nodes.rivals import names_of
+from backlash_ros.nodes.rivals import identity_made_by, names_of
 from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
 from backlash_ros.shipped import find_config
 
@@ -52,6 +54,7 @@ SETTLE_S = 1.0  # after which everybody should have found everybody
 REMIND_S = 3.0  # between two lines that say what is missing
 CONTROLLER_SECTIONS = ('/**/controller', 'controller', '/controller')
 NOT_OURS = {'/rosout', '/parameter_events'}
+UNSEEN = 'a controller of this machine'  # that discovery has not found yet
 COMMAND_LINE = '_ros2cli'  # how the nodes of `ros2 topic` are called
 
 
@@ -151,10 +154,17 @@ class CheckDriverNode(ProcessNode):
         if self._limits is None:
             self._hear(topics.CONTROL, heard.controls)
         else:
-            self._control = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+            own = identity_made_by(self, self._names[topics.CONTROL], self._advertise)
+            self._presence = Presence(
+                self.context.get_domain_id(), self._names[topics.CONTROL], own
+            )
         self.listen(
             Float64, topics.PLANT_OUTPUT, self._on_output, self._profile(topics.PLANT_OUTPUT)
         )
+
+    def _advertise(self) -> Publisher:
+        self._control: Publisher = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+        return self._control
 
     def _hear(self, topic: str, messages: list[Message]) -> None:
         def on_message(message: Float64, info: dict[str, Any]) -> None:
@@ -228,6 +238,8 @@ class CheckDriverNode(ProcessNode):
 
     def _may_drive(self, listened_s: float) -> bool:
         """Whether to drive: told to, the graph known by now, heard by a driver, alone."""
+        if self._limits is not None and listened_s > SETTLE_S and self._presence.others():
+            self._rivals = self._rivals or UNSEEN
         return (
             self._limits is not None and listened_s > SETTLE_S and not self._rivals
             and self._control.get_subscription_count() > 0

@@ -188,6 +188,21 @@ class ControllerNode(ManagedNode):
             self.loop.renew(self.loop.estimate)
             self.loop.heard_at = None
             return
+        if self._lockstep:  # simulated time hurts nobody
+            self._await_loop()
+        else:
+            self.call_when(
+                lambda: self._rivals.settled and self._knows_rivals(), self._await_loop,
+                f'discovery of another controller of {self._rivals.topic} on this machine: '
+                'end that one, or set on_rival: warn',
+            )
+
+    def _knows_rivals(self) -> bool:
+        """Whether no controller of this machine has still to be found that may be in charge."""
+        return self._rivals.complete or self._live.parameters.word('on_rival') == 'warn'
+
+    def _await_loop(self) -> None:
+        """Listen to plant_output as soon as everybody is there."""
         needed = self._conditions_of_start()
         self.call_when(
             lambda: all(condition() for condition in needed), self._listen_to_driver,
@@ -242,13 +257,10 @@ class ControllerNode(ManagedNode):
 
     def _conditions_of_start(self) -> list[Callable[[], bool]]:
         """What has to be there before plant_output is listened to, for that starts the loop."""
-        # Whoever commands the actuator already has to be found first; simulated time hurts nobody.
-        alone: list[Callable[[], bool]] = [] if self._lockstep else [lambda: self._rivals.settled]
         wanted = max(self.settings.integer('wait_for_subscribers'), int(self._lockstep))
         if not wanted:
-            return alone
+            return []
         return [
-            *alone,
             lambda: self._io.listeners >= wanted,
             # Beside the driver, those who listen want to hear everything.
             lambda: min(self._signals.listeners, self._estimates.listeners) >= wanted - 1,
@@ -312,6 +324,8 @@ class ControllerNode(ManagedNode):
 
     def _may_begin(self, loop: ControlLoop, output: Output) -> bool:
         """Whether it is known from which v the first command goes on, or waiting is in vain."""
+        if not self._knows_rivals():
+            return False
         if self._io.is_simulated:
             return True
         if missing := missing_limits(self._live.parameters):

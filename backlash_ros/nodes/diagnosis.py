@@ -151,7 +151,7 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
     _, mean_s, _ = statistics.intervals_s()
     return {
         **counts_of(loop),
-        'state': e.status.word,
+        'state': e.status.word if loop.adapting else 'held',
         **_of_the_fit(loop),
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
         **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),

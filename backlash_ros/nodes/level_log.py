@@ -7,7 +7,9 @@ from math import inf
 
 from backlash_ros.nodes.causes import Finding, Level
 
-LASTS_S = 2.0  # what passes by itself as a rule is told only after so long
+# What passes by itself as a rule is told only after so long: at the third of the looks, which come
+# once a second, be it a little early.
+LASTS_S = 1.5
 AGAIN_S = 10.0  # until the same cause is told once more
 
 

@@ -97,7 +97,12 @@ class Lately:
         self._looks: deque[tuple[float, Mapping[str, int]]] = deque()
 
     def gained(self, counts: Mapping[str, int], now_s: float) -> dict[str, int]:
-        """Take in the counters as they are now [s] and return what each has gained lately."""
+        """Take in the counters as they are now [s] and return what each has gained lately.
+
+        Counters that have fallen are those of another loop, which has begun with 0.
+        """
+        if self._looks and any(counts[name] < n for name, n in self._looks[-1][1].items()):
+            self._looks.clear()
         while len(self._looks) > 1 and self._looks[1][0] <= now_s - WINDOW_S:
             self._looks.popleft()
         before = self._looks[0][1] if self._looks else {}

@@ -14,18 +14,19 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
+from backlash_ros.nodes.causes import UNNAMED
+from backlash_ros.nodes.presence import Presence
 from backlash_ros.nodes.spin import ProcessNode
 
 LOOK_S = 0.2  # between two looks at the graph
-# What discovery takes between processes of one machine: a publisher that is found so soon after the
-# start of a node was there before it.
+# What discovery mostly takes: a publisher that is found so soon after the start of a node was there
+# before it. Controllers of this machine are waited for however long it takes.
 SETTLE_S = 0.7
 HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
 SILENT_S = 3.0  # periods of /diagnostics, after which a controller that has said something is gone
 OWN_S = 1.0  # for the graph to show a publisher of this very process
 # Keys in /diagnostics by which controllers know each other.
 ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
-UNNAMED = 'a node without a name'
 
 
 class Rival(NamedTuple):
@@ -111,8 +112,10 @@ class RivalWatch:
         self.topic = node.resolve_topic_name(topic)
         self.found: tuple[Rival, ...] = ()
         self._node, self._changed = node, changed
-        own = _identity_made_by(node, self.topic, advertise)
+        own = identity_made_by(node, self.topic, advertise)
         self._rivals = Rivals(own, time.monotonic() + SETTLE_S)
+        self._presence = Presence(node.context.get_domain_id(), self.topic, own)
+        self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
         self._others: frozenset[str] = frozenset()
         self._hello_until = -inf
         self._diagnostics: Subscription | None = None  # listened to only beside others
@@ -120,8 +123,13 @@ class RivalWatch:
 
     @property
     def settled(self) -> bool:
-        """Whether those who were there before the node have been found."""
+        """Whether the time is over in which those who were there before the node are found."""
         return time.monotonic() >= self._rivals.settled_at
+
+    @property
+    def complete(self) -> bool:
+        """Whether all controllers of this machine that were there at activation are found."""
+        return not self._awaited
 
     @property
     def claim(self) -> dict[str, object]:
@@ -135,11 +143,14 @@ class RivalWatch:
 
     def begin(self) -> None:
         """The controller has become active."""
+        # Of two that begin at once the one that is listed later waits for the other at least.
+        self._awaited = self._presence.others()
         self._rivals.begin(time.time_ns(), time.monotonic())
         self.look()
 
     def end(self) -> None:
         """It is not active any more."""
+        self._awaited = frozenset()
         self._rivals.end()
         self.look()
 
@@ -147,6 +158,10 @@ class RivalWatch:
         """Look at the graph."""
         now, before = time.monotonic(), self.found
         others = self._other_publishers()
+        if self._awaited:
+            self._awaited = self._awaited & self._presence.others() - others.keys()
+            # Whoever has been found while it was waited for was there before.
+            self._rivals.settled_at = max(self._rivals.settled_at, now)
         if self._others != others.keys():
             self._others, self._hello_until = frozenset(others), now + HELLO_S
         self._listen(bool(others))
@@ -161,7 +176,7 @@ class RivalWatch:
         infos = self._node.get_publishers_info_by_topic(self.topic)
         return {
             identity: name_of(info) for info in infos
-            if (identity := _identity(info)) != self._rivals.own
+            if (identity := identity_of(info)) != self._rivals.own
         }
 
     def _listen(self, wanted: bool) -> None:
@@ -192,24 +207,25 @@ def names_of(infos: Iterable[TopicEndpointInfo]) -> str:
     return ', '.join(sorted({name_of(info) for info in infos}))
 
 
-def _identity(info: TopicEndpointInfo) -> str:
+def identity_of(info: TopicEndpointInfo) -> str:
+    """Identity of an endpoint, one and the same for all who see it."""
     return bytes(info.endpoint_gid).hex()
 
 
-def _identity_made_by(
+def identity_made_by(
     node: Node, topic: str, advertise: Callable[[], Publisher],
 ) -> str:
     """Identity of the publisher that advertise makes; rclpy has no way to ask for it."""
     def seen() -> list[TopicEndpointInfo]:
         return list(node.get_publishers_info_by_topic(topic))
 
-    own_name, before = node.get_fully_qualified_name(), set(map(_identity, seen()))
+    own_name, before = node.get_fully_qualified_name(), set(map(identity_of, seen()))
     advertise()
     deadline = time.monotonic() + OWN_S
     while time.monotonic() < deadline:
         # A namesake that is discovered at this very moment has no name yet.
         for info in seen():
-            if _identity(info) not in before and name_of(info) == own_name:
-                return _identity(info)
+            if identity_of(info) not in before and name_of(info) == own_name:
+                return identity_of(info)
         time.sleep(1e-3)
     raise RuntimeError(f'the graph does not show the own publisher of {topic} within {OWN_S:g} s')

@@ -34,6 +34,8 @@ SOURCES: dict[str, dict[str, str]] = {
         name: name for name in ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l')
     },
 }
+ARRAY = 'std_msgs/msg/Float64MultiArray'
+MODEL_LABELS = ('numerator', 'denominator', 'delay_samples')  # by which a renamed one is known
 TRUE_BACKLASH = {'true_m': 'm', 'true_c_r': 'c_r', 'true_c_l': 'c_l'}
 
 
@@ -184,15 +186,23 @@ def _read_content(path: Path) -> _Content:
         raise InputError(f'{path}: {reason}, and nothing of it can be read: {error}') from None
 
 
-def _is_array_topic(name: str) -> bool:
-    return any(f'/{name}'.endswith(f'/{topic}') for topic in (*LABELS, topics.MODEL))
+def _is_array_topic(name: str, message_type: str) -> bool:
+    return message_type == ARRAY and any(
+        _last_part(name) == _last_part(topic) for topic in (*LABELS, topics.MODEL)
+    )
+
+
+def _last_part(name: str) -> str:
+    return name.rpartition('/')[2]
 
 
 def _read_complete(path: Path) -> _Content:
     content = _Content()
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         content.names = {connection.topic for connection in reader.connections}
-        wanted = [found for found in reader.connections if _is_array_topic(found.topic)]
+        wanted = [
+            found for found in reader.connections if _is_array_topic(found.topic, found.msgtype)
+        ]
         # No choice would be all of them.
         for connection, stamp_ns, raw in reader.messages(wanted) if wanted else ():
             message = reader.deserialize(raw, connection.msgtype)
@@ -205,7 +215,7 @@ def _read_remains(path: Path, reason: str) -> _Content:
     remains = open_remains(path)
     first, last, count, garbled = 2**63, 0, 0, 0
     for topic, stamp_ns, raw in remains.messages():
-        if _is_array_topic(topic.name):
+        if _is_array_topic(topic.name, topic.message_type):
             try:
                 message = types.deserialize_cdr(raw, topic.message_type)
             # Whatever the damaged bytes make the library stumble over, the message is lost.
@@ -251,7 +261,7 @@ def _find_tables(
     """The array topics of one axis, what other axes there are, and its models."""
     tables, about = {}, ''
     for topic, labels in LABELS.items():
-        names = sorted(name for name in content.names if f'/{name}'.endswith(f'/{topic}'))
+        names = _names_of(content, topic, labels)
         name, note = choose_namespace(names, axis) if names else ('', '')
         if topic == topics.SIGNALS:
             about = note
@@ -264,9 +274,20 @@ def _find_tables(
             heard = ', '.join(sorted(content.names)) or 'nothing'
             of_axis = f' of axis {axis}' if axis else ''
             raise InputError(f'{path}: holds no {topic}{of_axis}, only {heard}')
-    names = sorted(name for name in content.names if f'/{name}'.endswith(f'/{topics.MODEL}'))
+    names = _names_of(content, topics.MODEL, MODEL_LABELS)
     name = choose_namespace(names, axis)[0] if names else ''
     return tables, about, content.messages.get(name, [])
+
+
+def _names_of(content: _Content, topic: str, labels: Sequence[str]) -> list[str]:
+    """Under which names a topic was recorded; nodes that were renamed stand behind the others."""
+    kept = {name for name in content.names if f'/{name}'.endswith(f'/{topic}')}
+    renamed = {
+        name for name, messages in content.messages.items()
+        if _last_part(name) == _last_part(topic)
+        and {each.label for each in messages[0][1].layout.dim} >= set(labels)
+    }
+    return [*sorted(kept), *sorted(renamed - kept)]
 
 
 def _tabulate(
