@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 NO_PAST: Array = np.empty(0)
 PAST = 3  # memories of G for which what its error does may last
 FAR = 1e3  # prior of x0, in units of the largest output and of the noise
+ROUNDING = 1e-10  # share of the largest y below which a residual is rounding
 LINEAR = 0.05  # scale of the error of G up to which the response is linear in it
 SETTLING = 64  # samples over which the size of a column is told
 
@@ -275,7 +276,7 @@ class WindowFit:
         squares = float(residual @ residual)
         count = self._triangle.count
         correlation = 0.0
-        if squares > 0.0 and count > 1.0:
+        if squares > count * (ROUNDING * self.reach[0]) ** 2 and count > 1.0:
             lag = float(residual[1:] @ residual[:-1]) / squares
             correlation = max(0.0, lag - 3.0 / sqrt(count))
         inflation = 1.0 - correlation + count * correlation
