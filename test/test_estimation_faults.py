@@ -57,6 +57,21 @@ def test_sensor_that_comes_back_ends_the_freeze() -> None:
     assert errors(record, -1).max() < 0.01
 
 
+@pytest.mark.parametrize('seed', [303, 305])
+def test_samples_that_contradict_in_a_row_are_none_of_them_lost(seed: int) -> None:
+    # An integrator that leaks contradicts the first estimate at once: what was refused as outliers
+    # until then is just what tells of the leak.
+    leaking = np.convolve([1.0, -0.999], [1.0, -1.88504, 0.88692]).tolist()
+    record = build_closed_loop(Parameters({
+        'truth.denominator': leaking, 'output_noise_std': 1e-4, 'seed': seed,
+    })).run(300)
+    tracking = record.column('status') == Status.TRACKING
+    for name in NAMES:
+        off = np.abs(record.column(name) - record.column(f'true_{name}'))
+        assert np.all(off[tracking] <= 5.0 * record.column(f'std_{name}')[tracking])
+    assert np.count_nonzero(tracking) > 200
+
+
 @pytest.mark.parametrize('disturbance', [2.0, -1.0])
 def test_constant_disturbance_is_cancelled_by_effective_crossings(disturbance: float) -> None:
     record = run(500, lambda k, y: y, input_disturbance=disturbance)

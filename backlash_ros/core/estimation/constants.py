@@ -6,6 +6,7 @@ from __future__ import annotations
 LONGEST = 1500  # samples of the record that is fitted; beyond it the oldest third is let go
 BLOCK = (8, 64)  # samples, fewest and most, that are taken in between two solutions
 BLOCK_SHARE = 32  # ... and in between: one block for so many samples of the record
+BEGINNING = 0.03  # share of the record in which p is unknown that is let go for good
 GROWTH = 1.4  # of the record, after which all of it is fitted anew
 MOVED = 0.5  # standard deviations of the gap after which all of it is fitted anew
 

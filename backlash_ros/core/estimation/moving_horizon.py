@@ -22,6 +22,7 @@ from backlash_ros.core.estimation.attribution import Attribution, attributed
 from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
 from backlash_ros.core.estimation.constants import (
     AS_GOOD,
+    BEGINNING,
     BLOCK,
     BLOCK_SHARE,
     FIRST_SEARCH,
@@ -110,7 +111,8 @@ class MovingHorizon:
         self._begin_acquisition(initial if initial.learned else None)
         # Of the play operator, once it is known.
         self._p = self._u = nan
-        self._lost_in_a_row = self._refused = 0
+        self._lost_in_a_row = 0
+        self._refused: dict[int, float] = {}  # y of the newest samples, one after the other
         self._since_motion = 0
         self._v = nan
         self._reason = Status.ACQUIRING  # why there is no estimate
@@ -252,7 +254,8 @@ class MovingHorizon:
             p = clamp(self._p, v, v + gap)
             self._since_motion = self._since_motion + 1 if p == self._p else 0
             attribution, there = self._attribution, p
-            if attribution is None and other == other:
+            # An observer of a G that is known to be another one would blame the commands.
+            if attribution is None and other == other and self._around.model is self.model:
                 attribution = self._attribution = Attribution(observer)
             if attribution is not None:
                 if other == other:
@@ -276,13 +279,15 @@ class MovingHorizon:
                         self._record.exchange(self._record.end + 1 - attribution.delay)
                 self.innovation = innovation
                 if innovation * innovation <= GATE**2 * observer.variance:
-                    self._refused = 0
+                    self._refused.clear()
                     observer.correct(innovation)
-                elif self._refused < OUTLIERS:
-                    self._refused += 1
+                elif len(self._refused) < OUTLIERS:
+                    self._refused[self._record.end] = y
                     self.outliers += 1
                     accepted = None
                 else:
+                    # So many in a row were none: they are what the fit has to explain.
+                    self._record.restore(self._refused)
                     observer.correct(innovation)
         else:
             self._since_motion = self._since_motion + 1 if v == self._v else 0
@@ -514,6 +519,13 @@ class MovingHorizon:
                 )
                 prior = self._drifted(part.solution, len(v) - gone)
             around = around._replace(prior=prior, most=around.most if prior else inf)
+        elif around.error.count:
+            # Where the play began costs as many unknowns as the error of G has.
+            v, _ = record.since(first)
+            unknown = start.forgotten_after(v)
+            if unknown <= BEGINNING * len(v):
+                first += unknown
+                start = fit.start_after(v[:unknown])
         v, y = record.since(first)
         start = start.with_gap(solution.gap, v)
         if around.model is self._told.model:
@@ -768,6 +780,8 @@ class MovingHorizon:
         exact, cov = None, None
         if self._around.model is self.model:
             exact, cov = fit.state(solution)
+        else:
+            self._attribution = None
         noise = solution.posterior.noise_std
         if observer is None:
             observer = self._observer = Observer(self.model, noise)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import nan
 
 import numpy as np
@@ -62,6 +63,12 @@ class Record:
     def lose(self, numbers: NDArray[np.intp]) -> None:
         """Count y of these samples as lost."""
         self._y[self._begin + numbers - self.first] = np.nan
+
+    def restore(self, outputs: Mapping[int, float]) -> None:
+        """Count these y as measured after all, by the number of their sample."""
+        for number, y in outputs.items():
+            if self.first <= number < self.end:
+                self._y[self._begin + number - self.first] = y
 
     def forget_before(self, number: int) -> None:
         """Let go of all samples older than this one."""

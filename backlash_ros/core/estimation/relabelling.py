@@ -72,6 +72,9 @@ def fitted(
         result = Fitted(fit, solution)
         if best is None or solution.posterior.evidence >= best.solution.posterior.evidence:
             best = result
+        if fit.layout.leak:
+            # Without a leak an offset of u explains one as long as the labels are wrong.
+            solution = fit.solve(leaking=True)
         if abs(solution.gap - start.gap) <= STANDS * solution.std_gap or solution.m == 0.0:
             break
         slope = solution.m

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.constants import GATE, SLOW
 from backlash_ros.core.estimation.crossings import Crossings, crossings_of
 from backlash_ros.core.estimation.error_model import ErrorModel
-from backlash_ros.core.estimation.play import Labels, labels_of
+from backlash_ros.core.estimation.play import Labels, labels_of, play
 from backlash_ros.core.estimation.regression import (
     VAGUE,
     Posterior,
@@ -64,6 +64,13 @@ class Start(NamedTuple):
         labels = self.labels(v)
         side = int(labels.right[-1] - labels.left[-1])
         return Start(self.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
+
+    def forgotten_after(self, v: Array) -> int:
+        """Samples of v (N,) after which p says nothing any more; N + 1 if it always does."""
+        low = float(v[0])
+        ends = (play(v, self.gap, p)[0] for p in (low, low + self.gap))
+        same = np.flatnonzero(np.equal(*ends))
+        return int(same[0]) + 1 if same.size and self.side == 0 else len(v) + 1
 
     def with_gap(self, gap: float, v: Array) -> Start:
         """The same for another gap, before v (N,): a side that was engaged stays so."""
@@ -259,8 +266,11 @@ class WindowFit:
         motion = sqrt(solution.correlation) * solution.rms
         return motion / scale if scale > 0.0 else inf
 
-    def solve(self, walk: float | None = None) -> Solution:
-        """The solution for all samples so far. walk: instead of that of `around`."""
+    def solve(self, walk: float | None = None, leaking: bool = False) -> Solution:
+        """The solution for all samples so far.
+
+        walk: instead of that of `around`. leaking: where G integrates, it leaks for sure.
+        """
         layout, gap = self.layout, self.start.gap
         spreads: Array = np.ones(layout.errors)
         if layout.jump:
@@ -270,7 +280,7 @@ class WindowFit:
         if layout.ramps:
             step = (walk or self.around.walk) / sqrt(layout.ramps)
             triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
-        posterior = self._posterior(triangle, spreads)
+        posterior = self._posterior(triangle, spreads, leaking)
         posterior = replace(posterior, evidence=posterior.evidence + offset)
         residual = self.residual(posterior)
         squares = float(residual @ residual)
@@ -294,7 +304,7 @@ class WindowFit:
             inflation, sqrt(squares / max(count, 1.0)),
         )
 
-    def _posterior(self, triangle: Triangle, spreads: Array) -> Posterior:
+    def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:
         """Of all unknowns; where G integrates, it may leak or not.
 
         One is as likely as the other before the data speak.
@@ -309,12 +319,15 @@ class WindowFit:
         if not layout.leak:
             return of(triangle, layout.base)
         where, base = layout.driven, layout.base
-        leaking, offset = triangle.with_prior(
+        leaky, offset = triangle.with_prior(
             slice(where, where + 1), around.error.leak, around.told_std
         )
+        other = of(leaky, base)
+        if leaking:
+            return other
         tight = triangle.without(where)
-        offset += tight.log_precision(where, base - 1) - leaking.log_precision(where + 1, base)
-        return mixture(with_zero(of(tight, base - 1), where), of(leaking, base), offset)
+        offset += tight.log_precision(where, base - 1) - leaky.log_precision(where + 1, base)
+        return mixture(with_zero(of(tight, base - 1), where), other, offset)
 
     def _theta_now(self) -> Array:
         """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""
