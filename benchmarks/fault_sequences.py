@@ -9,12 +9,13 @@ from math import inf, isfinite
 import numpy as np
 from fault_controller import Controller
 from fault_world import SENSOR_FAULTS, Actuator, Driver, Sensor
-from random_cases import random_plant
+from random_cases import NEAR_ONE, random_plant
 
 from backlash_ros.core.assembly import (
     build_controller,
     build_model,
     build_plant,
+    build_true_model,
     law_fits,
 )
 from backlash_ros.core.controller import ControlStep, Limits
@@ -24,6 +25,7 @@ from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.proportional import LARGEST_F_OVER_M
 from backlash_ros.core.structure import LARGEST_FEEDBACK
+from backlash_ros.core.transfer_function import TransferFunction
 
 PERIOD_S = 0.01
 SAMPLES = (300, 800)
@@ -49,6 +51,8 @@ class Findings:
     jumps: list[str] = field(default_factory=list)
     unbounded: list[str] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
+    wrong_uncertain: list[str] = field(default_factory=list)
+    wrong_inherited: list[str] = field(default_factory=list)
     wrong_without: list[str] = field(default_factory=list)
     commands: int = 0
     samples: int = 0
@@ -124,7 +128,8 @@ class Sequence:
         self.driver = Driver(
             p, rng, self.actuator, Sensor(rng, swing), reports=bool(rng.random() < 0.5)
         )
-        self.truth = p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
+        self.truth = _truth(p)
+        self._foreign = False  # whether the loop began with what another plant has taught
         self._frozen: float | None = None  # y_m while the loop is interrupted
         self._since_frozen = 0
         self._stops: dict[int, Callable[[], None]] = {}  # ends of faults, by tick
@@ -140,6 +145,7 @@ class Sequence:
         inherited = None
         if rng.random() < 0.2:
             inherited = self._saved_elsewhere()
+            self._foreign = True
             told(f'begins with saved estimates of another plant: {inherited}')
         v = 0.0 if rng.random() < 0.5 else None
         self.controller = Controller(p, self.driver, inherited, self._sent, self._answered)
@@ -211,11 +217,13 @@ class Sequence:
         if rng.random() < 0.5:
             controller.deactivate()
         estimate: Estimate | None = controller.loop.estimate
+        self._foreign = False
         chance = rng.random()
         if chance < 0.4 or (estimate is not None and not estimate.learned):
             estimate = None
         elif chance < 0.6:
             estimate = self._saved_elsewhere()
+            self._foreign = True
         self._told(f'    with {estimate}')
         # Where the driver does not say which v acts, whoever starts the controller does.
         controller.start_anew(estimate, None if self.driver.reports else self.actuator.v)
@@ -286,17 +294,11 @@ class Sequence:
     def _saved_elsewhere(self) -> Estimate:
         """What another axis with the same G has learned."""
         m, c_r, c_l = (
-            value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth_of_parameters
+            value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth
         )
         gap = c_r - c_l
         return Estimate(m, c_r, c_l, self.p.real('proportional.f'),
                         1e-3 * m, 1e-3 * gap, 1e-3 * gap)
-
-    @property
-    def truth_of_parameters(self) -> tuple[float, float, float]:
-        """m, c_r, c_l of the plant."""
-        p = self.p
-        return p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
 
     # What is watched.
 
@@ -357,9 +359,15 @@ class Sequence:
                   zip((e.m, e.c_r, e.c_l), self.truth, stds, strict=True))
         if off <= 1.0:
             return
-        kind = self.findings.wrong if e.learned else self.findings.wrong_without
+        found = self.findings
+        kind = found.wrong if e.learned else found.wrong_without
+        if e.learned and self._foreign:
+            kind = found.wrong_inherited
+        elif e.learned and self.p.real('truth.scale_frequency') != 1.0:
+            kind = found.wrong_uncertain
         kind.append(
-            f'sample {self.driver.tick}: m {e.m:.5g} ({m:.5g}) ± {e.std_m:.2g}, '
+            f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
+            f'm {e.m:.5g} ({m:.5g}) ± {e.std_m:.2g}, '
             f'c_r {e.c_r:.5g} ({c_r:.5g}) ± {e.std_c_r:.2g}, '
             f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}'
         )
@@ -411,6 +419,18 @@ class Sequence:
         while later in self._stops:
             later += 1
         self._stops[later] = end
+
+
+def _truth(p: Parameters) -> tuple[float, float, float]:
+    """m, c_r, c_l as the controller may know them: the gain at rest of the true G is part of m."""
+    ratio = _gain_at_rest(build_true_model(p)) / _gain_at_rest(build_model(p))
+    return p.real('backlash.m') * ratio, p.real('backlash.c_r'), p.real('backlash.c_l')
+
+
+def _gain_at_rest(model: TransferFunction) -> float:
+    """G(1), or where G integrates the gain of what is left without the integrators."""
+    left = [1.0 - pole for pole in model.poles if abs(pole - 1.0) > NEAR_ONE]
+    return float(np.sum(model.numerator) / np.real(np.prod(left)))
 
 
 def _shift(before: Estimate, now: Estimate, v: float) -> float:

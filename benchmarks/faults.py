@@ -42,6 +42,8 @@ KINDS = {
     'unbounded': 'u_d further from what y_m asks for than tracking.md says',
     'broken': 'an exception',
     'wrong': '*tracking* with an estimate off by more than five published deviations',
+    'wrong_inherited': 'the same in a loop that began with saved estimates of another plant',
+    'wrong_uncertain': 'the same where time constants of the true G differ by up to 15 %',
     'wrong_without': '*tracking* with an estimate off by a fifth, laws without deviations',
 }
 LISTED = 40  # seeds in a cell
