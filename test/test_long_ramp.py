@@ -1,0 +1,22 @@
+"""A ramp to zero at the end that takes longer than a signal may take."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+from paced_driver import controller_and_driver
+from ros_processes import ros_world
+
+
+def test_a_ramp_longer_than_it_may_last_stops_where_it_is(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(
+            world, **{'on_stop': 'ramp', 'control.rate_max': 20.0, 'timeout.ramp': 0.1}
+        )
+        driver.run_until(lambda: abs(driver.v) > 3.0, 'a v away from 0')
+        controller.send(signal.SIGINT)
+        driver.run_until(lambda: controller.process.poll() is not None, 'the end')
+        assert controller.process.returncode == 0
+        assert 0.1 < abs(driver.controls[-1].data)
+        assert 'is held: it did not reach zero within timeout.ramp=0.1 s' in controller.stderr
