@@ -217,10 +217,10 @@ class Sequence:
         if rng.random() < 0.5:
             controller.deactivate()
         estimate: Estimate | None = controller.loop.estimate
-        self._foreign = False
         chance = rng.random()
         if chance < 0.4 or (estimate is not None and not estimate.learned):
             estimate = None
+            self._foreign = False
         elif chance < 0.6:
             estimate = self._saved_elsewhere()
             self._foreign = True
@@ -395,6 +395,7 @@ class Sequence:
             'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'output_noise_std': 0.0,
             'control.min': -inf, 'control.max': inf, 'control.rate_max': inf,
             'on_stop': 'hold', 'on_timeout': 'hold', 'inverse.take_up_rate': inf,
+            'truth.scale_frequency': 1.0,
         })
         largest = 0.0
         for y_start, references in self._segments:
