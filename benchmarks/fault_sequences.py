@@ -398,7 +398,10 @@ class Sequence:
             'truth.scale_frequency': 1.0,
         })
         largest = 0.0
-        for y_start, references in self._segments:
+        # tracking begins at the first y, the four blocks at 0.
+        for y_start, references in (
+            (start, references) for y, references in self._segments for start in (y, 0.0)
+        ):
             core, plant = build_controller(p), build_plant(p)
             for y_m in references:
                 step = core.step(plant.measure(), y_m - y_start)
