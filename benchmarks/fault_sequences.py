@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import product
 from math import inf, isfinite
 
 import numpy as np
@@ -140,6 +141,7 @@ class Sequence:
         self._last: Estimate | None = None
         self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
         self._loop: object = None
+        self._weights = {p.real('tracking.input_weight')}  # with which u_d was asked for
         self._u_d = 0.0
         self._widest = 0.0
         inherited = None
@@ -259,6 +261,7 @@ class Sequence:
         change = changes[int(rng.integers(len(changes)))]
         self._told(f'    {change}')
         self.controller.take_up(p.replaced(change))
+        self._weights.add(self.controller.p.real('tracking.input_weight'))
 
     def _call_service(self, tick: int) -> None:
         rng, loop = self.rng, self.controller.loop
@@ -389,7 +392,7 @@ class Sequence:
 
     def _asked(self) -> float:
         """Largest |u_d| of a loop that knows a plant without a gap, for the same references."""
-        p = self.p.replaced({
+        known = self.p.replaced({
             'estimator.law': 'fixed', 'estimator.initial.m': self.p.real('backlash.m'),
             'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
             'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'output_noise_std': 0.0,
@@ -399,12 +402,12 @@ class Sequence:
         })
         largest = 0.0
         # tracking begins at the first y, the four blocks at 0.
-        for y_start, references in (
-            (start, references) for y, references in self._segments for start in (y, 0.0)
-        ):
+        starts = ((begin, references) for y, references in self._segments for begin in (y, 0.0))
+        for (begin, references), weight in product(starts, sorted(self._weights)):
+            p = known.replaced({'tracking.input_weight': weight})
             core, plant = build_controller(p), build_plant(p)
             for y_m in references:
-                step = core.step(plant.measure(), y_m - y_start)
+                step = core.step(plant.measure(), y_m - begin)
                 plant.step(step.v)
                 largest = max(largest, abs(step.u_d))
         return largest
