@@ -18,7 +18,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Estimate, Status
+from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Status
 
 Array = NDArray[np.float64]
 
@@ -45,8 +45,9 @@ class Agreement:
         # Products judged last, the weights of their errors, and the largest sum of squares.
         self._judged, self._weights, self._most = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
 
-    def take(self, row: Sequence[float], estimate: Estimate) -> Status:
-        """Take in the three elements of phi, and t; return the status of this estimate."""
+    def take(self, row: Sequence[float], m: float, c_r: float, c_l: float) -> Status:
+        """Take in the three elements of phi, and t; return the status of these estimates."""
+        theta = m, m * c_r, m * c_l
         self._rows.append(row)
         if len(self._rows) == EVERY:
             self._samples += EVERY
@@ -54,14 +55,14 @@ class Agreement:
             share = EVERY / min(self._samples, MEMORY)
             self._products += share * (rows.T @ rows / EVERY - self._products)
             if self._samples >= LEAST_SAMPLES:
-                self.status = self._judge(estimate)
+                self.status = self._judge(theta)
         elif self.status is Status.TRACKING:
-            moved = zip(_products_of(estimate), self._judged, self._weights, strict=True)
+            moved = zip(theta, self._judged, self._weights, strict=True)
             if sum((weight * (now - then)) ** 2 for now, then, weight in moved) > self._most:
                 self.status = Status.ACQUIRING
         return self.status
 
-    def _judge(self, estimate: Estimate) -> Status:
+    def _judge(self, theta: tuple[float, float, float]) -> Status:
         size = np.sqrt(np.diag(self._products)[:3])
         if float(size.min()) ** 2 <= LEAST_SQUARE:
             return Status.ACQUIRING
@@ -69,7 +70,6 @@ class Agreement:
         least = float(np.linalg.eigvalsh(scaled)[0])
         if least <= np.finfo(float).eps:
             return Status.ACQUIRING
-        theta = _products_of(estimate)
         most = AGREED**2 * float((theta[1] * size[1]) ** 2 + (theta[2] * size[2]) ** 2)
         if self._mean_square(np.array(theta)) <= least * most:
             self._judged, self._most = theta, most
@@ -89,8 +89,3 @@ class Agreement:
         best = inverse @ (self._products[:3, 3] / size) / size
         variance = self._mean_square(best) * float(inverse[0, 0])
         return float(best[0]), sqrt(variance / min(self._samples, MEMORY)) / float(size[0])
-
-
-def _products_of(estimate: Estimate) -> tuple[float, float, float]:
-    m = estimate.m
-    return m, m * estimate.c_r, m * estimate.c_l

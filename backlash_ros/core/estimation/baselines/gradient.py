@@ -61,11 +61,10 @@ class GradientEstimator:
         self.x_hat: Array = np.zeros(order)
         self.x_cov = None
         self._bounds, self._noise_square = bounds, (NOISE_MARGIN * noise_std) ** 2
-        self._returned = _Filter(blocks.returned, 1)
         self._y = 0.0  # the newest one, or what was expected of it
         self._agreement = Agreement()
-        # W of phi and of u_d side by side.
-        self._disturbance = _Filter(blocks.disturbance, 4)
+        # W of phi and of u_d, and what returns of y, side by side.
+        self._filters = _Filters([*[blocks.disturbance] * 4, blocks.returned])
         self._phi: Array = np.zeros(3)
         self._v_square = self._u_square = self._size = 0.0  # running means
         self._samples = 0
@@ -76,13 +75,14 @@ class GradientEstimator:
         self._engage(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self.u_hat = float(theta @ self._phi)
-        returned = float(self._returned.step(np.array([self._y]))[0])
-        filtered = self._disturbance.step(np.append(self._phi, interval.u_d))
+        inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
+        filtered = self._filters.step(inputs)
         self._samples += 1
         share = 1.0 / min(self._samples, MEMORY)
         self._v_square += share * (interval.v**2 - self._v_square)
         self._u_square += share * (interval.u_d**2 - self._u_square)
         zeta = filtered[:3]
+        returned = float(filtered[4])
         expected = float(theta @ zeta) - returned
         if y is None:
             self.innovation, self._y = nan, expected
@@ -101,14 +101,15 @@ class GradientEstimator:
             return
         row = (*zeta.tolist(), y + returned)
         if old.status is Status.INCONSISTENT:
-            self.estimate = replace(old, status=self._agreement.take(row, old))
+            status = self._agreement.take(row, old.m, old.c_r, old.c_l)
+            self.estimate = replace(old, status=status)
             return
         theta = theta + (self.step * eps / norm) * scaled
         low, high = self._bounds.m
         m = min(max(float(theta[0]), low), high)
         m, c_r, c_l = self._bounds.project(m, float(theta[1]) / m, float(theta[2]) / m)
-        new = Estimate(m, c_r, c_l, old.f)
-        self.estimate = replace(new, status=self._agreement.take(row, new))
+        status = self._agreement.take(row, m, c_r, c_l)
+        self.estimate = Estimate(m, c_r, c_l, old.f, status=status)
 
     def refine(self, budget_s: float = inf) -> None:
         """Nothing is left to do after the command."""
@@ -127,14 +128,15 @@ class GradientEstimator:
             self._phi = np.array([v, 0.0, -1.0])
 
 
-class _Filter:
-    """A strictly proper transfer function applied to several signals at once."""
+class _Filters:
+    """Strictly proper transfer functions with one denominator, each applied to its signal."""
 
-    def __init__(self, model: TransferFunction, signals: int) -> None:
-        self._a, self._b, _ = model.state_space()
-        self._x: Array = np.zeros((model.order, signals))
+    def __init__(self, models: list[TransferFunction]) -> None:
+        self._a = models[0].state_space()[0]
+        self._b: Array = np.column_stack([model.state_space()[1] for model in models])
+        self._x: Array = np.zeros(self._b.shape)
 
     def step(self, inputs: Array) -> Array:
         """Take in u(k-1) of each signal and return y(k), shape (signals,)."""
-        self._x = self._a @ self._x + np.outer(self._b, inputs)
+        self._x = self._a @ self._x + self._b * inputs
         return np.asarray(self._x[0])

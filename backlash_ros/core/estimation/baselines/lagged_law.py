@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 from math import inf
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.baselines.agreement import Agreement
 from backlash_ros.core.estimation.baselines.history import History
 from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimation.protocol import Status
 
 # A side is engaged when the reconstructed u moves on in one direction over this many samples to
 # either side, by more than so many standard deviations of its error: smoothing rounds the corners.
@@ -75,10 +74,12 @@ class LaggedLaw:
             return None
         return rising
 
-    def _judged(self, estimate: Estimate, u: float, v: float, rising: bool) -> Estimate:
-        """The estimate with what this sample and those before it say of it."""
+    def _status_of(
+        self, m: float, c_r: float, c_l: float, u: float, v: float, rising: bool,
+    ) -> Status:
+        """What this sample and those before it say of the estimates."""
         row = (v, -1.0, 0.0, u) if rising else (v, 0.0, -1.0, u)
-        return replace(estimate, status=self._agreement.take(row, estimate))
+        return self._agreement.take(row, m, c_r, c_l)
 
     def refine(self, budget_s: float = inf) -> None:
         """Nothing is left to do after the command."""

@@ -13,6 +13,8 @@ Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
 from backlash_ros.core.estimation.baselines.lagged_law import LaggedLaw
 from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
@@ -46,7 +48,8 @@ class NormalisedLms(LaggedLaw):
             return
         old, v = self.estimate, past.v
         if old.status is Status.INCONSISTENT:
-            self.estimate = self._judged(old, u, v, rising)
+            status = self._status_of(old.m, old.c_r, old.c_l, u, v, rising)
+            self.estimate = replace(old, status=status)
             return
         m, c_r, c_l = old.m, old.c_r, old.c_l
         self._v_max = max(self._v_max, abs(v))
@@ -63,4 +66,5 @@ class NormalisedLms(LaggedLaw):
         if self.step_f > 0.0:
             f += self.step_f * (u - past.u_d) * v / (1.0 + v * v)
             f = min(max(f, self._f_bounds[0]), self._f_bounds[1])
-        self.estimate = self._judged(Estimate(m, c_r, c_l, f), u, v, rising)
+        status = self._status_of(m, c_r, c_l, u, v, rising)
+        self.estimate = Estimate(m, c_r, c_l, f, status=status)

@@ -75,8 +75,10 @@ class PrintedLaw(LaggedLaw):
         c = printed_c(u, past.y_m, f, m)
         c_r = self._guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
         c_l = old.c_l if upward else self._guarded(c, old.c_l, self._bounds.c_l)
-        new, rising = Estimate(m, c_r, c_l, f, status=old.status), self._rising(u)
-        self.estimate = new if rising is None else self._judged(new, u, past.v, rising)
+        status, rising = old.status, self._rising(u)
+        if rising is not None:
+            status = self._status_of(m, c_r, c_l, u, past.v, rising)
+        self.estimate = Estimate(m, c_r, c_l, f, status=status)
 
     def _guarded(self, value: float, old: float, bounds: tuple[float, float]) -> float:
         if not isfinite(value):
