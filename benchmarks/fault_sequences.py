@@ -40,6 +40,7 @@ NEGLIGIBLE = 1e-3  # of m and of the gap: an error that is none, however small t
 WITHOUT = 0.2  # of m and of the gap: an error of laws without deviations that is wrong
 JUMP = 2.5  # usual moves of v in the first one after an interruption
 LEARNED_MOVES = 50  # commands from which it is known which moves are usual
+NOTHING, AFTER = 'nothing yet', '; after: '
 TWICE = 2.0  # an interruption may ask for what the reference alone does not
 
 
@@ -141,6 +142,7 @@ class Sequence:
         self._last: Estimate | None = None
         self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
         self._loop: object = None
+        self._lately = NOTHING  # what has happened last
         self._weights = {p.real('tracking.input_weight')}  # with which u_d was asked for
         self._u_d = 0.0
         self._widest = 0.0
@@ -180,6 +182,7 @@ class Sequence:
         rng = self.rng
         what = str(rng.choice(EVENTS))
         self._told(f'{tick}: {what}')
+        self._lately = what
         EVENTS_BY_NAME[what](self, tick)
 
     # What may happen.
@@ -189,6 +192,7 @@ class Sequence:
         sensor.fault = str(self.rng.choice(SENSOR_FAULTS))
         sensor.value = sensor.swing * float(self.rng.uniform(-1.0, 1.0))
         self._told(f'    {sensor.fault}')
+        self._lately += f': {sensor.fault}'
         self._end_later(tick, lambda: setattr(sensor, 'fault', ''))
 
     def _lose(self, tick: int) -> None:
@@ -372,7 +376,7 @@ class Sequence:
             f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
             f'm {e.m:.5g} ({m:.5g}) ± {e.std_m:.2g}, '
             f'c_r {e.c_r:.5g} ({c_r:.5g}) ± {e.std_c_r:.2g}, '
-            f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}'
+            f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}{AFTER}{self._lately}'
         )
 
     def _conclude(self) -> None:

@@ -26,7 +26,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-from fault_sequences import PERIOD_S, Findings, Sequence
+from fault_sequences import AFTER, PERIOD_S, Findings, Sequence
 from reporting import ROOT, markdown_table, processors, text_table
 
 DOCUMENT = ROOT / 'docs' / 'faults.md'
@@ -47,6 +47,7 @@ KINDS = {
     'wrong_without': '*tracking* with an estimate off by a fifth, laws without deviations',
 }
 LISTED = 40  # seeds in a cell
+WRONG = 'What had happened last where G and the estimates to begin with were right:'
 
 
 class Result(NamedTuple):
@@ -104,6 +105,16 @@ def rows_of(results: list[Result]) -> list[list[str]]:
     return rows
 
 
+def reasons_of(results: list[Result]) -> list[list[str]]:
+    """A line for each event that wrong estimates have followed: how many sequences, and which."""
+    seeds: dict[str, list[str]] = {}
+    for result in results:
+        if 'wrong' in result.found:
+            seeds.setdefault(result.found['wrong'].split(AFTER)[1], []).append(str(result.seed))
+    ordered = sorted(seeds.items(), key=lambda item: (-len(item[1]), item[0]))
+    return [[event, str(len(which)), ', '.join(which)] for event, which in ordered]
+
+
 def summary(results: list[Result], first_seed: int) -> str:
     """What was played, in a sentence."""
     hours = sum(result.samples for result in results) * PERIOD_S / 3600.0
@@ -119,7 +130,9 @@ def write_document(results: list[Result], first_seed: int) -> None:
     """Write the table between its marks."""
     text = DOCUMENT.read_text(encoding='utf-8')
     table = markdown_table(('found', 'sequences', 'seeds'), rows_of(results))
-    made = f'{summary(results, first_seed)}\n\n{table}\n'
+    reasons = markdown_table(('before the first wrong *tracking*', 'sequences', 'seeds'),
+                             reasons_of(results))
+    made = f'{summary(results, first_seed)}\n\n{table}\n\n{WRONG}\n\n{reasons}\n'
     DOCUMENT.write_text(
         MARK.sub(lambda mark: f'{mark[1]}{made}{mark[2]}', text), encoding='utf-8'
     )
