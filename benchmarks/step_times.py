@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from reporting import Check
 
+from backlash_ros.core.assembly import law_fits
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
@@ -176,7 +177,7 @@ def law_timings() -> list[Timing]:
         f'{law}, {structure}': {
             'estimator.law': law, 'structure': structure, 'output_noise_std': NOISE,
         }
-        for structure in STRUCTURES for law in LAWS
+        for structure in STRUCTURES for law in LAWS if law_fits(law, structure)
     }
     steady = compare(
         {what: Sampled(Parameters(s), STEADY_FROM).step for what, s in settings.items()},

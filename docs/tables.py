@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 
+import combinations_of_laws
 import numpy as np
 from printed_law import (
     Reading,
@@ -243,10 +244,16 @@ def constants_of(path: Path) -> list[tuple[str, str, str]]:
     return found
 
 
+def combinations() -> str:
+    """What every law comes to in every structure."""
+    return markdown(*combinations_of_laws.rows())
+
+
 TABLES: dict[str, Callable[[], str]] = {
     'plant_facts': plant_facts, 'laws': laws, 'printed_moves': printed_moves,
     'printed_not_finite': printed_not_finite, 'printed_growth': printed_growth,
     'printed_readings': printed_readings, 'disturbance': disturbance,
     'uncertain_plants': uncertain_plants, 'freedom': freedom,
+    'combinations': combinations,
     'estimator_constants': estimator_constants, 'estimator_details': estimator_details,
 }

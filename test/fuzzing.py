@@ -27,6 +27,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 
+from backlash_ros.core.assembly import law_fits
 from backlash_ros.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
 from backlash_ros.nodes.driver_io import Output
@@ -47,7 +48,7 @@ SEQUENCES_PER_NODE = 200
 def parameters_of(rng: np.random.Generator) -> dict[str, object]:
     """Values for a node."""
     law = str(rng.choice(LAWS))
-    structure = 'pole_placement' if law == 'gradient' else str(rng.choice(STRUCTURES))
+    structure = str(rng.choice([name for name in STRUCTURES if law_fits(law, name)]))
     return {
         'sample_period': PERIOD_S, 'estimator.law': law, 'structure': structure,
         'control.min': LOW, 'control.max': HIGH,

@@ -153,8 +153,8 @@ class KnownInput:
         return self._samples >= self.lag
 
     def newer(self, samples: int) -> float:
-        """u(k - lag + samples)."""
-        return self._window[samples]
+        """u(k - lag + samples), or the newest one."""
+        return self._window[min(samples, self.lag - 1)]
 
     def update(self, y: float) -> float:
         """Take in u(k-1) and return u(k - lag)."""

@@ -176,7 +176,7 @@ def test_every_command_keeps_the_limits_that_hold_at_that_moment(
         else:
             if values[0] == 'ramp' and limits.move == inf:
                 continue  # refused when it is configured
-            sent = list(islice(last_commands(values[0], v, limits), 5))
+            sent = list(islice(last_commands(values[0], v, lambda held=limits: held), 5))
             core.start_from(sent[-1] if sent else v)
         for command in sent:
             assert abs(command - v) <= limits.move * (1.0 + 1e-9)

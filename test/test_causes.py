@@ -208,6 +208,12 @@ def test_held_learning_is_told_from_a_state_of_the_estimator() -> None:
     assert first(replace(held, status=Status.INCONSISTENT)).level == Level.ERROR
 
 
+def test_constants_that_were_given_are_not_called_learned() -> None:
+    given = replace(WELL, given=True)
+    assert first(given).text.startswith('estimates as given')
+    assert first(replace(given, late=60)).text.startswith('10 % of control came too late')
+
+
 def test_a_sensor_at_rest_with_v_inside_the_gap_is_no_fault() -> None:
     assert first(replace(WELL, still=2000, v_swing=0.9)) == STATES[Status.TRACKING]
     assert first(replace(WELL, still=5, v_swing=3.0)) == STATES[Status.TRACKING]

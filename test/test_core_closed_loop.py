@@ -12,6 +12,7 @@ from strategies import output_of, paper_example, plants
 from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.controller import AdaptiveController, ControlStep
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.metrics import control_error_rms, settling_time
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
@@ -138,6 +139,7 @@ def test_printed_law_stays_finite_and_does_not_identify() -> None:
     run = build_closed_loop(paper_example(estimator__law='printed')).run(TEN_SECONDS)
     assert np.isfinite(run.column('v')).all()
     assert settled(run) == [None, None, None]
+    assert Status.TRACKING not in run.column('status')
 
 
 def test_row_holds_the_signals_of_one_sample() -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import RunRecord
 
@@ -63,8 +64,28 @@ def test_lost_samples_teach_nothing_and_do_no_harm() -> None:
     run = build_closed_loop(four_blocks(output_loss=0.02)).run(1500)
     assert run.lost_samples > 10
     assert np.abs(run.column('y')).max() < 1.0
+    assert last(run) == pytest.approx(TRUTH, rel=0.01)
 
 
-def test_gradient_without_its_structure_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r'structure=.*must be pole_placement'):
-        build_controller(Parameters({'estimator.law': 'gradient'}))
+def test_learns_without_compensation() -> None:
+    loop = build_closed_loop(four_blocks())
+    loop.controller.compensating = False
+    assert last(loop.run(1500)) == pytest.approx(TRUTH, rel=0.01)
+
+
+def test_says_that_y_moves_against_v() -> None:
+    p = four_blocks()
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    for k in range(200):
+        step = controller.step(-plant.measure(), reference(k * 0.01))
+        plant.step(step.v)
+    assert step.estimate.status is Status.INCONSISTENT
+
+
+@pytest.mark.parametrize(('law', 'structure', 'wanted'), [
+    ('gradient', 'proportional', 'pole_placement'), ('gradient', 'tracking', 'pole_placement'),
+    ('printed', 'tracking', 'proportional'), ('printed', 'pole_placement', 'proportional'),
+])
+def test_a_law_outside_of_its_structure_is_refused(law: str, structure: str, wanted: str) -> None:
+    with pytest.raises(ParameterError, match=rf'structure=.*{structure}.*must be {wanted}'):
+        build_controller(Parameters({'estimator.law': law, 'structure': structure}))

@@ -39,6 +39,12 @@ from backlash_ros.core.true_plant import Alteration, altered_plant, delayed
 DOUBT_OF_FIRST_GUESS = 0.5
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
+# Laws that belong to one structure, and why.
+ONLY_IN = {'printed': 'proportional', 'gradient': 'pole_placement'}
+WHY_ONLY = {
+    'printed': 'the law solves u_d = y_m + f v (3.2), which no other structure has',
+    'gradient': 'the law learns behind the filters of that loop',
+}
 
 
 def build_model(p: Parameters) -> TransferFunction:
@@ -87,6 +93,7 @@ def build_controller(p: Parameters, inherited: Estimate | None = None) -> Adapti
     inverse = BacklashInverse(
         p.real('inverse.direction_band'), p.real('inverse.take_up_rate') * period
     )
+    _check_structure(p)
     estimator = ESTIMATORS[p.word('estimator.law')](p, inherited or _initial(p))
     learner = None
     if isinstance(estimator, MovingHorizon) and p.flag('plant.adapt'):
@@ -97,6 +104,15 @@ def build_controller(p: Parameters, inherited: Estimate | None = None) -> Adapti
 def build_structure(p: Parameters) -> Structure:
     """The linear part alone."""
     return STRUCTURES[p.word('structure')](p)
+
+
+def _check_structure(p: Parameters) -> None:
+    law, structure = p.word('estimator.law'), p.word('structure')
+    if not law_fits(law, structure):
+        raise ParameterError(
+            'structure', structure, f'must be {ONLY_IN[law]} for estimator.law: {law}',
+            f'{WHY_ONLY[law]}; moving_horizon, lms and fixed fit any structure',
+        )
 
 
 def _check_first_guess(p: Parameters) -> None:
@@ -215,17 +231,11 @@ def _fixed(p: Parameters, initial: Estimate) -> Estimator:
 
 
 def law_fits(law: str, structure: str) -> bool:
-    """Whether a law can learn in a structure: the gradient one only from the four-block loop."""
-    return law != 'gradient' or structure == 'pole_placement'
+    """Whether a law belongs into a structure."""
+    return ONLY_IN.get(law, structure) == structure
 
 
 def _gradient(p: Parameters, initial: Estimate) -> Estimator:
-    structure = p.word('structure')
-    if not law_fits('gradient', structure):
-        raise ParameterError(
-            'structure', structure, 'must be pole_placement for estimator.law: gradient',
-            'the law learns from the response of that loop; every other law fits any structure',
-        )
     blocks = _four_blocks(p)
     return GradientEstimator(
         initial, _bounds(p), blocks, build_model(p).order, p.real('gradient.step'),

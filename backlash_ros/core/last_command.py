@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from math import inf
 
 from backlash_ros.core.controller import Limits
@@ -10,19 +10,21 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 
 
-def last_commands(action: str, v: float, limits: Limits) -> Iterator[float]:
+def last_commands(action: str, v: float, limits: Callable[[], Limits]) -> Iterator[float]:
     """Commands that follow v, one per sample; the last one stays in force.
 
     action: hold (no further command), zero or ramp. Both go to the v nearest to 0 within the limits
     as fast as the limits allow; where they allow any move, which ramp is refused for, that is one
     command.
+
+    limits: those that hold when the next command is made.
     """
     if action == 'hold':
         return
-    if action == 'zero' and v == limits.zero:
+    if action == 'zero' and v == limits().zero:
         yield v  # said even if nothing changes
-    while v != limits.zero:
-        before, v = v, limits.apply(limits.zero, v)
+    while v != limits().zero:
+        before, v = v, limits().apply(limits().zero, v)
         if v == before:
             return  # v is so large that a step at rate_max does not change it
         yield v

@@ -48,7 +48,8 @@ class FourBlocks:
     """Gains theta_1 (n-1,), theta_2 (n-1,), theta_20, theta_3 and what they make of the loop.
 
     filter: Lambda, shape (n,). reference: theta_3 B/A_m from r to y. disturbance: W from u - u_d
-    to y. demand: theta_3 A/A_m from r to u_d, coefficients of numerator and denominator.
+    to y. returned: B R/(Lambda A_m), so that y + returned y = W u whatever makes u. demand:
+    theta_3 A/A_m from r to u_d, coefficients of numerator and denominator.
     """
 
     theta_1: Array
@@ -58,6 +59,7 @@ class FourBlocks:
     filter: Array
     reference: TransferFunction
     disturbance: TransferFunction
+    returned: TransferFunction
     demand: tuple[Array, Array]
 
 
@@ -91,7 +93,8 @@ def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> F
     return FourBlocks(
         (placed - s)[1:], (r - r[0] * placed)[1:], float(r[0]), theta_3, placed,
         TransferFunction((theta_3 * b).tolist(), closed.tolist()),
-        TransferFunction(np.convolve(b, s).tolist(), product.tolist()), (theta_3 * a, closed),
+        TransferFunction(np.convolve(b, s).tolist(), product.tolist()),
+        TransferFunction(np.convolve(b, r).tolist(), product.tolist()), (theta_3 * a, closed),
     )
 
 

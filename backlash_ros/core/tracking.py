@@ -87,6 +87,7 @@ class Tracking:
         self._bounded_before = False  # whether feedback has met its bound the sample before
         self._width = 1.0  # bound on feedback in reaches, while the backlash is unknown
         self._known = False  # whether the estimate comes from data
+        self._slope: float | None = None  # that of the newest estimate that the law stood by
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
         self._in_use_for = 0  # samples since an estimate is known
         self._engaged_for = 0  # samples since v has crossed the gap
@@ -205,7 +206,7 @@ class Tracking:
         self._ideal, self._x, self._u_d = ideal, onward, u_d
         c_r, c_l = cautious_crossings(estimate, caution, self._known)
         side = inverse.side
-        v = inverse.step(u_d, estimate.m, c_r, c_l)
+        v = inverse.step(u_d, self._slope_of(estimate), c_r, c_l)
         crosses = inverse.taking_up or inverse.side is not side
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         if gains.integral:
@@ -313,6 +314,16 @@ class Tracking:
             sharp = _is_sharp(estimate, self._width * self._reach)
             self._trusted_for += self._sharp_counts if sharp else 1
         return self._trusted_for >= TRUSTED_AFTER
+
+    def _slope_of(self, estimate: Estimate) -> float:
+        """The slope to invert.
+
+        On the way to its first agreement with the data the m of a law without deviations may be
+        anywhere within its bounds.
+        """
+        if self._slope is None or estimate.learned or estimate.status is Status.TRACKING:
+            self._slope = estimate.m
+        return self._slope
 
     def _note_covariance(self, x_cov: Array | None) -> None:
         self._x_cov = x_cov

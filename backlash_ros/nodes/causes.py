@@ -89,6 +89,7 @@ class LoopFigures:
     unexplained: float = nan  # motion of u that no G and no backlash explains, over m times the gap
     wrong_sign: bool = False  # whether y moves against v
     adapting: bool = True
+    given: bool = False  # whether the estimates are taken as the parameters give them
     silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not
     on_timeout: str = 'hold'
     referred: bool = True  # whether a y_m has come
@@ -150,6 +151,7 @@ STATES: dict[Status, Finding] = {
 HELD = Finding(
     Level.OK, 'adaptation off', 'estimates held as ~/freeze_adaptation asked; v is still answered'
 )
+GIVEN = Finding(Level.OK, 'given', 'estimates as given: estimator.law fixed learns nothing')
 
 
 def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
@@ -165,6 +167,8 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
             Level.WARN, 'held', f'{f.output.name} does not follow from v while samples are late or '
             'lost: estimates held',
         )
+    if f.given and f.status == Status.TRACKING:
+        return GIVEN
     if not f.adapting and f.status != Status.INCONSISTENT:
         return HELD
     return _contradiction(f) if f.status == Status.INCONSISTENT else STATES[f.status]

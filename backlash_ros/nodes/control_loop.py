@@ -187,7 +187,7 @@ class ControlLoop:
         """
         if not self.knows_v:
             return iter(())
-        return last_commands(action, self.v, self.core.limits)
+        return last_commands(action, self.v, lambda: self.core.limits)
 
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""

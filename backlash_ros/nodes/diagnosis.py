@@ -13,6 +13,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import stated_deviations
 from backlash_ros.core.transfer_function import TransferFunction
@@ -81,6 +82,7 @@ class Diagnosis:
             standing_down=loop.standing_down,
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
             unexplained=unexplained, wrong_sign=wrong_sign, adapting=loop.adapting,
+            given=was_given(loop.estimate),
             silent_s=p.real('timeout.plant_output') if loop.silent else 0.0,
             on_timeout=p.word('on_timeout'),
             referred=isfinite(loop.y_m),

@@ -1,19 +1,22 @@
-"""The adaptation of Tao and Kokotović: a normalised gradient on the products, from y and y_m.
+"""The adaptation of Tao and Kokotović: a normalised gradient on the products.
 
-With theta = (m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi, the loop of
-pole_placement.py answers to the true theta with
+With theta = (m, m c_r, m c_l) and phi = (v, -1{right}, -1{left}), u = theta' phi, the plant
+behind the filters of pole_placement.py answers to the true theta with
 
-    y = y_ref + W (u - u_d),   y_ref = theta_3 B/A_m y_m
+    y + B R/(Lambda A_m) y = W u
 
 so that with zeta = W phi the estimation error is linear in the parameter error:
 
-    eps = y - y_ref + W u_d - theta_hat' zeta = (theta - theta_hat)' zeta
+    eps = y + B R/(Lambda A_m) y - theta_hat' zeta = (theta - theta_hat)' zeta
     theta_hat(k+1) = theta_hat(k) + step P zeta eps / (zeta' P zeta + xi^2/u_s^2 + a^2)
 
 xi = theta_hat' zeta - W u_d is the swapping term. P = diag(1/v_s^2, 1, 1) gives the slope and the
 crossings regressors of one size; v_s^2, u_s^2 and 10 a^2 are the means of v^2, u_d^2 and
 zeta' P zeta, so that no unit matters; a is larger where y is noisy. The side of phi is the one
-the inverse used.
+the inverse used, and that of a backlash theta_hat where v lies on no line of the inverse: limited,
+or not compensated. As long as the loop is that of pole_placement.py,
+B R/(Lambda A_m) y = W u_d - y_ref with y_ref = theta_3 B/A_m y_m: then eps is what y differs from
+y_ref by, beyond the swapping term.
 
 Reference: G. Tao, P. V. Kokotović, Adaptive Control of Systems with Actuator and Sensor
 Nonlinearities, Wiley 1996.
@@ -21,11 +24,13 @@ Nonlinearities, Wiley 1996.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.baselines.agreement import Agreement
 from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
 from backlash_ros.core.pole_placement import FourBlocks
 from backlash_ros.core.transfer_function import TransferFunction
@@ -39,10 +44,9 @@ MEMORY = 200  # samples of the running means
 
 
 class GradientEstimator:
-    """Learns (m, m c_r, m c_l) from the tracking error of the four-block loop.
+    """Learns (m, m c_r, m c_l) from y behind the filters of the four-block loop.
 
-    step: 0 < step < 2. noise_std: of y. Only valid while v comes from PolePlacement with the
-    same blocks, which are the model that explains y.
+    step: 0 < step < 2. noise_std: of y. Where y moves against v nothing is learned.
     """
 
     def __init__(
@@ -57,9 +61,10 @@ class GradientEstimator:
         self.x_hat: Array = np.zeros(order)
         self.x_cov = None
         self._bounds, self._noise_square = bounds, (NOISE_MARGIN * noise_std) ** 2
-        self._reference = _Filter(blocks.reference, 1)
-        # W of phi and of u_d side by side.
-        self._disturbance = _Filter(blocks.disturbance, 4)
+        self._y = 0.0  # the newest one, or what was expected of it
+        self._agreement = Agreement()
+        # W of phi and of u_d, and what returns of y, side by side.
+        self._filters = _Filters([*[blocks.disturbance] * 4, blocks.returned])
         self._phi: Array = np.zeros(3)
         self._v_square = self._u_square = self._size = 0.0  # running means
         self._samples = 0
@@ -70,18 +75,21 @@ class GradientEstimator:
         self._engage(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self.u_hat = float(theta @ self._phi)
-        y_ref = float(self._reference.step(np.array([interval.y_m]))[0])
-        filtered = self._disturbance.step(np.append(self._phi, interval.u_d))
+        inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
+        filtered = self._filters.step(inputs)
         self._samples += 1
         share = 1.0 / min(self._samples, MEMORY)
         self._v_square += share * (interval.v**2 - self._v_square)
         self._u_square += share * (interval.u_d**2 - self._u_square)
-        if y is None:
-            self.innovation = nan
-            return
         zeta = filtered[:3]
+        returned = float(filtered[4])
+        expected = float(theta @ zeta) - returned
+        if y is None:
+            self.innovation, self._y = nan, expected
+            return
+        self._y = y
         xi = float(theta @ zeta - filtered[3])
-        eps = self.innovation = y - y_ref - xi
+        eps = self.innovation = y - expected
         if min(self._v_square, self._u_square) < LEAST_SQUARE:
             return
         scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
@@ -91,33 +99,44 @@ class GradientEstimator:
         norm += xi**2 / self._u_square
         if norm == 0.0 or not self.adapting:
             return
+        row = (*zeta.tolist(), y + returned)
+        if old.status is Status.INCONSISTENT:
+            status = self._agreement.take(row, old.m, old.c_r, old.c_l)
+            self.estimate = replace(old, status=status)
+            return
         theta = theta + (self.step * eps / norm) * scaled
         low, high = self._bounds.m
         m = min(max(float(theta[0]), low), high)
         m, c_r, c_l = self._bounds.project(m, float(theta[1]) / m, float(theta[2]) / m)
-        self.estimate = Estimate(m, c_r, c_l, old.f, status=Status.TRACKING)
+        status = self._agreement.take(row, m, c_r, c_l)
+        self.estimate = Estimate(m, c_r, c_l, old.f, status=status)
 
     def refine(self, budget_s: float = inf) -> None:
         """Nothing is left to do after the command."""
 
     def _engage(self, interval: Interval, used: Estimate) -> None:
-        """Set phi for the line on which the inverse put v; between lines the last one holds."""
+        """Set phi for the line on which v lies; between lines the last one holds."""
         v, line = interval.v, interval.u_d / used.m
         near = ON_LINE * (abs(v) + abs(line))
-        if abs(v - line - used.c_r) <= near:
+        right, left = abs(v - line - used.c_r) <= near, abs(v - line - used.c_l) <= near
+        if not (right or left):
+            right = self.u_hat < used.m * (v - used.c_r)
+            left = self.u_hat > used.m * (v - used.c_l)
+        if right:
             self._phi = np.array([v, -1.0, 0.0])
-        elif abs(v - line - used.c_l) <= near:
+        elif left:
             self._phi = np.array([v, 0.0, -1.0])
 
 
-class _Filter:
-    """A strictly proper transfer function applied to several signals at once."""
+class _Filters:
+    """Strictly proper transfer functions with one denominator, each applied to its signal."""
 
-    def __init__(self, model: TransferFunction, signals: int) -> None:
-        self._a, self._b, _ = model.state_space()
-        self._x: Array = np.zeros((model.order, signals))
+    def __init__(self, models: list[TransferFunction]) -> None:
+        self._a = models[0].state_space()[0]
+        self._b: Array = np.column_stack([model.state_space()[1] for model in models])
+        self._x: Array = np.zeros(self._b.shape)
 
     def step(self, inputs: Array) -> Array:
         """Take in u(k-1) of each signal and return y(k), shape (signals,)."""
-        self._x = self._a @ self._x + np.outer(self._b, inputs)
+        self._x = self._a @ self._x + self._b * inputs
         return np.asarray(self._x[0])

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
+from collections import deque
 from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.baselines.agreement import Agreement
 from backlash_ros.core.estimation.baselines.history import History
 from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
+from backlash_ros.core.estimation.protocol import Status
+
+# A side is engaged when the reconstructed u moves on in one direction over this many samples to
+# either side, by more than so many standard deviations of its error: smoothing rounds the corners.
+STROKE = 8
+MOTION_THRESHOLD = 2.0
+LEAST_SHARE = 0.25  # of the mean motion of the stroke, below which the sample itself rests
 
 
 class LaggedLaw:
-    """Reconstruction of u, and what was applied when it acted."""
+    """Reconstruction of u, what was applied when it acted, and whether estimates agree with it."""
 
     def __init__(self, reconstruction: InputReconstruction) -> None:
         self.adapting = True
         self._reconstruction = reconstruction
         self._history = History(reconstruction.lag)
+        self._threshold = MOTION_THRESHOLD * reconstruction.std
+        self._past: deque[float] = deque([0.0, 0.0], maxlen=STROKE + 1)
+        self._agreement = Agreement()
 
     @property
     def u_hat(self) -> float:
@@ -38,6 +50,36 @@ class LaggedLaw:
     def innovation(self) -> float:
         """y(k) minus its prediction; nan where y(k) was lost."""
         return self._reconstruction.innovation
+
+    def _follow(self, y: float | None) -> float:
+        """Take in y(k), None if it was lost, and return the u that the reconstruction reached."""
+        u = self._reconstruction.update(y)
+        self._past.append(u)
+        return u
+
+    def _rising(self, u: float) -> bool | None:
+        """Whether u moves on the right line (True) or the left one; None where it may rest.
+
+        u rises only on the right line and falls only on the left one, so that no wrong side can
+        lock in.
+        """
+        ahead = self._reconstruction.newer(STROKE) - u
+        behind = u - self._past[0]
+        step, rising = u - self._past[-2], True
+        if min(ahead, behind, step) < 0.0:
+            ahead, behind, step = -ahead, -behind, -step
+            rising = False
+        slowest = min(ahead, behind)
+        if slowest <= self._threshold or step < LEAST_SHARE * slowest / STROKE:
+            return None
+        return rising
+
+    def _status_of(
+        self, m: float, c_r: float, c_l: float, u: float, v: float, rising: bool,
+    ) -> Status:
+        """What this sample and those before it say of the estimates."""
+        row = (v, -1.0, 0.0, u) if rising else (v, 0.0, -1.0, u)
+        return self._agreement.take(row, m, c_r, c_l)
 
     def refine(self, budget_s: float = inf) -> None:
         """Nothing is left to do after the command."""

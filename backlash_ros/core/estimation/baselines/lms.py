@@ -13,24 +13,18 @@ Reference: S. Haykin, Adaptive Filter Theory, Prentice-Hall 1996, chapter 9 (the
 
 from __future__ import annotations
 
-from collections import deque
+from dataclasses import replace
 
 from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
 from backlash_ros.core.estimation.baselines.lagged_law import LaggedLaw
 from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
 
-# A side is engaged when the reconstructed u moves on in one direction over this many samples to
-# either side, by more than so many standard deviations of its error: smoothing rounds the corners.
-STROKE = 8
-MOTION_THRESHOLD = 2.0
-LEAST_SHARE = 0.25  # of the mean motion of the stroke, below which the sample itself rests
-
 
 class NormalisedLms(LaggedLaw):
     """LMS on (m, m c_r, m c_l) and f, fed with u reconstructed from y.
 
-    step: 0 < step < 2. step_f: 0 keeps f. The side comes from the motion of u: it rises only on
-    the right line and falls only on the left one, so that no wrong side can lock in.
+    step: 0 < step < 2. step_f: 0 keeps f. The side comes from the motion of u. Where y moves
+    against v nothing is learned.
     """
 
     def __init__(
@@ -41,30 +35,23 @@ class NormalisedLms(LaggedLaw):
         self.estimate = initial
         self.step, self.step_f = step, step_f
         self._bounds, self._f_bounds = bounds, f_bounds
-        self._threshold = MOTION_THRESHOLD * reconstruction.std
-        self._past: deque[float] = deque([0.0, 0.0], maxlen=STROKE + 1)
         self._v_max = 0.0
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""
-        reconstruction = self._reconstruction
-        u = reconstruction.update(y)
-        self._past.append(u)
+        u = self._follow(y)
         past = self._history.push(interval)
-        if past is None or not (reconstruction.ready and self.adapting):
+        if past is None or not (self._reconstruction.ready and self.adapting):
             return
-        ahead = reconstruction.newer(STROKE) - u
-        behind = u - self._past[0]
-        step, rising = u - self._past[-2], True
-        if min(ahead, behind, step) < 0.0:
-            ahead, behind, step = -ahead, -behind, -step
-            rising = False
-        slowest = min(ahead, behind)
-        if slowest <= self._threshold or step < LEAST_SHARE * slowest / STROKE:
+        rising = self._rising(u)
+        if rising is None:
             return
-        old = self.estimate
+        old, v = self.estimate, past.v
+        if old.status is Status.INCONSISTENT:
+            status = self._status_of(old.m, old.c_r, old.c_l, u, v, rising)
+            self.estimate = replace(old, status=status)
+            return
         m, c_r, c_l = old.m, old.c_r, old.c_l
-        v = past.v
         self._v_max = max(self._v_max, abs(v))
         e = u - m * (v - (c_r if rising else c_l))
         weight = 1.0 / self._v_max**2 if self._v_max**2 > LEAST_SQUARE else 0.0
@@ -79,4 +66,5 @@ class NormalisedLms(LaggedLaw):
         if self.step_f > 0.0:
             f += self.step_f * (u - past.u_d) * v / (1.0 + v * v)
             f = min(max(f, self._f_bounds[0]), self._f_bounds[1])
-        self.estimate = Estimate(m, c_r, c_l, f, status=Status.TRACKING)
+        status = self._status_of(m, c_r, c_l, u, v, rising)
+        self.estimate = Estimate(m, c_r, c_l, f, status=status)

@@ -14,7 +14,7 @@ from math import isfinite, nan
 
 from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
 from backlash_ros.core.estimation.baselines.lagged_law import LaggedLaw
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval
 
 
 def printed_f(u: float, y_m: float, m: float, w: float) -> float:
@@ -60,7 +60,7 @@ class PrintedLaw(LaggedLaw):
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and apply (3.11) to the sample that the reconstruction has reached."""
-        u = self._reconstruction.update(y)
+        u = self._follow(y)
         past = self._history.push(interval)
         if past is None or not (self._reconstruction.ready and self.adapting):
             return
@@ -75,7 +75,10 @@ class PrintedLaw(LaggedLaw):
         c = printed_c(u, past.y_m, f, m)
         c_r = self._guarded(c, old.c_r, self._bounds.c_r) if upward else old.c_r
         c_l = old.c_l if upward else self._guarded(c, old.c_l, self._bounds.c_l)
-        self.estimate = Estimate(m, c_r, c_l, f, status=Status.TRACKING)
+        status, rising = old.status, self._rising(u)
+        if rising is not None:
+            status = self._status_of(m, c_r, c_l, u, past.v, rising)
+        self.estimate = Estimate(m, c_r, c_l, f, status=status)
 
     def _guarded(self, value: float, old: float, bounds: tuple[float, float]) -> float:
         if not isfinite(value):

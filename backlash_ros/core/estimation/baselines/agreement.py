@@ -1,0 +1,91 @@
+"""Whether estimates agree with what was measured lately, for laws that have no deviations.
+
+u, or what is made of it linearly, is t = theta' phi for the true theta = (m, m c_r, m c_l), and
+t - theta_hat' phi = (theta - theta_hat)' phi. A small error at one sample says little: a large step
+makes it so whatever theta_hat is. Over many samples, with R = E{phi phi'} and phi scaled to
+E{phi_i^2} = 1,
+
+    |theta - theta_hat|^2 <= E{(t - theta_hat' phi)^2} / (smallest eigenvalue of R)
+
+which is what the estimates may be wrong by.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Status
+
+Array = NDArray[np.float64]
+
+MEMORY = 200  # samples over which the mean is taken, with weights that fade
+LEAST_SAMPLES, EVERY = 100, 20  # before the first judgement, and from one to the next
+AGREED = 0.1  # largest error, as a share of what the crossings make of t
+# Deviations by which the slope that fits best lies below 0 where y moves against v.
+NEGATIVE = 5.0
+
+
+class Agreement:
+    """Means of the products of phi and t, by which estimates are judged.
+
+    status: TRACKING while no theta that explains the samples differs by more than AGREED from the
+    estimate that was judged last, nor this one from the newest; INCONSISTENT where the samples ask
+    for a negative slope; ACQUIRING otherwise.
+    """
+
+    def __init__(self) -> None:
+        self.status = Status.ACQUIRING
+        self._samples = 0
+        self._rows: list[Sequence[float]] = []  # (phi, t) since the means were taken
+        self._products: Array = np.zeros((4, 4))  # means of (phi, t)(phi, t)'
+        # Products judged last, the weights of their errors, and the largest sum of squares.
+        self._judged, self._weights, self._most = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0
+
+    def take(self, row: Sequence[float], m: float, c_r: float, c_l: float) -> Status:
+        """Take in the three elements of phi, and t; return the status of these estimates."""
+        theta = m, m * c_r, m * c_l
+        self._rows.append(row)
+        if len(self._rows) == EVERY:
+            self._samples += EVERY
+            rows, self._rows = np.array(self._rows), []
+            share = EVERY / min(self._samples, MEMORY)
+            self._products += share * (rows.T @ rows / EVERY - self._products)
+            if self._samples >= LEAST_SAMPLES:
+                self.status = self._judge(theta)
+        elif self.status is Status.TRACKING:
+            moved = zip(theta, self._judged, self._weights, strict=True)
+            if sum((weight * (now - then)) ** 2 for now, then, weight in moved) > self._most:
+                self.status = Status.ACQUIRING
+        return self.status
+
+    def _judge(self, theta: tuple[float, float, float]) -> Status:
+        size = np.sqrt(np.diag(self._products)[:3])
+        if float(size.min()) ** 2 <= LEAST_SQUARE:
+            return Status.ACQUIRING
+        scaled = self._products[:3, :3] / np.outer(size, size)
+        least = float(np.linalg.eigvalsh(scaled)[0])
+        if least <= np.finfo(float).eps:
+            return Status.ACQUIRING
+        most = AGREED**2 * float((theta[1] * size[1]) ** 2 + (theta[2] * size[2]) ** 2)
+        if self._mean_square(np.array(theta)) <= least * most:
+            self._judged, self._most = theta, most
+            self._weights = tuple(size.tolist())
+            return Status.TRACKING
+        slope, deviation = self._best_slope(scaled, size)
+        return Status.INCONSISTENT if slope < -NEGATIVE * deviation else Status.ACQUIRING
+
+    def _mean_square(self, theta: Array) -> float:
+        """Mean of (t - theta' phi)^2."""
+        weights = np.append(-theta, 1.0)
+        return max(float(weights @ self._products @ weights), 0.0)
+
+    def _best_slope(self, scaled: Array, size: Array) -> tuple[float, float]:
+        """The m that explains the samples best, and its standard deviation."""
+        inverse = np.linalg.inv(scaled)
+        best = inverse @ (self._products[:3, 3] / size) / size
+        variance = self._mean_square(best) * float(inverse[0, 0])
+        return float(best[0]), sqrt(variance / min(self._samples, MEMORY)) / float(size[0])

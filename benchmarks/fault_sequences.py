@@ -1,0 +1,465 @@
+"""Random sequences of faults, and what must not happen in any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import product
+from math import inf, isfinite
+
+import numpy as np
+from fault_controller import Controller
+from fault_world import SENSOR_FAULTS, Actuator, Driver, Sensor
+from random_cases import NEAR_ONE, random_plant
+
+from backlash_ros.core.assembly import (
+    build_controller,
+    build_model,
+    build_plant,
+    build_true_model,
+    law_fits,
+)
+from backlash_ros.core.controller import ControlStep, Limits
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimation.storage import was_given
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.proportional import LARGEST_F_OVER_M
+from backlash_ros.core.structure import LARGEST_FEEDBACK
+from backlash_ros.core.transfer_function import TransferFunction
+
+PERIOD_S = 0.01
+SAMPLES = (300, 800)
+PAUSE = (15, 120)  # samples from one event to the next
+LASTS = (5, 100)  # samples for which a fault of the sensor or the network lasts
+LAWS = ('moving_horizon',) * 4 + ('lms', 'printed', 'fixed', 'gradient')
+STRUCTURES = ('proportional', 'tracking', 'pole_placement')
+ROUNDING = 1e-9
+DEVIATIONS = 5.0  # beyond which an estimate that is said to be learned is wrong
+NEGLIGIBLE = 1e-3  # of m and of the gap: an error that is none, however small the deviations
+WITHOUT = 0.2  # of m and of the gap: an error of laws without deviations that is wrong
+JUMP = 2.5  # usual moves of v in the first one after an interruption
+LEARNED_MOVES = 50  # commands from which it is known which moves are usual
+NOTHING, AFTER = 'nothing yet', '; after: '
+TWICE = 2.0  # an interruption may ask for what the reference alone does not
+
+
+@dataclass
+class Findings:
+    """What went wrong in a sequence, a sentence each, by kind."""
+
+    outside: list[str] = field(default_factory=list)
+    too_fast: list[str] = field(default_factory=list)
+    jumps: list[str] = field(default_factory=list)
+    unbounded: list[str] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
+    wrong_uncertain: list[str] = field(default_factory=list)
+    wrong_inherited: list[str] = field(default_factory=list)
+    wrong_without: list[str] = field(default_factory=list)
+    commands: int = 0
+    samples: int = 0
+    claimed: bool = False  # whether a law with deviations has ever said that it has learned
+
+
+def parameters_of(rng: np.random.Generator) -> tuple[Parameters, float]:
+    """Parameters of a loop, and the swing of its y."""
+    law = str(rng.choice(LAWS))
+    structure = str(rng.choice([name for name in STRUCTURES if law_fits(law, name)]))
+    numerator, denominator, _ = random_plant(rng)
+    m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
+    c_r, c_l = (float(np.exp(rng.uniform(np.log(0.2), np.log(8.0)))) for _ in range(2))
+    gap = c_r + c_l
+    omega = 2.0 * np.pi / (int(rng.integers(40, 150)) * PERIOD_S)
+    factors = 10.0 ** rng.uniform(-0.7, 0.7, 3)
+    u_swing = float(rng.uniform(0.4, 4.0)) * m * gap
+    f = 0.22 * m if rng.random() < 0.5 else 0.0
+    values: dict[str, object] = {
+        'sample_period': PERIOD_S, 'estimator.law': law, 'structure': structure,
+        'plant.numerator': numerator.tolist(), 'plant.denominator': denominator.tolist(),
+        'control.delay_samples': int(rng.choice([0, 0, 1])),
+        'backlash.m': m, 'backlash.c_r': c_r, 'backlash.c_l': -c_l,
+        'estimator.initial.m': m * factors[0], 'estimator.initial.c_r': c_r * factors[1],
+        'estimator.initial.c_l': -c_l * factors[2], 'proportional.f': f,
+        'waveform': str(rng.choice(['sine', 'multisine', 'square', 'triangle'])),
+        'frequency': float(omega), 'seed': int(rng.integers(2**31)),
+        'timeout.plant_output': float(rng.uniform(0.1, 0.5)),
+    }
+    gain = abs(complex(build_model(Parameters(values)).response(
+        np.exp(1j * np.array([omega * PERIOD_S])))[0]))
+    y_swing = u_swing * gain
+    v_swing = u_swing / m + gap
+    values['amplitude'] = u_swing if structure == 'proportional' else y_swing
+    noise = y_swing * 10.0 ** float(rng.uniform(-5.0, -2.0))
+    values['output_noise_std'] = noise
+    values['estimator.output_noise_std'] = noise * float(rng.choice([0.3, 1.0, 3.0]))
+    if rng.random() < 0.3:
+        values['truth.scale_frequency'] = float(rng.uniform(0.85, 1.15))
+    if rng.random() < 0.75:
+        values['control.min'] = -v_swing * float(rng.uniform(0.7, 3.0))
+        values['control.max'] = v_swing * float(rng.uniform(0.7, 3.0))
+    actions = ['hold', 'zero']
+    if rng.random() < 0.6:
+        values['control.rate_max'] = v_swing * float(omega * rng.uniform(1.0, 10.0))
+        actions.append('ramp')
+    if rng.random() < 0.2:
+        values['inverse.take_up_rate'] = v_swing * float(omega * rng.uniform(0.5, 5.0))
+    if rng.random() < 0.2:
+        values['inverse.direction_band'] = 0.02 * u_swing
+    values['on_stop'], values['on_timeout'] = (str(rng.choice(actions)) for _ in range(2))
+    p = Parameters(values)
+    build_controller(p)
+    build_plant(p)
+    return p, y_swing
+
+
+class Sequence:
+    """One loop, and what happens to it. told: called with what happens, for a reader."""
+
+    def __init__(self, seed: int, told: Callable[[str], None] = lambda text: None) -> None:
+        self.rng = rng = np.random.default_rng([seed, 13])
+        self.findings = Findings()
+        self._told = told
+        while True:
+            try:
+                self.p, swing = parameters_of(rng)
+                break
+            except ParameterError:
+                continue  # a plant that is refused
+        p = self.p
+        self.actuator = Actuator()
+        self.driver = Driver(
+            p, rng, self.actuator, Sensor(rng, swing), reports=bool(rng.random() < 0.5)
+        )
+        self.truth = _truth(p)
+        self._foreign = False  # whether the loop began with what another plant has taught
+        self._frozen: float | None = None  # y_m while the loop is interrupted
+        self._since_frozen = 0
+        self._stops: dict[int, Callable[[], None]] = {}  # ends of faults, by tick
+        self._usual = 0.0  # largest move of v so far
+        self._moves = 0
+        self._v_before = 0.0  # that acted before the newest command
+        self._v_answered = 0.0  # of the newest answer
+        self._last: Estimate | None = None
+        self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
+        self._loop: object = None
+        self._lately = NOTHING  # what has happened last
+        self._weights = {p.real('tracking.input_weight')}  # with which u_d was asked for
+        self._u_d = 0.0
+        self._widest = 0.0
+        inherited = None
+        if rng.random() < 0.2:
+            inherited = self._saved_elsewhere()
+            self._foreign = True
+            told(f'begins with saved estimates of another plant: {inherited}')
+        v = 0.0 if rng.random() < 0.5 else None
+        self.controller = Controller(p, self.driver, inherited, self._sent, self._answered)
+        if v is not None:
+            self.controller.start_anew(inherited, v)
+        told(f'{p.word("estimator.law")}, {p.word("structure")}, truth {self.truth}')
+
+    def run(self) -> Findings:
+        """Play the sequence."""
+        rng, driver = self.rng, self.driver
+        samples = int(rng.integers(*SAMPLES))
+        next_event = int(rng.integers(*PAUSE))
+        for tick in range(1, samples + 1):
+            if tick in self._stops:
+                self._stops.pop(tick)()
+            if tick == next_event:
+                self._event(tick)
+                next_event = tick + int(rng.integers(*PAUSE))
+            driver.advance()
+            y_m: float | None = driver.reference(tick * PERIOD_S)
+            if self._frozen is not None:
+                y_m = self._frozen
+            self.controller.run(y_m)
+        self.findings.samples = samples
+        self._conclude()
+        return self.findings
+
+    def _event(self, tick: int) -> None:
+        """Let something happen."""
+        rng = self.rng
+        what = str(rng.choice(EVENTS))
+        self._told(f'{tick}: {what}')
+        self._lately = what
+        EVENTS_BY_NAME[what](self, tick)
+
+    # What may happen.
+
+    def _fail_sensor(self, tick: int) -> None:
+        sensor = self.driver.sensor
+        sensor.fault = str(self.rng.choice(SENSOR_FAULTS))
+        sensor.value = sensor.swing * float(self.rng.uniform(-1.0, 1.0))
+        self._told(f'    {sensor.fault}')
+        self._lately += f': {sensor.fault}'
+        self._end_later(tick, lambda: setattr(sensor, 'fault', ''))
+
+    def _lose(self, tick: int) -> None:
+        self.driver.loses = True
+        self._end_later(tick, lambda: setattr(self.driver, 'loses', False))
+
+    def _lose_reports(self, tick: int) -> None:
+        self.driver.loses_reports = True
+        self._end_later(tick, lambda: setattr(self.driver, 'loses_reports', False))
+
+    def _repeat(self, tick: int) -> None:
+        self.driver.repeats = True
+        self._end_later(tick, lambda: setattr(self.driver, 'repeats', False))
+
+    def _stall(self, tick: int) -> None:
+        self.controller.stalled_until = tick + int(self.rng.integers(2, 40))
+
+    def _restart_driver(self, tick: int) -> None:
+        self.driver.down_until = tick + int(self.rng.integers(2, 80))
+        self._freeze()
+
+    def _step_clock(self, tick: int) -> None:
+        self.driver.offset_ns += int(self.rng.choice([-1, 1])) * int(10 ** self.rng.uniform(6, 10))
+        self._freeze()
+
+    def _restart_controller(self, tick: int) -> None:
+        rng, controller = self.rng, self.controller
+        if rng.random() < 0.5:
+            controller.deactivate()
+        estimate: Estimate | None = controller.loop.estimate
+        chance = rng.random()
+        if chance < 0.4 or (estimate is not None and not estimate.learned):
+            estimate = None
+            self._foreign = False
+        elif chance < 0.6:
+            estimate = self._saved_elsewhere()
+            self._foreign = True
+        self._told(f'    with {estimate}')
+        # Where the driver does not say which v acts, whoever starts the controller does.
+        controller.start_anew(estimate, None if self.driver.reports else self.actuator.v)
+        self._forget()
+
+    def _cycle(self, tick: int) -> None:
+        self.controller.cycle(clean_up=bool(self.rng.integers(2)))
+        self._freeze()
+        if self.controller.loop.last is None:
+            self._forget()
+
+    def _change_limits(self, tick: int) -> None:
+        rng, p = self.rng, self.controller.p
+        changes: dict[str, object] = {}
+        for name in ('control.min', 'control.max', 'control.rate_max'):
+            if isfinite(p.real(name)):
+                changes[name] = self.p.real(name) * float(rng.uniform(0.3, 1.5))
+        if changes:
+            self._told(f'    {changes}')
+            self.controller.take_up(p.replaced(changes))
+
+    def _change_live(self, tick: int) -> None:
+        rng, p = self.rng, self.controller.p
+        scale = float(10.0 ** rng.uniform(-1.0, 1.0))
+        changes: list[dict[str, object]] = [
+            {'tracking.input_weight': 1e-2 * scale}, {'inverse.caution': scale},
+            {'inverse.direction_band': 0.01 * scale * self.p.real('backlash.m')},
+            {'lms.step': min(scale, 1.9)}, {'inverse.take_up_rate': 100.0 * scale},
+        ]
+        if self.controller.loop.takes_up_noise:
+            noise = p.real('output_noise_std')
+            changes.append({'estimator.output_noise_std': noise * scale})
+        change = changes[int(rng.integers(len(changes)))]
+        self._told(f'    {change}')
+        self.controller.take_up(p.replaced(change))
+        self._weights.add(self.controller.p.real('tracking.input_weight'))
+
+    def _call_service(self, tick: int) -> None:
+        rng, loop = self.rng, self.controller.loop
+        kind = int(rng.integers(3))
+        on = bool(rng.integers(2))
+        self._told(f'    {("freeze", "compensation", "reset")[kind]} {on}')
+        if kind == 0:
+            loop.adapt(on)
+        elif kind == 1:
+            loop.compensate(on)
+        else:
+            loop.renew(None)
+            self._forget()
+
+    def _meet_rival(self, tick: int) -> None:
+        loop = self.controller.loop
+        if loop.standing_down:
+            return
+        loop.stand_down()
+        self._freeze()
+
+        def end() -> None:
+            if loop is self.controller.loop and loop.standing_down:
+                limits = loop.core.limits
+                low, high = max(limits.low, -1e3), min(limits.high, 1e3)
+                self.actuator.v = float(self.rng.uniform(low, high))
+                loop.hear_other(self.actuator.v)
+                loop.resume()
+                self._forget()
+
+        self._end_later(tick, end)
+
+    def _saved_elsewhere(self) -> Estimate:
+        """What another axis with the same G has learned."""
+        m, c_r, c_l = (
+            value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth
+        )
+        gap = c_r - c_l
+        return Estimate(m, c_r, c_l, self.p.real('proportional.f'),
+                        1e-3 * m, 1e-3 * gap, 1e-3 * gap)
+
+    # What is watched.
+
+    def _sent(self, v: float, limits: Limits) -> None:
+        found, before = self.findings, self.actuator.v
+        self._v_before = before
+        found.commands += 1
+        where = f'sample {self.driver.tick}: v {before:.6g} -> {v:.6g}, {limits}'
+        beyond, beyond_before = (
+            max(limits.low - x, x - limits.high, 0.0) for x in (v, before)
+        )
+        slack = ROUNDING * (1.0 + abs(v))
+        # Limits that have been narrowed are met as fast as the rate allows.
+        if not isfinite(v) or beyond > max(beyond_before - limits.move, 0.0) + slack:
+            found.outside.append(where)
+        if not abs(v - before) <= limits.move * (1.0 + ROUNDING) + slack:
+            found.too_fast.append(where)
+
+    def _answered(self, step: ControlStep, renewed: bool) -> None:
+        """Judge an answer. renewed: whether nothing was known of the plant before it."""
+        e, v = step.estimate, step.v
+        if self._loop is not self.controller.loop:
+            self._loop = self.controller.loop
+            self._segments.append((step.y, []))
+        self._segments[-1][1].append(step.y_m)
+        self._u_d = max(self._u_d, abs(step.u_d))
+        self._widest = max(self._widest, e.m * (e.c_r - e.c_l))
+        move = abs(v - self._v_before)
+        # Through the four blocks u_d answers at once to what y has done meanwhile.
+        goes_on = renewed and self.p.word('structure') != 'pole_placement'
+        # A v that was led to zero meanwhile starts from there.
+        goes_on = goes_on and self._v_before == self._v_answered
+        if goes_on and self._moves >= LEARNED_MOVES and self._last is not None:
+            allowed = JUMP * self._usual + _shift(self._last, e, v)
+            if move > allowed + ROUNDING * (1.0 + abs(v)):
+                self.findings.jumps.append(
+                    f'sample {self.driver.tick}: v moved by {move:.3g}, usual {self._usual:.3g}'
+                )
+        self._moves += 1
+        self._usual = max(self._usual, move)
+        self._last, self._v_answered = e, v
+        if self._frozen is not None and self._moves and renewed:
+            self._frozen = None
+        self._judge(e)
+
+    def _judge(self, e: Estimate) -> None:
+        if e.status is not Status.TRACKING or was_given(e):
+            return
+        m, c_r, c_l = self.truth
+        gap = c_r - c_l
+        if e.learned:
+            self.findings.claimed = True
+            stds = [max(DEVIATIONS * std, NEGLIGIBLE * size)
+                    for std, size in ((e.std_m, m), (e.std_c_r, gap), (e.std_c_l, gap))]
+        else:
+            stds = [WITHOUT * m, WITHOUT * gap, WITHOUT * gap]
+        off = max(abs(value - true) / std for value, true, std in
+                  zip((e.m, e.c_r, e.c_l), self.truth, stds, strict=True))
+        if off <= 1.0:
+            return
+        found = self.findings
+        kind = found.wrong if e.learned else found.wrong_without
+        if e.learned and self._foreign:
+            kind = found.wrong_inherited
+        elif e.learned and self.p.real('truth.scale_frequency') != 1.0:
+            kind = found.wrong_uncertain
+        kind.append(
+            f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
+            f'm {e.m:.5g} ({m:.5g}) ± {e.std_m:.2g}, '
+            f'c_r {e.c_r:.5g} ({c_r:.5g}) ± {e.std_c_r:.2g}, '
+            f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}{AFTER}{self._lately}'
+        )
+
+    def _conclude(self) -> None:
+        """Say whether u_d has gone further than a loop ever may."""
+        p = self.p
+        if p.word('structure') == 'proportional':
+            f = max(abs(p.real('proportional.f')), *map(abs, p.pair('proportional.bounds')))
+            allowed = (p.real('amplitude') + f * 100.0) / (1.0 - LARGEST_F_OVER_M)
+        else:
+            # The gapless loop is only run where it may matter.
+            allowed = TWICE * (1.0 + LARGEST_FEEDBACK) * self._widest
+            if self._u_d > allowed:
+                asked = max(self._asked(), self._widest)
+                allowed = TWICE * (1.0 + LARGEST_FEEDBACK) * asked
+        if not self._u_d <= allowed:
+            self.findings.unbounded.append(f'u_d reached {self._u_d:.3g}, allowed {allowed:.3g}')
+
+    def _asked(self) -> float:
+        """Largest |u_d| of a loop that knows a plant without a gap, for the same references."""
+        known = self.p.replaced({
+            'estimator.law': 'fixed', 'estimator.initial.m': self.p.real('backlash.m'),
+            'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
+            'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'output_noise_std': 0.0,
+            'control.min': -inf, 'control.max': inf, 'control.rate_max': inf,
+            'on_stop': 'hold', 'on_timeout': 'hold', 'inverse.take_up_rate': inf,
+            'truth.scale_frequency': 1.0,
+        })
+        largest = 0.0
+        # tracking begins at the first y, the four blocks at 0.
+        starts = ((begin, references) for y, references in self._segments for begin in (y, 0.0))
+        for (begin, references), weight in product(starts, sorted(self._weights)):
+            p = known.replaced({'tracking.input_weight': weight})
+            core, plant = build_controller(p), build_plant(p)
+            for y_m in references:
+                step = core.step(plant.measure(), y_m - begin)
+                plant.step(step.v)
+                largest = max(largest, abs(step.u_d))
+        return largest
+
+    def _freeze(self) -> None:
+        """Hold y_m until the loop goes on: then v has no reason to move."""
+        if self._segments:
+            self._frozen = self._segments[-1][1][-1]
+
+    def _forget(self) -> None:
+        """What was usual is not any more: another estimate is in use, or v was moved."""
+        self._moves, self._usual, self._last, self._frozen = 0, 0.0, None, None
+
+    def _end_later(self, tick: int, end: Callable[[], None]) -> None:
+        later = tick + int(self.rng.integers(*LASTS))
+        while later in self._stops:
+            later += 1
+        self._stops[later] = end
+
+
+def _truth(p: Parameters) -> tuple[float, float, float]:
+    """m, c_r, c_l as the controller may know them: the gain at rest of the true G is part of m."""
+    ratio = _gain_at_rest(build_true_model(p)) / _gain_at_rest(build_model(p))
+    return p.real('backlash.m') * ratio, p.real('backlash.c_r'), p.real('backlash.c_l')
+
+
+def _gain_at_rest(model: TransferFunction) -> float:
+    """G(1), or where G integrates the gain of what is left without the integrators."""
+    left = [1.0 - pole for pole in model.poles if abs(pole - 1.0) > NEAR_ONE]
+    return float(np.sum(model.numerator) / np.real(np.prod(left)))
+
+
+def _shift(before: Estimate, now: Estimate, v: float) -> float:
+    """By how much a new estimate may move v."""
+    crossings = max(abs(now.c_r - before.c_r), abs(now.c_l - before.c_l))
+    reach = abs(v) + max(now.c_r, -now.c_l)
+    return crossings + abs(now.m - before.m) / min(now.m, before.m) * reach
+
+
+EVENTS_BY_NAME: dict[str, Callable[[Sequence, int], None]] = {
+    'the sensor fails': Sequence._fail_sensor, 'outputs are lost': Sequence._lose,
+    'reports are lost': Sequence._lose_reports, 'outputs are repeated': Sequence._repeat,
+    'the controller is held up': Sequence._stall,
+    'the driver is started anew': Sequence._restart_driver,
+    'the clock is set': Sequence._step_clock,
+    'the controller is started anew': Sequence._restart_controller,
+    'deactivated and activated': Sequence._cycle, 'limits change': Sequence._change_limits,
+    'live parameters change': Sequence._change_live, 'a service is called': Sequence._call_service,
+    'a rival takes over for a while': Sequence._meet_rival,
+}
+EVENTS = (*EVENTS_BY_NAME, *('the sensor fails',) * 3)

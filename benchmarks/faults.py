@@ -1,0 +1,182 @@
+"""Random sequences of faults: does any of them hurt the actuator, or make an estimate lie?
+
+    python benchmarks/faults.py --sequences 20000
+    python benchmarks/faults.py --seed 45       what happens in one of them
+
+Each sequence is a loop of a random plant, law, structure, limits and noise, in simulated time: the
+core, the bookkeeping of samples and commands, and what the node decides around them; no middleware.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+import time
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from multiprocessing import Pool
+from pathlib import Path
+from typing import NamedTuple
+
+# Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
+
+from fault_sequences import AFTER, PERIOD_S, Findings, Sequence
+from reporting import ROOT, markdown_table, processors, text_table
+
+DOCUMENT = ROOT / 'docs' / 'faults.md'
+MARK = re.compile(
+    r'(<!-- campaign: made by benchmarks/faults\.py -->\n).*?(<!-- end -->)', re.DOTALL
+)
+SEQUENCES, FIRST_SEED = 20_000, 1
+SHOWN = 3  # findings of a kind in the report of one sequence
+KINDS = {
+    'outside': 'a command outside the limits that held at that moment',
+    'too_fast': 'a move beyond `control.rate_max`',
+    'jumps': 'a jump at the first command after an interruption',
+    'unbounded': 'u_d further from what y_m asks for than tracking.md says',
+    'broken': 'an exception',
+    'wrong': '*tracking* with an estimate off by more than five published deviations',
+    'wrong_inherited': 'the same in a loop that began with saved estimates of another plant',
+    'wrong_uncertain': 'the same where time constants of the true G differ by up to 15 %',
+    'wrong_without': '*tracking* with an estimate off by a fifth, laws without deviations',
+}
+LISTED = 40  # seeds in a cell
+WRONG = 'What had happened last where G and the estimates to begin with were right:'
+
+
+class Result(NamedTuple):
+    """What a sequence led to: the kinds of what was found, with the first of each."""
+
+    seed: int
+    loop: str
+    samples: int
+    commands: int
+    claimed: bool
+    found: dict[str, str]
+
+
+def play(seed: int) -> Result:
+    """Play the sequence of a seed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        sequence = Sequence(seed)
+        p = sequence.p
+        loop = f'{p.word("estimator.law")}, {p.word("structure")}'
+        try:
+            findings = sequence.run()
+        except Exception as error:
+            return Result(seed, loop, 0, 0, False, {'broken': repr(error)})
+    found = {kind: texts[0] for kind, texts in found_in(findings) if texts}
+    return Result(seed, loop, findings.samples, findings.commands, findings.claimed, found)
+
+
+def found_in(findings: Findings) -> Iterator[tuple[str, list[str]]]:
+    """What was found of each kind."""
+    for kind in KINDS:
+        if kind != 'broken':
+            yield kind, getattr(findings, kind)
+
+
+def show(seed: int) -> int:
+    """Print what happens in a sequence, and what was found."""
+    sequence = Sequence(seed, print)
+    findings = sequence.run()
+    for kind, texts in found_in(findings):
+        for text in texts[:SHOWN]:
+            print(f'{kind}: {text}')
+        if len(texts) > SHOWN:
+            print(f'{kind}: ... {len(texts)} in all')
+    return 0
+
+
+def rows_of(results: list[Result]) -> list[list[str]]:
+    """A line for each kind: how many sequences, and their seeds."""
+    rows = []
+    for kind, what in KINDS.items():
+        seeds = [str(result.seed) for result in results if kind in result.found]
+        named = ', '.join(seeds[:LISTED]) + (', ...' if len(seeds) > LISTED else '')
+        rows.append([what, str(len(seeds)), named])
+    return rows
+
+
+def reasons_of(results: list[Result]) -> list[list[str]]:
+    """A line for each event that wrong estimates have followed: how many sequences, and which."""
+    seeds: dict[str, list[str]] = {}
+    for result in results:
+        if 'wrong' in result.found:
+            seeds.setdefault(result.found['wrong'].split(AFTER)[1], []).append(str(result.seed))
+    ordered = sorted(seeds.items(), key=lambda item: (-len(item[1]), item[0]))
+    return [[event, str(len(which)), ', '.join(which)] for event, which in ordered]
+
+
+def summary(results: list[Result], first_seed: int) -> str:
+    """What was played, in a sentence."""
+    hours = sum(result.samples for result in results) * PERIOD_S / 3600.0
+    claimed = sum(result.claimed for result in results)
+    return (
+        f'{len(results)} sequences from seed {first_seed} on, {hours:.1f} h of simulated time, '
+        f'{sum(result.commands for result in results)} commands; in {claimed} of them a law with '
+        'deviations said *tracking*.'
+    )
+
+
+def write_document(results: list[Result], first_seed: int) -> None:
+    """Write the table between its marks."""
+    text = DOCUMENT.read_text(encoding='utf-8')
+    table = markdown_table(('found', 'sequences', 'seeds'), rows_of(results))
+    reasons = markdown_table(('before the first wrong *tracking*', 'sequences', 'seeds'),
+                             reasons_of(results))
+    made = f'{summary(results, first_seed)}\n\n{table}\n\n{WRONG}\n\n{reasons}\n'
+    DOCUMENT.write_text(
+        MARK.sub(lambda mark: f'{mark[1]}{made}{mark[2]}', text), encoding='utf-8'
+    )
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Options of the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--sequences', type=int, default=SEQUENCES, metavar='N')
+    parser.add_argument('--first-seed', type=int, default=FIRST_SEED, metavar='S')
+    parser.add_argument('--seed', type=int, metavar='K', help='show what happens in this one')
+    parser.add_argument('--processes', type=int, default=processors())
+    parser.add_argument('--seconds', type=float, default=float('inf'),
+                        help='begin no further sequence after so long')
+    parser.add_argument('--write', action='store_true',
+                        help=f'write the table into {DOCUMENT.relative_to(ROOT)}')
+    return parser.parse_args()
+
+
+def main() -> int:
+    """Return 0 if no command has broken a limit and nothing ran away."""
+    arguments = parse_arguments()
+    if arguments.seed is not None:
+        return show(arguments.seed)
+    first = arguments.first_seed
+    deadline = time.monotonic() + arguments.seconds
+    results: list[Result] = []
+    with Pool(arguments.processes) as pool:
+        seeds = range(first, first + arguments.sequences)
+        for result in pool.imap(play, seeds, chunksize=4):
+            results.append(result)
+            for kind, text in result.found.items():
+                print(f'{result.seed} ({result.loop}) {kind}: {text}', flush=True)
+            if time.monotonic() > deadline:
+                pool.terminate()
+                break
+    print(summary(results, first))
+    print(text_table(('found', 'sequences', 'seeds'), rows_of(results)))
+    if arguments.write:
+        write_document(results, first)
+    count = Counter(kind for result in results for kind in result.found)
+    return int(any(count[kind] for kind in ('outside', 'too_fast', 'unbounded', 'broken')))
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,139 @@
+"""Every law in every structure, also where the command or the samples are not as they should be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from backlash_ros.core.assembly import (
+    ESTIMATORS,
+    STRUCTURES,
+    build_controller,
+    build_plant,
+    build_reference,
+    law_fits,
+)
+from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimation.storage import was_given
+from backlash_ros.core.parameters import Parameters
+
+SAMPLES, RESTS_FROM = 1500, 900
+SEED = 5
+NOISE = 1e-7  # deviation of the noise on y [unit of y]
+LOST = 0.1  # share of the samples
+DRIVER_LIMIT = 8.0  # of a driver that limits v by itself [unit of v]
+AMPLITUDES = {'proportional': 10.0, 'tracking': 0.2, 'pole_placement': 0.2}
+TRUTH = (1.3, 3.0, -3.0)
+# Estimates of the laws without deviations are right within this share of m and of the gap, the
+# others within so many of their deviations.
+RIGHT, DEVIATIONS = 0.2, 5.0
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What is not as it should be.
+
+    changes: of parameters. compensates: whether the gap is cancelled. rests: whether y_m stops
+    after RESTS_FROM samples. lost: share of the samples that never arrive. driver_limit: beyond
+    which the driver limits v by itself; reports: whether it says so on applied_control.
+    """
+
+    changes: dict[str, object] = field(default_factory=dict)
+    compensates: bool = True
+    rests: bool = False
+    lost: float = 0.0
+    driver_limit: float = inf
+    reports: bool = False
+
+
+CONDITIONS = {
+    'all is well': Condition(),
+    'compensation off': Condition(compensates=False),
+    'v saturated': Condition({'control.min': -8.0, 'control.max': 8.0}),
+    'v rate limited': Condition({'control.rate_max': 200.0}),
+    'y_m at rest': Condition({'amplitude': 0.0}),
+    'y_m comes to rest': Condition(rests=True),
+    'samples lost': Condition(lost=LOST),
+    'driver limits v, and reports it': Condition(driver_limit=DRIVER_LIMIT, reports=True),
+    'driver limits v in silence': Condition(driver_limit=DRIVER_LIMIT),
+}
+
+
+class Sample(NamedTuple):
+    """What a sample led to, and the reference that it answered."""
+
+    y_m: float
+    u_d: float
+    v: float
+    estimate: Estimate
+
+    @property
+    def claims(self) -> bool:
+        """Whether the law says that it has learned."""
+        return self.estimate.status is Status.TRACKING
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the estimates are what they are said to be."""
+        e, gap = self.estimate, TRUTH[1] - TRUTH[2]
+        if e.learned:
+            allowed = [DEVIATIONS * std for std in (e.std_m, e.std_c_r, e.std_c_l)]
+        else:
+            allowed = [RIGHT * TRUTH[0], RIGHT * gap, RIGHT * gap]
+        return all(
+            abs(value - true) <= tolerance
+            for value, true, tolerance in zip((e.m, e.c_r, e.c_l), TRUTH, allowed, strict=True)
+        )
+
+
+def parameters_of(law: str, structure: str, condition: Condition) -> Parameters:
+    """The paper's plant with this law and structure."""
+    return Parameters({
+        'estimator.law': law, 'structure': structure, 'output_noise_std': NOISE,
+        'amplitude': AMPLITUDES[structure], **condition.changes,
+    })
+
+
+def run(law: str, structure: str, condition: Condition) -> list[Sample]:
+    """Run a loop; raises ParameterError for a combination that cannot work."""
+    p = parameters_of(law, structure, condition)
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    controller.compensating = condition.compensates
+    rng = np.random.default_rng(SEED)
+    samples: list[Sample] = []
+    acted: list[float] = []  # since the sample that was answered last
+    v = 0.0
+    for k in range(SAMPLES):
+        y = plant.measure()
+        if k == 0 or rng.random() >= condition.lost:
+            y_m = 0.0 if condition.rests and k >= RESTS_FROM else reference(k * 0.01)
+            reported = acted if condition.reports else ()
+            step = controller.step(y, y_m, max(len(acted) - 1, 0), reported)
+            controller.refine()
+            samples.append(Sample(y_m, step.u_d, step.v, step.estimate))
+            v, acted = step.v, []
+        acted.append(min(max(v, -condition.driver_limit), condition.driver_limit))
+        plant.step(acted[-1])
+    return samples
+
+
+def outcome(samples: list[Sample]) -> str:
+    """The last status, or what it stands for."""
+    last = samples[-1]
+    if was_given(last.estimate):
+        return 'as given'
+    return 'learned' if last.claims else last.estimate.status.word
+
+
+def rows() -> tuple[list[str], list[list[str]]]:
+    """Header, and a line for each law in each structure that it fits, a column per condition."""
+    header = ['law, structure', *CONDITIONS]
+    pairs = [(law, s) for s in STRUCTURES for law in ESTIMATORS if law_fits(law, s)]
+    return header, [
+        [f'`{law}`, `{structure}`',
+         *(outcome(run(law, structure, condition)) for condition in CONDITIONS.values())]
+        for law, structure in pairs
+    ]
