@@ -7,7 +7,7 @@ import pytest
 from records import PERIOD_S, resonance, swing
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.error_model import build_error_model
+from backlash_ros.core.estimation.error_model import ErrorModel, build_error_model
 from backlash_ros.core.estimation.low_order import OutputError, low_order
 from backlash_ros.core.estimation.record_fit import drained
 from backlash_ros.core.state_model import StateModel
@@ -94,3 +94,10 @@ def test_an_exact_model_stays_what_it_is() -> None:
     model = learned(resonance(), resonance())
     assert model is not None
     assert off(model, resonance()) <= 1e-3
+
+
+def test_prior_holds_where_rounding_makes_another_pole_of_an_integrator() -> None:
+    told, other = (TransferFunction([0.1], np.poly(poles).tolist())
+                   for poles in ([0.9, 0.8], [0.9, 0.8, 0.7]))
+    error = ErrorModel(StateModel(told), 0.2)
+    assert error.around(StateModel(other)) is error

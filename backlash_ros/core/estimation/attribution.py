@@ -1,13 +1,12 @@
 """Which of two commands acted over an interval, where the time of its arrival leaves that open.
 
-With the other one, u of the interval was another by `change`, and the first y that shows it another
-by first * change. The innovation tells the two apart where that is more than the noise: a
-likelihood ratio against prior odds.
+With the other one, u of the interval was another by `change`, and so was the first y that shows it.
+The innovation tells the two apart where that is more than the noise: a likelihood ratio against
+prior odds.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Generator
 from math import log
 
@@ -24,35 +23,53 @@ LEAST = 2.0 * log(ODDS)
 
 
 class Attribution:
-    """Judges the intervals one after the other, as soon as y shows them.
+    """Judges the intervals as soon as y shows them, those since the last y together.
 
-    A change is judged `delay` outputs after its interval has begun, delay >= 1 being that of G.
+    A driver that was held up has gone on with the older command until some time between two y: the
+    other one acted in the first of these intervals, or in none. observer: that follows y.
     """
 
     def __init__(self, observer: Observer) -> None:
         self._observer = observer
-        self.delay = observer.model.transfer_function.delay
-        self._changes: deque[float] = deque([0.0] * self.delay, maxlen=self.delay)
+        self._delay = observer.model.transfer_function.delay
+        # What the other commands would have added to the state of the observer, the oldest first.
+        self._pending: list[list[float]] = []
 
     def note(self, change: float) -> None:
         """Take in by how much u would be another in the interval that has just ended."""
-        self._changes.append(change)
-
-    def is_other(self, innovation: float) -> float:
-        """Part of this innovation that the other command explains; 0 where it was not the one.
-
-        The state of the observer is moved by what the other one has done to it.
-        """
-        change = self._changes[0]
-        if change == 0.0:
-            return 0.0
         observer = self._observer
-        explained = observer.first * change
-        rest = innovation - explained
-        if innovation * innovation - rest * rest <= LEAST * observer.variance:
-            return 0.0
-        observer.shift(change)
-        return explained
+        for added in self._pending:
+            observer.advance(added, 0.0)
+        added = [0.0] * observer.model.order
+        observer.advance(added, change)
+        self._pending.append(added)
+
+    def judge(self, innovation: float) -> tuple[float, list[int]]:
+        """Part of this innovation that other commands explain, and how many intervals ago.
+
+        The state of the observer is moved by what they have done to it.
+        """
+        ripe = len(self._pending) - self._delay + 1
+        if ripe <= 0:
+            return 0.0, []
+        judged, self._pending = self._pending[:ripe], self._pending[ripe:]
+        best, count, explained, together = innovation * innovation - self._least, 0, 0.0, 0.0
+        for i, added in enumerate(judged, 1):
+            together += added[0]
+            rest = (innovation - together) ** 2
+            if rest < best:
+                best, count, explained = rest, i, together
+        newest = len(judged) + len(self._pending) - 1
+        found = []
+        for i, added in enumerate(judged[:count]):
+            self._observer.shift(added)
+            if any(added):
+                found.append(newest - i)
+        return explained, found
+
+    @property
+    def _least(self) -> float:
+        return LEAST * self._observer.variance
 
 
 def attributed(
@@ -65,7 +82,6 @@ def attributed(
     after every `piece` samples.
     """
     attribution = Attribution(observer)
-    behind = attribution.delay - 1
     chosen = v.tolist()
     others = other.tolist()
     p, gap = play
@@ -79,11 +95,11 @@ def attributed(
         expected = observer.predict(slope * now - offset)
         if measured == measured:
             innovation = measured - expected
-            explained = attribution.is_other(innovation)
-            if explained != 0.0 and k >= behind:
-                chosen[k - behind] = others[k - behind]
-                if behind == 0:
-                    now = there
+            explained, found = attribution.judge(innovation)
+            for ago in found:
+                chosen[k - ago] = others[k - ago]
+            if 0 in found:
+                now = there
             observer.correct(innovation - explained)
         p = now
     return np.array(chosen)

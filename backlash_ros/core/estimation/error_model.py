@@ -60,9 +60,16 @@ class ErrorModel:
             self.spread, self.low_order_spread = _prior(model, self, moving, uncertainty)
 
     def around(self, model: StateModel) -> ErrorModel:
-        """The same prior for a G of as many moving poles, in units of its own time constants."""
+        """The same prior for a G of as many moving poles, in units of its own time constants.
+
+        Where rounding has changed their number, an integrator beside slow poles being one of them,
+        it stays as it is.
+        """
+        moving = _moving(model)
+        if len(moving) != self.taps:
+            return self
         other = copy(self)
-        other.stable = monic(_moving(model))
+        other.stable = monic(moving)
         other.gain = float(other.stable.sum())
         return other
 

@@ -268,15 +268,16 @@ class MovingHorizon:
                 self.innovation = nan
             else:
                 innovation = y - expected
-                explained = attribution.is_other(innovation) if attribution is not None else 0.0
-                if attribution is not None and explained != 0.0:
+                if attribution is not None:
+                    explained, found = attribution.judge(innovation)
                     innovation -= explained
-                    self.reattributed += 1
-                    if attribution.delay == 1:
-                        v, other = other, v
-                        self._p, self._u = there, estimate.m * (there - estimate.c_r)
-                    else:
-                        self._record.exchange(self._record.end + 1 - attribution.delay)
+                    self.reattributed += len(found)
+                    for ago in found:
+                        if ago > 0:
+                            self._record.exchange(self._record.end - ago)
+                        else:
+                            v, other = other, v
+                            self._p, self._u = there, estimate.m * (there - estimate.c_r)
                 self.innovation = innovation
                 if innovation * innovation <= GATE**2 * observer.variance:
                     self._refused.clear()

@@ -89,8 +89,6 @@ class Observer:
         self.variance = (self._gain.innovation * noise_std) ** 2  # of the innovation, measured
         self._to_state = tuple(map(tuple, model.to_state.tolist()))
         self.cov: Array = self.noise_cov  # of the state
-        self._once = self._response(transfer.delay)  # state as soon as y shows u = 1 over a period
-        self.first = self._once[0]
 
     @property
     def state(self) -> list[float]:
@@ -117,7 +115,10 @@ class Observer:
 
     def predict(self, u: float) -> float:
         """Take u over one period and return the y that is expected after it."""
-        x = self._x
+        return self.advance(self._x, u)
+
+    def advance(self, x: list[float], u: float) -> float:
+        """Take a state in the observer form over one period, in place, and return its y."""
         y = x[0]
         terms = self._terms
         last = self._n - 1
@@ -135,19 +136,11 @@ class Observer:
             x[i] += k * innovation
         self.variance += (innovation * innovation - self.variance) / MEMORY
 
-    def shift(self, u: float) -> None:
-        """Move the state to where so much more u would have led, over the newest period y shows."""
+    def shift(self, added: list[float]) -> None:
+        """Add to the state, in the observer form."""
         x = self._x
-        for i, once in enumerate(self._once):
-            x[i] += once * u
-
-    def _response(self, periods: int) -> list[float]:
-        self._x = [0.0] * self._n
-        self.predict(1.0)
-        for _ in range(periods - 1):
-            self.predict(0.0)
-        response, self._x = self._x, [0.0] * self._n
-        return response
+        for i, more in enumerate(added):
+            x[i] += more
 
     def settle(self, noise_std: float) -> None:
         """Go a step towards the smallest gain that explains the innovations.
