@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.error_model import ErrorModel, build_error_model
 from backlash_ros.core.estimation.low_order import OutputError, low_order
-from backlash_ros.core.estimation.record_fit import drained
+from backlash_ros.core.estimation.pace import drained
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 

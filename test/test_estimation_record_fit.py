@@ -11,14 +11,10 @@ from hypothesis import strategies as st
 from records import PERIOD_S, Truth, output, resonance, swing
 from scipy.special import chdtri
 
+from backlash_ros.core.estimation.prior import Prior
 from backlash_ros.core.estimation.protocol import Bounds
-from backlash_ros.core.estimation.record_fit import (
-    SEARCHED_AT_MOST,
-    RecordFit,
-    fit_record,
-    frequencies_of,
-)
-from backlash_ros.core.estimation.window_fit import Prior
+from backlash_ros.core.estimation.record_description import RecordFit, frequencies_of
+from backlash_ros.core.estimation.record_fit import SEARCHED_AT_MOST, fit_record
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 

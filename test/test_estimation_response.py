@@ -9,10 +9,11 @@ from scipy.signal import lfilter
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
 from backlash_ros.core.estimation.error_model import ErrorModel
-from backlash_ros.core.estimation.pace import Pace
-from backlash_ros.core.estimation.record_fit import drained
+from backlash_ros.core.estimation.learned_error import response_std
+from backlash_ros.core.estimation.pace import Pace, drained
+from backlash_ros.core.estimation.play import Start
 from backlash_ros.core.estimation.relabelling import Fitted, fitted
-from backlash_ros.core.estimation.window_fit import Around, Start
+from backlash_ros.core.estimation.solution import Around
 from backlash_ros.core.learned_model import FREQUENCIES
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
@@ -70,7 +71,7 @@ def test_deviation_is_that_of_plants_drawn_from_the_posterior() -> None:
         m, e = drawn[layout.n + 1], drawn[layout.base:layout.base + layout.errors]
         # The record says m G (1 + Delta).
         squares += np.abs(shares @ (e / m)) ** 2
-    assert fit.response_std(solution, POINTS) == pytest.approx(
+    assert response_std(fit, solution, POINTS) == pytest.approx(
         np.sqrt(squares / len(draws)), rel=0.1
     )
 
@@ -80,7 +81,7 @@ def test_true_response_lies_within_a_few_deviations(frequency_hz: float) -> None
     true = resonance(frequency_hz)
     fit, solution = fit_of(true, resonance(), 0.2)[:2]
     off = np.abs(true.response(POINTS) / resonance().response(POINTS) - 1.0)
-    std = fit.response_std(solution, POINTS)
+    std = response_std(fit, solution, POINTS)
     assert np.all(off <= 3.0 * std)
     # And they are no empty promise: where y moves G is known.
     assert std[0] < 0.02 + 2.0 * off[0]
@@ -88,7 +89,7 @@ def test_true_response_lies_within_a_few_deviations(frequency_hz: float) -> None
 
 def test_exact_model_has_no_deviation() -> None:
     fit, solution = fit_of(resonance(), resonance(), 0.0)[:2]
-    assert fit.response_std(solution, POINTS).tolist() == [0.0] * len(FREQUENCIES)
+    assert response_std(fit, solution, POINTS).tolist() == [0.0] * len(FREQUENCIES)
 
 
 def test_leak_of_an_integrator_counts() -> None:
@@ -99,4 +100,4 @@ def test_leak_of_an_integrator_counts() -> None:
         * posterior.noise_std**2 * solution.inflation
     # Far below every other frequency only the leak is left.
     low = np.exp(1j * np.array([1e-9]))
-    assert fit.response_std(solution, low) == pytest.approx([np.sqrt(leak) / 1e-9], rel=1e-3)
+    assert response_std(fit, solution, low) == pytest.approx([np.sqrt(leak) / 1e-9], rel=1e-3)

@@ -14,11 +14,13 @@ from scipy.special import chdtri
 
 from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED
 from backlash_ros.core.estimation.error_model import build_error_model
-from backlash_ros.core.estimation.pace import Pace
-from backlash_ros.core.estimation.record_fit import drained
+from backlash_ros.core.estimation.pace import Pace, drained
+from backlash_ros.core.estimation.play import Start
+from backlash_ros.core.estimation.prior import Prior
 from backlash_ros.core.estimation.relabelling import Fitted, fitted, searched
 from backlash_ros.core.estimation.search import Found, search
-from backlash_ros.core.estimation.window_fit import Around, Prior, Start, weights_of
+from backlash_ros.core.estimation.solution import Around
+from backlash_ros.core.estimation.window_fit import weights_of
 from backlash_ros.core.state_model import StateModel
 
 NOISE = 1e-3
@@ -201,13 +203,12 @@ def test_search_and_fit_learn_the_backlash_through_a_wrong_model(
 ) -> None:
     v = swing(500, seed=seed)
     y = output(resonance(5.0 * ratio), v, truth, NOISE, seed)
-    found = drained(searched(v, y, around(0.2), 100.0, Pace()))
-    assert found is not None
-    result, moved = found
+    result = drained(searched(v, y, around(0.2), 100.0, Pace()))
+    assert result is not None
     assert result.solution.gap == pytest.approx(truth.gap, rel=0.02)
     assert result.solution.m == pytest.approx(truth.m, rel=0.02)
     if ratio != 1.0:
-        assert moved.model is not around(0.2).model
+        assert result.around.model is not around(0.2).model
 
 
 def test_a_constant_u_is_no_backlash() -> None:

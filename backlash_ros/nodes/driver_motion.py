@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.controller import plausible
-from backlash_ros.core.estimation.record_fit import RecordFit, fit_record
+from backlash_ros.core.estimation.record_description import RecordFit
+from backlash_ros.core.estimation.record_fit import fit_record
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.transfer_function import TransferFunction
 from backlash_ros.nodes.command_history import ReportUse, report_use

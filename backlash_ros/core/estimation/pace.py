@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from math import inf
+from typing import TypeVar
+
+T = TypeVar('T')
 
 LARGEST, SMALLEST = 40_000, 400  # samples times alternatives in one piece
 LONG, SHORT = 0.5, 0.1  # shares of the time beyond which a piece is made smaller, or larger
@@ -24,3 +28,13 @@ class Pace:
     def pieces(self, samples: int) -> int:
         """Alternatives over so many samples that fit into one piece."""
         return max(self.size // max(samples, 1), 1)
+
+
+def drained(work: Generator[None, None, T]) -> T:
+    """What a generator returns once all of its pieces are done."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            result: T = done.value
+            return result

@@ -15,6 +15,8 @@ from backlash_ros.core.backlash import clamp
 
 Array = NDArray[np.float64]
 
+NO_PAST: Array = np.empty(0)
+
 
 class Labels(NamedTuple):
     """What the play operator says of N samples, each of shape (N,).
@@ -81,3 +83,45 @@ def play(v: Array, gap: float, p0: float) -> tuple[Array, NDArray[np.int8]]:
         p.append(held)
     out = np.array(p)
     return out, np.where(out == v, 1, np.where(out == v + gap, -1, 0)).astype(np.int8)
+
+
+class Start(NamedTuple):
+    """Where the play operator begins. gap: of the labels.
+
+    p: play output before the first sample. side: 1 or -1 where one was engaged before, at v_a; 0
+    where the plant was left somewhere in its gap. past: v before the record, from where all this
+    holds on: what it did to the error of G lasts.
+    """
+
+    gap: float
+    p: float
+    side: int = 0
+    v_a: float = 0.0
+    past: Array = NO_PAST
+
+    def labels(self, v: Array) -> Labels:
+        """What the play operator says of v (N,) from here on."""
+        return labels_of(v, self.gap, self.p, self.side, self.v_a)
+
+    def after(self, v: Array) -> Start:
+        """Where the play operator stands after v (N,)."""
+        if not len(v):
+            return self
+        labels = self.labels(v)
+        side = int(labels.right[-1] - labels.left[-1])
+        return Start(self.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
+
+    def forgotten_after(self, v: Array) -> int:
+        """Samples of v (N,) after which p says nothing any more; N + 1 if it always does."""
+        low = float(v[0])
+        ends = (play(v, self.gap, p)[0] for p in (low, low + self.gap))
+        same = np.flatnonzero(np.equal(*ends))
+        return int(same[0]) + 1 if same.size and self.side == 0 else len(v) + 1
+
+    def with_gap(self, gap: float, v: Array) -> Start:
+        """The same for another gap, before v (N,): a side that was engaged stays so."""
+        gap = max(gap, 0.0)
+        if self.side != 0:
+            return self._replace(gap=gap, p=self.v_a + (gap if self.side < 0 else 0.0))
+        low = float(self.past[0] if len(self.past) else v[0])
+        return self._replace(gap=gap, p=min(max(self.p, low), low + gap))

@@ -7,7 +7,7 @@ G (1 + Delta) does, where the data speak for it.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,16 +24,13 @@ from backlash_ros.core.estimation.constants import (
     WALKS,
     ZOOM,
 )
+from backlash_ros.core.estimation.learned_error import wants_another_model
 from backlash_ros.core.estimation.low_order import OutputError, low_order
 from backlash_ros.core.estimation.pace import Pace
+from backlash_ros.core.estimation.play import Start
 from backlash_ros.core.estimation.search import Candidate, search
-from backlash_ros.core.estimation.window_fit import (
-    Around,
-    Solution,
-    Start,
-    WindowFit,
-    weights_of,
-)
+from backlash_ros.core.estimation.solution import Around, Solution
+from backlash_ros.core.estimation.window_fit import WindowFit, weights_of
 from backlash_ros.core.model_check import check_model
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
@@ -54,6 +51,21 @@ class Fitted(NamedTuple):
     solution: Solution
     decided: bool = True
 
+    @property
+    def around(self) -> Around:
+        """What it was made around."""
+        return self.fit.around
+
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood, comparable between fits of the same samples."""
+        return self.solution.posterior.evidence
+
+    def beginning(self, v: Array) -> Start:
+        """Where another fit of v (N,) is to begin."""
+        solution = self.solution
+        return self.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
+
 
 def fitted(
     v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
@@ -70,15 +82,14 @@ def fitted(
             yield
         solution = fit.solve()
         result = Fitted(fit, solution)
-        if best is None or solution.posterior.evidence >= best.solution.posterior.evidence:
+        if best is None or result.evidence >= best.evidence:
             best = result
         if fit.layout.leak:
             # Without a leak an offset of u explains one as long as the labels are wrong.
             solution = fit.solve(leaking=True)
         if abs(solution.gap - start.gap) <= STANDS * solution.std_gap or solution.m == 0.0:
             break
-        slope = solution.m
-        start = start._replace(p=solution.start).with_gap(solution.gap, v)
+        slope, start = solution.m, Fitted(fit, solution).beginning(v)
         yield
     assert best is not None
     return best
@@ -86,7 +97,7 @@ def fitted(
 
 def searched(
     v: Array, y: Array, around: Around, widest: float, pace: Pace,
-) -> Generator[None, None, tuple[Fitted, Around] | None]:
+) -> Generator[None, None, Fitted | None]:
     """Search the gap and fit around the best candidates.
 
     None where a constant u explains y as well: v never engaged.
@@ -102,18 +113,17 @@ def searched(
         start = Start(candidate.gap, candidate.start)
         fits.append((yield from fitted(v, y, around, start, candidate.m, pace)))
     # Those far away only tell whether the choice is clear.
-    best = max(fits[:CANDIDATES], key=lambda fit: fit.solution.posterior.evidence)
+    best = most_likely(fits[:CANDIDATES])
     # With an error of G the evidence is that of the best error for each gap: too flat to tell.
     if not around.error.count:
         best = best._replace(decided=not any(_rivals(best, other) for other in fits))
-    decided = best.decided
-    result, around = yield from with_better_model(v, y, around, best, pace)
-    return result._replace(decided=decided), around
+    result = yield from with_better_model(v, y, best, pace)
+    return result._replace(decided=best.decided)
 
 
 def _rivals(best: Fitted, other: Fitted) -> bool:
     """Whether the gap of another fit is nearly as likely, and not the same."""
-    behind = best.solution.posterior.evidence - other.solution.posterior.evidence
+    behind = best.evidence - other.evidence
     apart = abs(other.solution.gap - best.solution.gap)
     return behind < UNDECIDED_BY and apart > 3.0 * best.solution.std_gap + ZOOM[0] * abs(
         best.solution.gap
@@ -132,15 +142,36 @@ def _apart(candidates: list[Candidate]) -> list[Candidate]:
     return chosen
 
 
+def fitted_with_model(
+    v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """The fit of a record, with the better G that follows from it."""
+    result = yield from fitted(v, y, around, start, slope, pace)
+    return (yield from with_better_model(v, y, result, pace))
+
+
+def motionless(
+    v: Array, y: Array, around: Around, slope: float, swing: float, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """The fit of a constant u: that of a gap wider than all of v, which moves by `swing`."""
+    start = Start(3.0 * swing, float(v[0]) + 1.5 * swing)
+    return (yield from fitted(v, y, around, start, slope, pace))
+
+
+def most_likely(results: Sequence[Fitted]) -> Fitted:
+    """The one with the largest evidence, the first of equals."""
+    return max(results, key=lambda result: result.evidence)
+
+
 def with_better_model(
-    v: Array, y: Array, around: Around, result: Fitted, pace: Pace,
-) -> Generator[None, None, tuple[Fitted, Around]]:
+    v: Array, y: Array, result: Fitted, pace: Pace,
+) -> Generator[None, None, Fitted]:
     """Let G move to the one of low order that fits best, until the evidence grows no more."""
     weights = np.where(np.isfinite(y), weights_of(y), 0.0)
     for _ in range(MODELS):
-        solution = result.solution
+        solution, around = result.solution, result.around
         posterior = solution.posterior
-        if not solution.m > 0.0 or not result.fit.wants_another_model(solution):
+        if not solution.m > 0.0 or not wants_another_model(result.fit, solution):
             break
         transfer = around.model.transfer_function
         u = result.fit.input(solution, v)
@@ -151,31 +182,27 @@ def with_better_model(
         if better is None or not _allowed(better):
             break
         model = StateModel(better)
-        moved = around._replace(
-            model=model, error=around.error.around(model),
-            scale=max(around.scale, posterior.scale),
-        )
+        moved = around.moved_to(model)._replace(scale=max(around.scale, posterior.scale))
         yield
-        start = result.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
-        other = yield from fitted(v, y, moved, start, solution.m, pace)
-        gained = other.solution.posterior.evidence - posterior.evidence
+        other = yield from fitted(v, y, moved, result.beginning(v), solution.m, pace)
+        gained = other.evidence - result.evidence
         # What moving K coefficients may cost or bring by chance.
         if gained < -around.error.count:
             break
-        result, around = other, moved
+        result = other
         if gained < around.error.count:
             break
-    return result, around
+    return result
 
 
 def with_walk(
-    v: Array, y: Array, around: Around, result: Fitted, pace: Pace,
-) -> Generator[None, None, tuple[Fitted, Around]]:
+    v: Array, y: Array, result: Fitted, pace: Pace,
+) -> Generator[None, None, Fitted]:
     """Let a disturbance of u walk where the residual hints at it and the evidence is for it."""
-    solution = result.solution
+    solution, around = result.solution, result.around
     if not solution.m > 0.0 or (solution.correlation == 0.0 and around.walk == 0.0):
-        return result, around
-    start = result.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
+        return result
+    start = result.beginning(v)
     still = around._replace(walk=0.0)
     if around.walk > 0.0:
         result = yield from fitted(v, y, still, start, solution.m, pace)
@@ -186,10 +213,10 @@ def with_walk(
         walking.fit.solve(share * size).posterior.evidence for share in WALKS
     ]
     best = int(np.argmax(evidence))
-    if evidence[best] <= result.solution.posterior.evidence:
-        return result, still
+    if evidence[best] <= result.evidence:
+        return result
     around = still._replace(walk=WALKS[best] * size)
-    return (yield from fitted(v, y, around, walking.fit.start, solution.m, pace)), around
+    return (yield from fitted(v, y, around, walking.fit.start, solution.m, pace))
 
 
 def _allowed(model: TransferFunction) -> bool:

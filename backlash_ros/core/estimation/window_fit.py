@@ -7,18 +7,16 @@ gap, so that labels made anew with it are a Gauss-Newton step (relabelling.py).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from math import inf, sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import GATE, SLOW
-from backlash_ros.core.estimation.crossings import Crossings, crossings_of
-from backlash_ros.core.estimation.error_model import ErrorModel
-from backlash_ros.core.estimation.play import Labels, labels_of, play
+from backlash_ros.core.estimation.crossings import crossings_of
+from backlash_ros.core.estimation.play import NO_PAST, Labels, Start
 from backlash_ros.core.estimation.regression import (
     VAGUE,
     Posterior,
@@ -27,115 +25,15 @@ from backlash_ros.core.estimation.regression import (
     with_zero,
 )
 from backlash_ros.core.estimation.regressors import RAMPS, Regressors
+from backlash_ros.core.estimation.solution import Around, Solution
 from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
 
-NO_PAST: Array = np.empty(0)
 PAST = 3  # memories of G for which what its error does may last
 FAR = 1e3  # prior of x0, in units of the largest output and of the noise
 ROUNDING = 1e-10  # share of the largest y below which a residual is rounding
-LINEAR = 0.05  # scale of the error of G up to which the response is linear in it
 SETTLING = 64  # samples over which the size of a column is told
-
-
-class Start(NamedTuple):
-    """Where the play operator begins. gap: of the labels.
-
-    p: play output before the first sample. side: 1 or -1 where one was engaged before, at v_a; 0
-    where the plant was left somewhere in its gap. past: v before the record, from where all this
-    holds on: what it did to the error of G lasts.
-    """
-
-    gap: float
-    p: float
-    side: int = 0
-    v_a: float = 0.0
-    past: Array = NO_PAST
-
-    def labels(self, v: Array) -> Labels:
-        """What the play operator says of v (N,) from here on."""
-        return labels_of(v, self.gap, self.p, self.side, self.v_a)
-
-    def after(self, v: Array) -> Start:
-        """Where the play operator stands after v (N,)."""
-        if not len(v):
-            return self
-        labels = self.labels(v)
-        side = int(labels.right[-1] - labels.left[-1])
-        return Start(self.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
-
-    def forgotten_after(self, v: Array) -> int:
-        """Samples of v (N,) after which p says nothing any more; N + 1 if it always does."""
-        low = float(v[0])
-        ends = (play(v, self.gap, p)[0] for p in (low, low + self.gap))
-        same = np.flatnonzero(np.equal(*ends))
-        return int(same[0]) + 1 if same.size and self.side == 0 else len(v) + 1
-
-    def with_gap(self, gap: float, v: Array) -> Start:
-        """The same for another gap, before v (N,): a side that was engaged stays so."""
-        gap = max(gap, 0.0)
-        if self.side != 0:
-            return self._replace(gap=gap, p=self.v_a + (gap if self.side < 0 else 0.0))
-        low = float(self.past[0] if len(self.past) else v[0])
-        return self._replace(gap=gap, p=min(max(self.p, low), low + gap))
-
-
-class Prior(NamedTuple):
-    """What is known of theta = (m, m c_r, m c_l) from elsewhere: mean (3,), covariance (3, 3)."""
-
-    theta: Array
-    cov: Array
-
-
-class Around(NamedTuple):
-    """What a fit is made around.
-
-    model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that
-    of the error of the G that was told, once this one was moved to where the data want it: it is no
-    better known for that. most: largest scale that is believed. walk: deviation by which a
-    disturbance of u walks over the record [unit of u], 0 for none.
-    """
-
-    model: StateModel
-    error: ErrorModel
-    told_std: float
-    prior: Prior | None = None
-    scale: float = 0.0
-    most: float = inf
-    walk: float = 0.0
-
-
-@dataclass(frozen=True)
-class Solution:
-    """What the samples of a window say.
-
-    posterior: of all unknowns. crossings: with honest deviations; None unless m > 0. gap: of the
-    solution, start: p of the solution at the start. count: samples that count, repeated readings
-    once. correlation: of successive residuals beyond chance. inflation: 1 - rho + N rho, by which
-    the covariance is widened. rms: of the residual.
-    """
-
-    posterior: Posterior
-    theta: Array
-    theta_cov: Array
-    crossings: Crossings | None
-    gap: float
-    start: float
-    count: float
-    correlation: float
-    inflation: float
-    rms: float
-
-    @property
-    def m(self) -> float:
-        """Slope; negative where v and y have opposite signs."""
-        return float(self.theta[0])
-
-    @property
-    def std_gap(self) -> float:
-        """Standard deviation of the gap; inf unless m > 0."""
-        return self.crossings.std_gap if self.crossings is not None else inf
 
 
 class WindowFit:
@@ -358,46 +256,6 @@ class WindowFit:
         known = self.layout.base
         cov = by @ posterior.cov[:known, :known] @ by.T
         return by @ posterior.mean[:known], cov * variance
-
-    def response_std(self, solution: Solution, z: NDArray[np.complex128]) -> Array:
-        """Relative deviation of the response of the true G from `model` at z (M,), shape (M,).
-
-        The root of the mean of |dG/G|^2 over the posterior of the error of G and of the leak of its
-        integrator. What is known of the error counts as well, as `model` goes without it. The gain
-        at rest is part of m. 0 where G is exact.
-        """
-        layout, posterior = self.layout, solution.posterior
-        error, m = self.around.error, solution.m
-        part = slice(layout.base, layout.base + layout.errors)
-        by: NDArray[np.complex128] = np.zeros((len(z), layout.unknowns), dtype=np.complex128)
-        if m != 0.0:
-            by[:, part] = error.responses(z) @ error.spread / m
-        if layout.leak:
-            by[:, layout.driven] = -1.0 / (z - 1.0)
-        known = by @ posterior.mean
-        if m != 0.0:
-            by[:, layout.n + 1] = -(by[:, part] @ posterior.mean[part]) / m
-        variance = np.einsum('mp,pq,mq->m', by, posterior.cov, by.conj()).real
-        spread = posterior.noise_std**2 * solution.inflation
-        return np.asarray(np.sqrt(np.abs(known) ** 2 + np.maximum(variance, 0.0) * spread))
-
-    def plausible(self, solution: Solution) -> bool:
-        """Whether the error of G is one that its prior with the largest scale expects."""
-        layout, most = self.layout, self.around.most
-        if layout.errors == 0 or most == inf:
-            return True
-        error = solution.posterior.mean[layout.base:layout.base + layout.errors]
-        size = float(error @ error) / (most * solution.m) ** 2 if most > 0.0 else 0.0
-        return size <= 9.0 * layout.errors
-
-    def wants_another_model(self, solution: Solution) -> bool:
-        """Whether the error of G is more than chance: then a G of low order may take it over."""
-        layout, posterior = self.layout, solution.posterior
-        if posterior.scale < LINEAR:
-            return False
-        part = slice(layout.base, layout.base + layout.errors)
-        error, cov = posterior.mean[part], posterior.cov[part, part] * posterior.noise_std**2
-        return float(error @ np.linalg.pinv(cov) @ error) > 2.0 * layout.errors
 
     def input(self, solution: Solution, v: Array) -> Array:
         """u as the fit has it, shape (N,). v: the samples taken in."""

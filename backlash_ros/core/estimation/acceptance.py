@@ -1,0 +1,43 @@
+"""Which fits are precise enough to be published, or to take the place of what held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from backlash_ros.core.estimation.constants import NO_GAP, PRECISE_GAP, PRECISE_SLOPE
+from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.protocol import Bounds
+from backlash_ros.core.estimation.relabelling import Fitted
+
+BEYOND = 3.0  # standard deviations by which an estimate may lie outside of its bounds
+ROUNDING = 1e-9  # ... and relative distance besides
+
+
+def usable(result: Fitted, bounds: Bounds, share: float = 1.0) -> Crossings | None:
+    """The crossings of a fit if they are precise and within the bounds by their deviations.
+
+    share: of the usual deviations that is allowed.
+    """
+    found = result.solution.crossings
+    if found is None or not found.std_m <= share * PRECISE_SLOPE * found.m:
+        return None
+    if not found.std_gap <= share * largest_gap_std(found.gap, result.fit.swing):
+        return None
+    values = (found.m, found.c_r, found.c_l)
+    outside = outside_bounds(values, (found.std_m, found.std_c_r, found.std_c_l), bounds)
+    return None if any(outside) else found
+
+
+def largest_gap_std(gap: float, swing: float) -> float:
+    """Deviation up to which a gap counts as known, where v swings by so much."""
+    return max(PRECISE_GAP * gap, NO_GAP * swing)
+
+
+def outside_bounds(
+    values: tuple[float, float, float], stds: Sequence[float], bounds: Bounds,
+) -> list[bool]:
+    """Whether m, c_r, c_l lie outside of their bounds by more than their deviations explain."""
+    return [
+        abs(value - near) > BEYOND * std + ROUNDING * abs(near)
+        for value, std, near in zip(values, stds, bounds.project(*values), strict=True)
+    ]

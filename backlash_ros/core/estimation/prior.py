@@ -1,0 +1,55 @@
+"""What is known of theta = (m, m c_r, m c_l), what drift makes of it, and whether two agree."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.protocol import Estimate
+
+Array = NDArray[np.float64]
+
+CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
+SHARPEST = 1e-9  # relative deviation of an estimate that is taken for exact
+
+
+class Prior(NamedTuple):
+    """What is known of theta = (m, m c_r, m c_l) from elsewhere: mean (3,), covariance (3, 3)."""
+
+    theta: Array
+    cov: Array
+
+
+def prior_of(estimate: Estimate) -> Prior:
+    """What an estimate with its deviations says."""
+    m, c_r, c_l = estimate.m, estimate.c_r, estimate.c_l
+    std = np.array([estimate.std_m, estimate.std_c_r, estimate.std_c_l])
+    std = np.maximum(std, SHARPEST * np.array([m, c_r - c_l, c_r - c_l]))
+    return Prior(np.array([m, m * c_r, m * c_l]), _cov_of_theta(m, c_r, c_l, std**2))
+
+
+def drifted(theta: Array, cov: Array, drift: Array, samples: int) -> Prior:
+    """What is left of theta (3,) and its covariance (3, 3) after so many samples of drift.
+
+    drift: random walk of m, c_r, c_l per square root of a sample, shape (3,).
+    """
+    m, product_r, product_l = theta.tolist()
+    return Prior(theta, cov + _cov_of_theta(m, product_r / m, product_l / m, drift**2 * samples))
+
+
+def _cov_of_theta(m: float, c_r: float, c_l: float, variances: Array) -> Array:
+    """Covariance (3, 3) of theta for independent m, c_r, c_l of these variances (3,)."""
+    jacobian = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [c_l, 0.0, m]])
+    return np.asarray(jacobian @ np.diag(variances) @ jacobian.T)
+
+
+def contradicts(one: Prior, other: Prior) -> bool:
+    """Whether two independent estimates of theta differ by more than chance."""
+    return beyond_chance(one.theta - other.theta, one.cov + other.cov)
+
+
+def beyond_chance(difference: Array, cov: Array) -> bool:
+    """Whether a difference (3,) of this covariance (3, 3) is one in 1,000 or rarer."""
+    return float(difference @ np.linalg.solve(cov, difference)) > CHI2
