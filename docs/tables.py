@@ -33,6 +33,7 @@ ESTIMATION = ROOT / 'backlash_ros' / 'core' / 'estimation'
 CONSTANTS = ESTIMATION / 'constants.py'
 OF_EVERY_LAW = ('protocol.py', 'storage.py')
 CONSTANT = re.compile(r'([A-Z][A-Z0-9_]*(?:, [A-Z][A-Z0-9_]*)*) = (.*?)(?:  # (.*))?')
+KIND = re.compile(r'# --- (\w+)')
 MOTOR = 'geared_motor.yaml'
 # True plants that differ from the G(z) of MOTOR, by what is set.
 TRUE_PLANTS: dict[str, dict[str, str]] = {
@@ -211,36 +212,46 @@ def freedom() -> str:
 
 
 def estimator_constants() -> str:
-    """The constants of the method with the comments beside them, as they stand in the code."""
-    rows = [(f'`{name}`', value, what) for name, value, what in constants_of(CONSTANTS)]
-    return markdown(('constant', 'value', 'meaning'), rows)
+    """What the method is tuned by, with the comments beside it, as it stands in the code."""
+    rows = [(kind, f'`{name}`', value, what) for kind, name, value, what in constants_of(CONSTANTS)]
+    return markdown(('for', 'constant', 'value', 'meaning'), rows)
 
 
 def estimator_details() -> str:
-    """The constants that belong to one file of the method alone."""
-    rows: list[tuple[str, str, str, str]] = []
+    """The guards and the structure of single computations of the method."""
+    rows: list[tuple[str, str, str, str, str]] = []
     for path in sorted(ESTIMATION.glob('*.py')):
         if path.name not in OF_EVERY_LAW and path != CONSTANTS:
             link = f'[{path.name}](../{path.relative_to(ROOT)})'
-            rows += [(f'`{name}`', value, what, link) for name, value, what in constants_of(path)]
-    return markdown(('constant', 'value', 'meaning', 'file'), rows)
+            rows += [
+                (kind, f'`{name}`', value, what, link)
+                for kind, name, value, what in constants_of(path)
+            ]
+    rows.sort(key=lambda row: row[0], reverse=True)
+    return markdown(('part of', 'constant', 'value', 'meaning', 'file'), rows)
 
 
-def constants_of(path: Path) -> list[tuple[str, str, str]]:
-    """Name, value and meaning of the constants of a file: those with a comment."""
+def constants_of(path: Path) -> list[tuple[str, str, str, str]]:
+    """Kind, name, value and meaning of the constants of a file: those with a comment.
+
+    The kind is what a line `# --- kind` above them says, the structure where there is none.
+    """
     lines = path.read_text().splitlines()
-    found = []
+    found, kind = [], 'structure'
     for k, line in enumerate(lines):
+        if (heading := KIND.fullmatch(line)) is not None:
+            kind = heading[1]
         match = CONSTANT.fullmatch(line)
         if match is None:
             continue
         name, value, comment = match.groups()
         first = k
-        while comment is None and first > 0 and lines[first - 1].startswith('# '):
+        while comment is None and first > 0 and lines[first - 1].startswith('# ') \
+                and not KIND.fullmatch(lines[first - 1]):
             first -= 1
         what = comment or ' '.join(text.removeprefix('# ') for text in lines[first:k])
         if what:
-            found.append((name, f'`{value}`', what.replace('|', '\\|')))
+            found.append((kind, name, f'`{value}`', what.replace('|', '\\|')))
     return found
 
 

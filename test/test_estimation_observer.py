@@ -7,7 +7,7 @@ import pytest
 from records import resonance
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
-from backlash_ros.core.estimation.observer import RATIOS, ROUNDING, Observer, gain_of
+from backlash_ros.core.estimation.observer import RATIOS, REGULAR, Observer, gain_of
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 
@@ -26,7 +26,7 @@ def stationary(model: StateModel, ratio: float) -> tuple[np.ndarray, float, np.n
     """
     power = abs(model.transfer_function.response(np.exp([0.1j * np.pi]))[0])
     noise = np.outer(model.b, model.b) * (ratio / power) ** 2
-    noise += ROUNDING * np.trace(noise) * np.eye(model.order)
+    noise += REGULAR * np.trace(noise) * np.eye(model.order)
     c = np.zeros(model.order)
     c[0] = model.c
     p = np.eye(model.order)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from backlash_ros.core.estimation.constants import NO_GAP, PRECISE_GAP, PRECISE_SLOPE
+from backlash_ros.core.estimation.constants import BY_CHANCE, NO_GAP, PRECISE_GAP, PRECISE_SLOPE
 from backlash_ros.core.estimation.crossings import Crossings
 from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.relabelling import Fitted
 
-BEYOND = 3.0  # standard deviations by which an estimate may lie outside of its bounds
-ROUNDING = 1e-9  # ... and relative distance besides
+# --- guards
+BOUND_ROUNDING = 1e-9  # relative distance from a bound that is none
 
 
 def usable(result: Fitted, bounds: Bounds, share: float = 1.0) -> Crossings | None:
@@ -38,6 +38,6 @@ def outside_bounds(
 ) -> list[bool]:
     """Whether m, c_r, c_l lie outside of their bounds by more than their deviations explain."""
     return [
-        abs(value - near) > BEYOND * std + ROUNDING * abs(near)
+        abs(value - near) > BY_CHANCE * std + BOUND_ROUNDING * abs(near)
         for value, std, near in zip(values, stds, bounds.project(*values), strict=True)
     ]

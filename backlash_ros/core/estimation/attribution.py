@@ -19,7 +19,7 @@ from backlash_ros.core.estimation.observer import Observer
 
 Array = NDArray[np.float64]
 
-LEAST = 2.0 * log(ODDS)
+LEAST_RATIO = 2.0 * log(ODDS)
 
 
 class Attribution:
@@ -69,7 +69,7 @@ class Attribution:
 
     @property
     def _least(self) -> float:
-        return LEAST * self._observer.variance
+        return LEAST_RATIO * self._observer.variance
 
 
 def attributed(

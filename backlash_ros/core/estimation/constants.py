@@ -1,44 +1,47 @@
-"""Every constant of the default law, with its meaning; docs/estimation.md shows this table."""
+"""What the default law is tuned by; docs/estimation.md shows this as a table.
+
+Guards against rounding and what belongs to the structure of one computation stand where they are
+used.
+"""
 
 from __future__ import annotations
 
-# --- the record
+# --- judgement
+BY_CHANCE = 3.0  # standard deviations up to which a difference is chance
+ENGAGED = 15.0  # log-likelihood by which a gap must beat a constant u
+UNDECIDED_BY = 6.0  # log-likelihood by which another gap may fall behind: some 300 are compared
+REVERSALS = 2  # changes of the engaged side before the first estimate where G is uncertain
+PRECISE_SLOPE = 0.2  # relative deviation of m below which an estimate is published
+PRECISE_GAP = 0.3  # relative deviation of the gap below which it is
+NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
+REPLACING = 0.04  # of these deviations: those of an estimate that replaces one that held
+GATE = 6.0  # standard deviations of an innovation beyond which y is an outlier
+OUTLIERS = 5  # outliers in a row that are none
+OUTLIER_SHARE = 0.2  # share of the samples of a block, or of a record, that may be outliers
+ODDS = 20.0  # against the older one of two commands that may have acted over an interval
+MISFIT = 3.0  # mean normalised square of the residuals of a block that contradicts the fit
+RECOVERED = 30  # samples that end a contradiction where they fit, or may explain one
+AS_GOOD = 1.5  # ratio of residuals up to which another fit explains the samples as well
+UNDECIDED = 100  # samples after which it is said why there is no estimate yet
+NO_DATA = 20  # lost samples in a row that are worth a state
+SLOW = 100  # samples that u takes at least to walk: what is faster is motion
+LEAK = 5e-3  # prior of that of an integrator, per sample and per unit of the uncertainty
+FREE_TAPS = 0.2  # prior of single taps, as a share of the largest one and of the uncertainty
+LINEAR = 0.05  # scale of the error of G up to which the response is linear in it
+
+# --- effort
 LONGEST = 1500  # samples of the record that is fitted; beyond it the oldest third is let go
 BLOCK = (8, 64)  # samples, fewest and most, that are taken in between two solutions
 BLOCK_SHARE = 32  # ... and in between: one block for so many samples of the record
 BEGINNING = 0.03  # share of the record in which p is unknown that is let go for good
 GROWTH = 1.4  # of the record, after which all of it is fitted anew
 MOVED = 0.5  # standard deviations of the gap after which all of it is fitted anew
-
-WALKS = (0.003, 0.01, 0.03, 0.1, 0.3)  # walks of u over the record, in m times the gap
-SLOW = 100  # samples that u takes at least to walk: what is faster is motion
-
-# --- the search
 FIRST_SEARCH = 20  # samples before the first search
 SEARCH_GROWTH = 1.25  # of the record between two searches, until there is an estimate
 SEARCHED = 400  # newest samples of the record that a search looks at
 GAPS = 32  # gaps that are compared, geometric between NO_GAP and 1 times the swing of v
 STARTS = 5  # places within each gap at which the play output may have begun
 ZOOM = (0.2, 17)  # second look: relative reach around the best gap, and gaps within it
-ENGAGED = 15.0  # log-likelihood by which a gap must beat a constant u
-UNDECIDED_BY = 6.0  # log-likelihood by which another gap may fall behind: some 300 are compared
 CANDIDATES = 3  # best gaps of a search that are fitted
-FAR = 2  # ... and gaps far from them
-
-# --- what is published
-PRECISE_SLOPE = 0.2  # relative deviation of m below which an estimate is published
-PRECISE_GAP = 0.3  # relative deviation of the gap below which it is
-REPLACING = 0.04  # of these deviations: those of an estimate that replaces one that held
-NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
-REVERSALS = 2  # changes of the engaged side before the first estimate where G is uncertain
-
-# --- what does not fit
-SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
-ODDS = 20.0  # against the older one of two commands that may have acted over an interval
-GATE = 6.0  # standard deviations of an innovation beyond which y is an outlier
-OUTLIERS = 5  # outliers in a row that are none
-MISFIT = 3.0  # mean normalised square of the residuals of a block that contradicts the fit
-RECOVERED = 30  # samples that end a contradiction where they fit, or may explain one
-AS_GOOD = 1.5  # ratio of residuals up to which another fit explains the samples as well
-UNDECIDED = 100  # samples after which it is said why there is no estimate yet
-NO_DATA = 20  # lost samples in a row that are worth a state
+FAR_CANDIDATES = 2  # ... and gaps far from them
+WALKS = (0.003, 0.01, 0.03, 0.1, 0.3)  # walks of u over the record, in m times the gap

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from backlash_ros.core.estimation.constants import FREE_TAPS, LEAK
 from backlash_ros.core.model_check import ON_CIRCLE
 from backlash_ros.core.state_model import StateModel
 
@@ -27,12 +28,11 @@ Array = NDArray[np.float64]
 
 DRAWN = 300  # plants that the prior is drawn from
 SEED = 1  # of the drawing: the same G has the same prior
-LONGEST = 2000  # samples of the responses that are compared
-SETTLED = 8.0  # slowest time constants that these responses last
+LONGEST_RESPONSE = 2000  # samples of the responses that are compared
+RESPONSE_LASTS = 8.0  # slowest time constants that these responses last
 MORE_TAPS = 2  # numerator taps of a G of low order beyond its moving poles: a sample of delay
-FREE_TAPS = 0.2  # spread of single taps, as a share of the largest one and of the uncertainty
-LEAK = 5e-3  # of an integrator per sample and per unit of the uncertainty
-NEGLIGIBLE = 1e-7  # share of the largest singular value of the responses that is rounding
+# --- guards
+NO_DIRECTION = 1e-7  # share of the largest singular value of the responses that is rounding
 
 
 class ErrorModel:
@@ -155,7 +155,7 @@ def _prior(
     numerator = np.trim_zeros(model.transfer_function.numerator, 'f')
     start = model.transfer_function.delay
     slowest = max((-1.0 / np.log(np.abs(moving))).tolist(), default=1.0)
-    samples = int(min(SETTLED * slowest + 20.0, LONGEST))
+    samples = int(min(RESPONSE_LASTS * slowest + 20.0, LONGEST_RESPONSE))
     impulse = np.zeros(samples)
     impulse[start] = 1.0
     response = lfilter(numerator, error.stable, impulse)
@@ -177,7 +177,7 @@ def _prior(
         coefficients[taps:, i] = stable[1:]
     told_taps = _taps(told, error.stable, start, taps)
     coefficients -= np.append(told_taps, error.stable[1:])[:, None]
-    h = np.asarray(np.linalg.lstsq(basis, off, rcond=NEGLIGIBLE)[0], dtype=np.float64)
+    h = np.asarray(np.linalg.lstsq(basis, off, rcond=NO_DIRECTION)[0], dtype=np.float64)
     # A lag by a part of a sample moves single taps in ways of its own.
     free = uncertainty * FREE_TAPS * float(np.abs(told_taps).max())
     taps_alone = np.eye(taps + len(moving), taps) * free

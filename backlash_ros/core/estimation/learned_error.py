@@ -7,12 +7,11 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.constants import BY_CHANCE, LINEAR
 from backlash_ros.core.estimation.solution import Solution
 from backlash_ros.core.estimation.window_fit import WindowFit
 
 Array = NDArray[np.float64]
-
-LINEAR = 0.05  # scale of the error of G up to which the response is linear in it
 
 
 def response_std(fit: WindowFit, solution: Solution, z: NDArray[np.complex128]) -> Array:
@@ -45,7 +44,7 @@ def plausible(fit: WindowFit, solution: Solution) -> bool:
         return True
     error = solution.posterior.mean[layout.base:layout.base + layout.errors]
     size = float(error @ error) / (most * solution.m) ** 2 if most > 0.0 else 0.0
-    return size <= 9.0 * layout.errors
+    return size <= BY_CHANCE**2 * layout.errors
 
 
 def wants_another_model(fit: WindowFit, solution: Solution) -> bool:

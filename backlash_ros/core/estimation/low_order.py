@@ -25,8 +25,9 @@ from backlash_ros.core.transfer_function import TransferFunction
 Array = NDArray[np.float64]
 
 SHIFTS = (0, 1, 2, -1)  # samples of delay more than G has that are compared
-ITERATIONS = 10  # Gauss-Newton steps, those that were too long included
+GAUSS_NEWTON_STEPS = 10  # Gauss-Newton steps, those that were too long included
 SHORTER = 0.3  # share of a step that is tried where the whole step leads uphill
+# --- guards
 NO_TAP = 1e-6  # share of the largest tap below which the last ones are none
 
 
@@ -119,7 +120,7 @@ def _fit(
     xi: Array = np.zeros(prior.shape[1])
     step: Array = xi
     length = 1.0
-    for _ in range(ITERATIONS):
+    for _ in range(GAUSS_NEWTON_STEPS):
         trial = xi + length * step
         value = start + prior @ trial
         b, a = value[:taps], np.append(1.0, value[taps:])

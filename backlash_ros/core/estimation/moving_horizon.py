@@ -21,14 +21,13 @@ from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
 from backlash_ros.core.estimation.constants import (
     BLOCK,
     NO_DATA,
-    SMALLEST_NOISE,
 )
 from backlash_ros.core.estimation.error_model import build_error_model
 from backlash_ros.core.estimation.learned_error import response_std
 from backlash_ros.core.estimation.learning import CAPACITY, Learning, Task
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
 from backlash_ros.core.estimation.schedule import next_task
-from backlash_ros.core.estimation.solution import Around
+from backlash_ros.core.estimation.solution import SMALLEST_NOISE, Around
 from backlash_ros.core.estimation.state_following import Sample, StateFollowing
 from backlash_ros.core.state_model import StateModel
 

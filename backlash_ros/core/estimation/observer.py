@@ -25,11 +25,12 @@ from backlash_ros.core.state_model import StateModel
 Array = NDArray[np.float64]
 
 # Noise on u, as its stationary share of y in units of the noise of y, that gains are made for.
-STEP = 10.0  # ratio of neighbours
-RATIOS = tuple(STEP**exponent for exponent in range(-4, 5))
-ROUNDING = 1e-9  # noise on every state beside that on u: keeps the Riccati equation regular
-MEMORY = 100  # samples over which innovations are averaged
-CHANCE = 1.15  # ratio of their deviation to the expected one that chance explains
+RATIO_STEP = 10.0  # ratio of neighbours
+RATIOS = tuple(RATIO_STEP**exponent for exponent in range(-4, 5))
+INNOVATIONS = 100  # samples over which innovations are averaged
+NOISIER = 1.15  # ratio of their deviation to the expected one that chance explains
+# --- guards
+REGULAR = 1e-9  # noise on every state beside that on u: keeps the Riccati equation regular
 
 
 class Gain(NamedTuple):
@@ -53,7 +54,7 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
     c = np.zeros((n, 1))
     c[0, 0] = model.c
     noise = np.outer(model.b, model.b) * (ratio / power) ** 2
-    noise += ROUNDING * float(np.trace(noise)) * np.eye(n)
+    noise += REGULAR * float(np.trace(noise)) * np.eye(n)
     try:
         p = linalg.solve_discrete_are(model.a.T, c, noise, np.eye(1))
         variance = float(model.c * p[0, 0] * model.c) + 1.0
@@ -61,7 +62,7 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
         # Error of the prediction with this gain: P = (A - A k c) P (A - A k c)' + A k k' A' + Q.
         after = model.a @ column
         quiet = linalg.solve_discrete_lyapunov(
-            model.a - np.outer(after, c), np.outer(after, after) + noise * STEP**-2
+            model.a - np.outer(after, c), np.outer(after, after) + noise * RATIO_STEP**-2
         )
     except (linalg.LinAlgError, ValueError):
         return None
@@ -134,7 +135,7 @@ class Observer:
         x = self._x
         for i, k in enumerate(self._gain.gain):
             x[i] += k * innovation
-        self.variance += (innovation * innovation - self.variance) / MEMORY
+        self.variance += (innovation * innovation - self.variance) / INNOVATIONS
 
     def shift(self, added: list[float]) -> None:
         """Add to the state, in the observer form."""
@@ -149,7 +150,7 @@ class Observer:
         """
         self._noise_std = noise_std
         gain = self._gain
-        if self.variance > (CHANCE * gain.innovation * noise_std) ** 2:
+        if self.variance > (NOISIER * gain.innovation * noise_std) ** 2:
             self._level = min(self._level + 1, len(RATIOS) - 1)
         elif self.variance < gain.innovation * gain.quiet * noise_std**2:
             self._level = max(self._level - 1, 0)

@@ -12,6 +12,7 @@ from backlash_ros.core.estimation.protocol import Estimate
 Array = NDArray[np.float64]
 
 CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
+# --- guards
 SHARPEST = 1e-9  # relative deviation of an estimate that is taken for exact
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import (
     GATE,
-    SMALLEST_NOISE,
+    OUTLIER_SHARE,
 )
 from backlash_ros.core.estimation.error_model import build_error_model
 from backlash_ros.core.estimation.pace import Pace, drained
@@ -37,7 +37,7 @@ from backlash_ros.core.estimation.relabelling import (
     searched,
     with_better_model,
 )
-from backlash_ros.core.estimation.solution import Around
+from backlash_ros.core.estimation.solution import SMALLEST_NOISE, Around
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 
@@ -45,7 +45,6 @@ Array = NDArray[np.float64]
 
 FEWEST = 10  # samples per unknown of G and u below which nothing is said
 SEARCHED_AT_MOST = 6000  # samples of a record that the search for the gap looks at
-OUTLYING = 0.2  # share of the samples that may be outliers
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
 
 
@@ -165,4 +164,4 @@ def _outliers(result: Fitted) -> NDArray[np.bool_]:
     known = residual[residual > 0.0]
     typical = NORMAL_MAD * float(np.median(known)) if len(known) else 0.0
     wild = residual > GATE * max(typical, result.around.told_std)
-    return wild if np.count_nonzero(wild) <= OUTLYING * len(known) else np.zeros_like(wild)
+    return wild if np.count_nonzero(wild) <= OUTLIER_SHARE * len(known) else np.zeros_like(wild)

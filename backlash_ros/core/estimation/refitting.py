@@ -10,7 +10,14 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.attribution import attributed
 from backlash_ros.core.estimation.change_detection import change, note_block
-from backlash_ros.core.estimation.constants import BEGINNING, BLOCK, LONGEST, MISFIT, SEARCHED
+from backlash_ros.core.estimation.constants import (
+    BEGINNING,
+    BLOCK,
+    LONGEST,
+    MISFIT,
+    OUTLIER_SHARE,
+    SEARCHED,
+)
 from backlash_ros.core.estimation.learning import Learning, Task
 from backlash_ros.core.estimation.observer import Observer
 from backlash_ros.core.estimation.play import Start
@@ -27,7 +34,6 @@ from backlash_ros.core.estimation.window_fit import weights_of
 
 Array = NDArray[np.float64]
 
-FEW = 0.2  # share of a block that may be outliers
 AT_ONCE = 4  # largest blocks that are taken in at once, where there was no time before
 
 
@@ -40,7 +46,7 @@ def take_block(learning: Learning) -> Task:
     rows = fit.columns(v, y)
     squares, outliers = fit.contradiction(rows, y, solution)
     valid = np.isfinite(y)
-    if np.count_nonzero(outliers) <= FEW * np.count_nonzero(valid):
+    if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
         valid &= ~outliers
         record.lose(number + np.flatnonzero(outliers))
     misfit = float(squares[valid].mean()) if valid.any() else 0.0

@@ -25,6 +25,7 @@ NOISE_WEIGHT = 1.0  # samples that the told noise level counts for
 # Scales s of the error of G that are compared, besides none, in units of the spread of the prior.
 SCALES = np.geomspace(1e-4, 10.0, 21)
 SAME = 0.7  # ratio of scales that the grid does not tell apart
+# --- guards
 LARGEST_EXPONENT = 700.0  # of a number that still is one
 VAGUE = 1e-9  # weight of a prior, as a share of the norm of a column, that is no information
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.constants import (
+    BY_CHANCE,
     CANDIDATES,
     ENGAGED,
-    FAR,
+    FAR_CANDIDATES,
     GROWTH,
     NO_GAP,
     UNDECIDED_BY,
@@ -37,7 +38,7 @@ from backlash_ros.core.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-ITERATIONS = 8  # of relabelling, at most
+RELABELLINGS = 8  # of relabelling, at most
 STANDS = 0.02  # standard deviations by which the gap may still move
 FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
 NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
@@ -74,7 +75,7 @@ def fitted(
     weights = weights_of(y)
     reach = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
     best: Fitted | None = None
-    for _ in range(ITERATIONS):
+    for _ in range(RELABELLINGS):
         fit = WindowFit(around, start, slope, reach, int(GROWTH * len(v)))
         while fit.length < len(v):
             part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
@@ -125,7 +126,7 @@ def _rivals(best: Fitted, other: Fitted) -> bool:
     """Whether the gap of another fit is nearly as likely, and not the same."""
     behind = best.evidence - other.evidence
     apart = abs(other.solution.gap - best.solution.gap)
-    return behind < UNDECIDED_BY and apart > 3.0 * best.solution.std_gap + ZOOM[0] * abs(
+    return behind < UNDECIDED_BY and apart > BY_CHANCE * best.solution.std_gap + ZOOM[0] * abs(
         best.solution.gap
     )
 
@@ -133,7 +134,7 @@ def _rivals(best: Fitted, other: Fitted) -> bool:
 def _apart(candidates: list[Candidate]) -> list[Candidate]:
     """The best candidates whose gaps are no neighbours, and the best ones far from them."""
     chosen: list[Candidate] = []
-    for least, count in ((NEIGHBOURS, CANDIDATES), (ZOOM[0], CANDIDATES + FAR)):
+    for least, count in ((NEIGHBOURS, CANDIDATES), (ZOOM[0], CANDIDATES + FAR_CANDIDATES)):
         for candidate in candidates:
             if len(chosen) == count:
                 break

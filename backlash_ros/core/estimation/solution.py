@@ -17,6 +17,9 @@ from backlash_ros.core.state_model import StateModel
 
 Array = NDArray[np.float64]
 
+# --- guards
+SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
+
 
 class Around(NamedTuple):
     """What a fit is made around.

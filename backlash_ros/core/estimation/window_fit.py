@@ -14,7 +14,7 @@ from math import inf, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import GATE, SLOW
+from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, SLOW
 from backlash_ros.core.estimation.crossings import crossings_of
 from backlash_ros.core.estimation.play import NO_PAST, Labels, Start
 from backlash_ros.core.estimation.regression import (
@@ -31,9 +31,10 @@ from backlash_ros.core.state_model import StateModel
 Array = NDArray[np.float64]
 
 PAST = 3  # memories of G for which what its error does may last
-FAR = 1e3  # prior of x0, in units of the largest output and of the noise
-ROUNDING = 1e-10  # share of the largest y below which a residual is rounding
-SETTLING = 64  # samples over which the size of a column is told
+STEP_SAMPLES = 64  # samples over which the size of a column is told
+# --- guards
+ANY_STATE = 1e3  # prior of x0, in units of the largest output and of the noise
+NO_RESIDUAL = 1e-10  # share of the largest y below which a residual is rounding
 
 
 class WindowFit:
@@ -77,7 +78,7 @@ class WindowFit:
         n, layout = self.layout.n, self.layout
         weights = np.zeros(layout.unknowns)
         told_std = self.around.told_std
-        weights[:n] = told_std / (FAR * (y_reach + told_std))
+        weights[:n] = told_std / (ANY_STATE * (y_reach + told_std))
         unit = VAGUE * step_norm(self.model)
         weights[n:layout.driven] = unit
         weights[n + 1] = unit * (v_reach or 1.0)
@@ -160,7 +161,8 @@ class WindowFit:
 
     def unexplained(self, solution: Solution) -> float:
         """Motion of u behind the correlated part of the residual, over m times the gap."""
-        scale = step_norm(self.model) / sqrt(SETTLING) * abs(solution.m) * max(solution.gap, 0.0)
+        size = step_norm(self.model) / sqrt(STEP_SAMPLES)
+        scale = size * abs(solution.m) * max(solution.gap, 0.0)
         motion = sqrt(solution.correlation) * solution.rms
         return motion / scale if scale > 0.0 else inf
 
@@ -184,9 +186,9 @@ class WindowFit:
         squares = float(residual @ residual)
         count = self._triangle.count
         correlation = 0.0
-        if squares > count * (ROUNDING * self.reach[0]) ** 2 and count > 1.0:
+        if squares > count * (NO_RESIDUAL * self.reach[0]) ** 2 and count > 1.0:
             lag = float(residual[1:] @ residual[:-1]) / squares
-            correlation = max(0.0, lag - 3.0 / sqrt(count))
+            correlation = max(0.0, lag - BY_CHANCE / sqrt(count))
         inflation = 1.0 - correlation + count * correlation
         now = self._theta_now()
         theta = now @ posterior.mean
@@ -284,7 +286,7 @@ def step_norm(model: StateModel) -> float:
     """Norm of the first samples of the step response of G."""
     x: Array = np.zeros(model.order)
     total = 0.0
-    for _ in range(SETTLING):
+    for _ in range(STEP_SAMPLES):
         x = model.a @ x + model.b
         total += (model.c * float(x[0])) ** 2
     return sqrt(total)
