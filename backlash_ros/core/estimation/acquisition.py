@@ -13,7 +13,6 @@ from backlash_ros.core.estimation.constants import (
     REPLACING,
     REVERSALS,
     SEARCH_GROWTH,
-    SEARCHED,
     UNDECIDED,
 )
 from backlash_ros.core.estimation.learned_error import plausible
@@ -33,7 +32,7 @@ def acquire(learning: Learning) -> Task:
     record, search = learning.record, learning.acquisition
     end = record.end
     search.next_at = end + max(int(len(record) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
-    first = max(record.first, end - SEARCHED)
+    first = max(record.first, end - learning.searched)
     record.forget_before(first)
     v, y = record.since(first)
     around = learning.free._replace(walk=learning.told_walk)

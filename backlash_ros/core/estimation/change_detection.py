@@ -16,7 +16,6 @@ from backlash_ros.core.estimation.constants import (
     RECOVERED,
     REPLACING,
     SEARCH_GROWTH,
-    SEARCHED,
 )
 from backlash_ros.core.estimation.learning import Learning, Task
 from backlash_ros.core.estimation.prior import Prior, contradicts
@@ -112,7 +111,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         return learning.go_on_from(whole, record.first)
     changes = []
     for first in (since, (since + end) // 2):
-        first = max(first, end - SEARCHED)
+        first = max(first, end - learning.searched)
         if end - first < RECOVERED:
             continue
         v, y = record.since(first)
@@ -133,7 +132,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         return learning.go_on_from(whole, record.first)
     if end - since >= RECOVERED:
         learning.reason = Status.INCONSISTENT
-    if end - since > SEARCHED:
+    if end - since > learning.searched:
         learning.begin_acquisition(estimate)
     return False
 
@@ -147,7 +146,7 @@ def _best_of_all(
     results = []
     for beginning in learning.beginnings(around):
         result: Fitted | None
-        if len(v) <= SEARCHED:
+        if len(v) <= learning.searched:
             result = yield from searched(v, y, beginning, learning.widest, pace)
         else:
             start = current.fit.start.with_gap(current.solution.gap, v)

@@ -19,7 +19,9 @@ from backlash_ros.core.estimation.constants import (
     FIRST_SEARCH,
     GROWTH,
     LONGEST,
+    MEMORIES_SEARCHED,
     REPLACING,
+    SEARCHED,
     UNDECIDED,
 )
 from backlash_ros.core.estimation.crossings import Crossings
@@ -91,6 +93,11 @@ class Learning:
     def free(self) -> Around:
         """Around the G of now, with nothing else taken for known."""
         return self.around._replace(prior=None, most=inf, walk=0.0)
+
+    @property
+    def searched(self) -> int:
+        """Newest samples that a search looks at: those whose beginning G has forgotten as well."""
+        return min(max(SEARCHED, MEMORIES_SEARCHED * self.around.model.memory), LONGEST)
 
     @property
     def widest(self) -> float:

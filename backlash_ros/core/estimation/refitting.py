@@ -16,7 +16,6 @@ from backlash_ros.core.estimation.constants import (
     LONGEST,
     MISFIT,
     OUTLIER_SHARE,
-    SEARCHED,
 )
 from backlash_ros.core.estimation.learning import Learning, Task
 from backlash_ros.core.estimation.observer import Observer
@@ -30,7 +29,7 @@ from backlash_ros.core.estimation.relabelling import (
     with_walk,
 )
 from backlash_ros.core.estimation.solution import Around
-from backlash_ros.core.estimation.window_fit import weights_of
+from backlash_ros.core.estimation.window_fit import PAST, weights_of
 
 Array = NDArray[np.float64]
 
@@ -75,7 +74,7 @@ def refit(learning: Learning) -> Task:
             v, y, beginning, start, current.solution.m, learning.pace
         )))
     result = yield from with_walk(v, y, most_likely(results), learning.pace)
-    if len(v) <= SEARCHED and around.prior is None:
+    if len(v) <= learning.searched and around.prior is None:
         # The gap of a short record may be one of several.
         other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
         if other is not None and learning.usable(other) is not None:
@@ -91,11 +90,12 @@ def _shortened(
     fit, solution, _ = current
     if fit.length < LONGEST:
         if around.error.count:
-            # Where the play began costs as many unknowns as the error of G has.
+            # Where the play began costs as many unknowns as the error of G has. What that did
+            # has to die out as well.
             v, _ = record.since(record.first)
-            unknown = fit.start.forgotten_after(v)
-            if unknown <= BEGINNING * len(v):
-                return around, fit.start_after(v[:unknown]), record.first + unknown
+            gone = fit.start.forgotten_after(v) + PAST * around.model.memory
+            if gone <= BEGINNING * len(v):
+                return around, fit.start_after(v[:gone]), record.first + gone
         return around, fit.start, record.first
     gone = LONGEST // 3
     v, y = record.since(record.first)
