@@ -138,18 +138,20 @@ def test_limits_of_the_scale_are_kept() -> None:
     assert problem.posterior(most=0.01).scale <= 0.01 / 0.7
 
 
-def test_a_prior_that_is_absorbed_is_one_more_measurement() -> None:
+def test_a_prior_is_one_more_measurement() -> None:
     problem = Problem(5, 0.0, 0.1, 0.1)
     rng = np.random.default_rng(6)
     root = rng.standard_normal((2, 2))
     mean, cov = rng.standard_normal(2), 1e-3 * (root @ root.T + np.eye(2))
     triangle = Triangle(np.full(BASE, VAGUE))
-    triangle.absorb(slice(1, 3), mean, cov, problem.told)
     triangle.append(problem.x[:, :BASE], problem.y, float(ROWS))
-    found = triangle.posterior(BASE, SLOPE, np.zeros(0), problem.told, 0.0, np.inf)
+    # In units of the noise that the rows tell, whatever was told.
+    noise = triangle.posterior(BASE, SLOPE, np.zeros(0), problem.told, 0.0, np.inf).noise_std
+    informed = triangle.informed(slice(1, 3), mean, cov, problem.told)
+    found = informed.posterior(BASE, SLOPE, np.zeros(0), problem.told, 0.0, np.inf)
     information = problem.x[:, :BASE].T @ problem.x[:, :BASE] + VAGUE**2 * np.eye(BASE)
     target = problem.x[:, :BASE].T @ problem.y
-    of_prior = np.linalg.inv(cov) * problem.told**2
+    of_prior = np.linalg.inv(cov) * noise**2
     information[1:, 1:] += of_prior
     target[1:] += of_prior @ mean
     assert found.mean == pytest.approx(np.linalg.solve(information, target), abs=1e-9)

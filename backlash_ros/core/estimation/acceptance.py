@@ -19,13 +19,19 @@ def usable(result: Fitted, bounds: Bounds, share: float = 1.0) -> Crossings | No
     share: of the usual deviations that is allowed.
     """
     found = result.solution.crossings
-    if found is None or not found.std_m <= share * PRECISE_SLOPE * found.m:
-        return None
-    if not found.std_gap <= share * largest_gap_std(found.gap, result.fit.swing):
+    if found is None or not is_precise(found, result.fit.swing, share):
         return None
     values = (found.m, found.c_r, found.c_l)
     outside = outside_bounds(values, (found.std_m, found.std_c_r, found.std_c_l), bounds)
     return None if any(outside) else found
+
+
+def is_precise(found: Crossings, swing: float, share: float = 1.0) -> bool:
+    """Whether slope and gap are known well enough where v swings by so much; share: as above."""
+    return (
+        found.std_m <= share * PRECISE_SLOPE * found.m
+        and found.std_gap <= share * largest_gap_std(found.gap, swing)
+    )
 
 
 def largest_gap_std(gap: float, swing: float) -> float:

@@ -13,7 +13,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.acceptance import usable
+from backlash_ros.core.estimation.acceptance import is_precise, usable
 from backlash_ros.core.estimation.constants import (
     BLOCK,
     FIRST_SEARCH,
@@ -24,7 +24,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
     UNDECIDED,
 )
-from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.crossings import Crossings, crossings_of
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.play import Start
 from backlash_ros.core.estimation.prior import Prior, drifted
@@ -63,7 +63,8 @@ class Learning:
     refit_at: length of the record at which all of it is fitted anew; moved_at: from which a gap
     that moved is reason to do so. contradicted_from: sample from which the fit does not hold;
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
-    again. refitted: whether it was fitted anew since the record contradicts itself.
+    again. refitted: whether it was fitted anew since the record contradicts itself. unconfirmed:
+    what was learned before, as long as the samples merely do not deny it.
     """
 
     bounds: Bounds
@@ -82,6 +83,7 @@ class Learning:
     consistent: int = 0
     next_try: int = 0
     refitted: bool = False
+    unconfirmed: Prior | None = None
 
     @property
     def fit(self) -> Fitted:
@@ -135,6 +137,15 @@ class Learning:
         wider = np.any(np.diag(found.cov) > np.diag(held))
         return bool(wider) and self.usable(self.fit, REPLACING) is None
 
+    def stands_alone(self, prior: Prior) -> bool:
+        """Whether the samples of the fit suffice for an estimate without this prior of theirs."""
+        solution = self.fit.solution
+        information = np.linalg.inv(solution.theta_cov) - np.linalg.inv(prior.cov)
+        if not np.linalg.eigvalsh(information)[0] > 0.0:
+            return False
+        alone = crossings_of(solution.theta, np.linalg.inv(information))
+        return alone is not None and is_precise(alone, self.fit.fit.swing, REPLACING)
+
     def drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""
         found = solution.crossings
@@ -152,11 +163,13 @@ class Learning:
         self.acquisition = Acquisition(self.record.end + FIRST_SEARCH, inherited)
         self.refit_at, self.moved_at = 0.0, 0
         self.refitted = False
-        self.contradicted_from = None
+        self.contradicted_from = self.unconfirmed = None
 
     def go_on_from(self, result: Fitted, first: int) -> bool:
         """Go on from this fit of the record from sample `first` on; it is to be published."""
         self.current, self.around = result, result.around
+        if result.around.prior is not self.unconfirmed:
+            self.unconfirmed = None
         self.record.forget_before(first)
         self.refit_at = min(GROWTH * result.fit.length, LONGEST)
         self.moved_at = result.fit.length + BLOCK[1]

@@ -226,7 +226,7 @@ class MovingHorizon:
             return reason
         if self._following.since_motion > self.model.memory:
             return Status.NOT_EXCITED
-        return Status.TRACKING
+        return Status.ACQUIRING if self._learning.unconfirmed is not None else Status.TRACKING
 
     # --- after the command -----------------------------------------------------------------------
 
@@ -281,6 +281,8 @@ class MovingHorizon:
         else:
             if learning.contradicted_from is None:
                 learning.reason = Status.TRACKING
+            if learning.unconfirmed is not None and learning.stands_alone(learning.unconfirmed):
+                learning.unconfirmed = None
             m, c_r, c_l = learning.bounds.project(found.m, found.c_r, found.c_l)
             self.covariance = found.cov
             self.estimate = Estimate(

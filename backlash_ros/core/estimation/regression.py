@@ -64,12 +64,12 @@ class Triangle:
         self.r = np.triu(factored[:size])
         self.count += count
 
-    def absorb(self, where: slice, mean: Array, cov: Array, noise_std: float) -> None:
-        """Take in a prior of some unknowns, in units of the noise."""
-        root = np.linalg.inv(np.linalg.cholesky(cov)) * noise_std
+    def informed(self, where: slice, mean: Array, cov: Array, told_std: float) -> Triangle:
+        """The same with a prior of these unknowns: mean (k,), covariance (k, k)."""
+        root = np.linalg.inv(np.linalg.cholesky(cov)) * self._noise(told_std)
         rows = np.zeros((len(mean), len(self.r) - 1))
         rows[:, where] = root
-        self.append(rows, root @ mean, 0.0)
+        return self._with_rows(rows, root @ mean)
 
     def without(self, column: int) -> Triangle:
         """The same where this unknown is 0."""
@@ -88,18 +88,24 @@ class Triangle:
 
         std: their deviation, around 0.
         """
-        size = len(self.r) - 1
-        sigma = sqrt(
-            (float(self.r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2)
-            / (max(self.count - size, 0.0) + NOISE_WEIGHT)
-        )
-        count = where.stop - where.start
-        rows = np.zeros((count, size))
+        sigma, count = self._noise(told_std), where.stop - where.start
+        rows = np.zeros((count, len(self.r) - 1))
         rows[:, where] = np.eye(count) * (sigma / std)
-        other = Triangle(np.zeros(size))
-        other.r, other.count = self.r, self.count
-        other.append(rows, np.zeros(count), 0.0)
+        other = self._with_rows(rows, np.zeros(count))
         return other, count * log(sigma / std) - other.log_precision(where.start, where.stop)
+
+    def _noise(self, told_std: float) -> float:
+        """Deviation of the noise, as far as the rows tell it without a prior."""
+        size = len(self.r) - 1
+        squares = float(self.r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2
+        return sqrt(squares / (max(self.count - size, 0.0) + NOISE_WEIGHT))
+
+    def _with_rows(self, rows: Array, y: Array) -> Triangle:
+        """The same with rows that count for no sample."""
+        other = Triangle(np.zeros(len(self.r) - 1))
+        other.r, other.count = self.r, self.count
+        other.append(rows, y, 0.0)
+        return other
 
     def posterior(
         self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,

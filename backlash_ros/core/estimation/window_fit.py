@@ -64,9 +64,6 @@ class WindowFit:
         self._rows: Array = np.empty((0, self.layout.unknowns))
         self._y: Array = np.empty(0)
         self._triangle = Triangle(self._vague(*reach))
-        prior = around.prior
-        if prior is not None:
-            self._triangle.absorb(self.layout.theta, prior.theta, prior.cov, around.told_std)
 
     @property
     def swing(self) -> float:
@@ -176,7 +173,11 @@ class WindowFit:
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
-        triangle, offset = self._triangle, 0.0
+        triangle, offset, prior = self._triangle, 0.0, self.around.prior
+        if prior is not None:
+            triangle = triangle.informed(
+                layout.theta, prior.theta, prior.cov, self.around.told_std
+            )
         if layout.ramps:
             step = (walk or self.around.walk) / sqrt(layout.ramps)
             triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
