@@ -24,7 +24,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
     UNDECIDED,
 )
-from backlash_ros.core.estimation.crossings import Crossings, crossings_of
+from backlash_ros.core.estimation.crossings import Crossings
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.play import Start
 from backlash_ros.core.estimation.prior import Prior, drifted
@@ -137,14 +137,12 @@ class Learning:
         wider = np.any(np.diag(found.cov) > np.diag(held))
         return bool(wider) and self.usable(self.fit, REPLACING) is None
 
-    def stands_alone(self, prior: Prior) -> bool:
-        """Whether the samples of the fit suffice for an estimate without this prior of theirs."""
-        solution = self.fit.solution
-        information = np.linalg.inv(solution.theta_cov) - np.linalg.inv(prior.cov)
-        if not np.linalg.eigvalsh(information)[0] > 0.0:
-            return False
-        alone = crossings_of(solution.theta, np.linalg.inv(information))
-        return alone is not None and is_precise(alone, self.fit.fit.swing, REPLACING)
+    @property
+    def stands_alone(self) -> bool:
+        """Whether the samples of the fit suffice for its estimate without a prior."""
+        fit = self.fit.fit
+        found = fit.solve(alone=True).crossings
+        return found is not None and is_precise(found, fit.swing, REPLACING)
 
     def drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""

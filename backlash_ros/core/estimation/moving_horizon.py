@@ -281,7 +281,7 @@ class MovingHorizon:
         else:
             if learning.contradicted_from is None:
                 learning.reason = Status.TRACKING
-            if learning.unconfirmed is not None and learning.stands_alone(learning.unconfirmed):
+            if learning.unconfirmed is not None and learning.stands_alone:
                 learning.unconfirmed = None
             m, c_r, c_l = learning.bounds.project(found.m, found.c_r, found.c_l)
             self.covariance = found.cov

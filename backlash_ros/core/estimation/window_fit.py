@@ -163,10 +163,13 @@ class WindowFit:
         motion = sqrt(solution.correlation) * solution.rms
         return motion / scale if scale > 0.0 else inf
 
-    def solve(self, walk: float | None = None, leaking: bool = False) -> Solution:
+    def solve(
+        self, walk: float | None = None, leaking: bool = False, alone: bool = False,
+    ) -> Solution:
         """The solution for all samples so far.
 
-        walk: instead of that of `around`. leaking: where G integrates, it leaks for sure.
+        walk: instead of that of `around`. leaking: where G integrates, it leaks for sure. alone:
+        without the prior of theta.
         """
         layout, gap = self.layout, self.start.gap
         spreads: Array = np.ones(layout.errors)
@@ -174,7 +177,7 @@ class WindowFit:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
         triangle, offset, prior = self._triangle, 0.0, self.around.prior
-        if prior is not None:
+        if prior is not None and not alone:
             triangle = triangle.informed(
                 layout.theta, prior.theta, prior.cov, self.around.told_std
             )
