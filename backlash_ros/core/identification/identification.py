@@ -1,0 +1,371 @@
+"""From v and y to backlash, G(z), delay and noise, with deviations and all that keeps them apart.
+
+    search the gap with a general G  ->  compare orders, delays, integrator on held-out samples
+    ->  search the gap again with the one that is taken  ->  deviations, judgement
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field, replace
+from math import nan
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import GATE
+from backlash_ros.core.estimation.record_fit import frequencies_of
+from backlash_ros.core.identification import judgement, uncertainty
+from backlash_ros.core.identification.order_selection import (
+    Compared,
+    compare,
+    effective_rows,
+    equal_delays,
+    held_out_rms,
+    lag_one,
+    predicted,
+    selected,
+)
+from backlash_ros.core.identification.output_error import (
+    Fit,
+    Point,
+    Samples,
+    Structure,
+    fit,
+    linear_columns,
+)
+from backlash_ros.core.identification.separable_search import Profile, profile, search
+from backlash_ros.core.identification.uncertainty import Covariance
+
+Array = NDArray[np.float64]
+T = TypeVar('T')
+
+GENERAL_ORDER = 3  # poles of the G with which the gap is searched first
+FEWEST = 8  # samples per unknown below which nothing is fitted
+SEARCHED_AT_MOST = 6000  # samples, of a longer record the busiest ones, that searches look at
+CANDIDATES = 2  # gaps with which the structures are compared
+SAME = 0.005  # relative distance of two gaps that are one
+PROFILE_GAPS = 40  # gaps of the profile over the swing of v
+NEAR = np.linspace(0.8, 1.2, 17)  # gaps around the best one, relative
+OUTLYING = 0.2  # share of the samples that may be outliers
+NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
+FEW_VALUES = 0.5  # distinct values of y per sample, more of which are not quantised
+LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
+TINY = float(np.finfo(float).tiny)
+FREQUENCIES = 60  # at which the response is told
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is compared. integrators: of G, without and with one. slope: m, where it is known, else
+    1: m and the gain of G cannot be told apart. held_out: share of the record, its last."""
+
+    orders: Sequence[int] = (1, 2, 3, 4)
+    delays: Sequence[int] = (0, 1, 2, 3)
+    integrators: Sequence[bool] = (False, True)
+    slope: float = 1.0
+    held_out: float = 1.0 / 3.0
+
+
+class HeldOut(NamedTuple):
+    """Prediction of samples that were not fitted. first: index of the first of them; simulated
+    (M,); rms of the error; trained: rms of the fit to the samples before."""
+
+    first: int
+    simulated: Array
+    rms: float
+    trained: float
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What was found. u = m (p - c_r), y = z^-delay numerator / denominator u + noise.
+
+    std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain of G. delays: that
+    explain y equally well. response_std: relative deviation of G at `frequencies` [rad/sample].
+    uncertainty: of G, as the parameter plant.uncertainty. reasons: why it is of no use, remarks:
+    what to know, a sentence each. fit, covariance, compared, profile, held_out: what pictures show;
+    None where nothing was fitted. outliers: samples of y that were left out.
+    """
+
+    sample_period: float
+    v: Array
+    y: Array
+    m: float = nan
+    gap: float = nan
+    c_r: float = nan
+    c_l: float = nan
+    std: dict[str, float] = field(default_factory=dict)
+    numerator: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    delay: int = 0
+    delays: tuple[int, ...] = ()
+    integrator: bool = False
+    noise_std: float = nan
+    quantum: float = 0.0
+    correlation: float = nan
+    ljung_box: float = nan
+    frequencies: Array = field(default_factory=lambda: np.empty(0))
+    response_std: Array = field(default_factory=lambda: np.empty(0))
+    uncertainty: float = nan
+    outliers: int = 0
+    reasons: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    samples: Samples | None = None
+    fit: Fit | None = None
+    covariance: Covariance | None = None
+    compared: tuple[Compared, ...] = ()
+    chosen: Compared | None = None
+    profile: Profile | None = None
+    held_out: HeldOut | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether it may be put into the controller."""
+        return not self.reasons
+
+
+def identify(v: Array, y: Array, sample_period: float, options: Options | None = None,
+             ) -> Identification:
+    """Identify v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
+
+    Raises ValueError for arrays that do not fit together or hold what is no number.
+    """
+    work = identifying(v, y, sample_period, options or Options())
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            result: Identification = done.value
+            return result
+
+
+def identifying(
+    v: Array, y: Array, sample_period: float, options: Options,
+) -> Generator[str, None, Identification]:
+    """The same in pieces of some ten milliseconds; yields what is being done."""
+    v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
+    _check(v, y)
+    nothing = _nothing(v, y, sample_period, options)
+    if nothing is not None:
+        return nothing
+    first = max(options.delays) + 1
+    part = _busiest(v, first)
+    searched = Samples(v[part], y[part], first)
+    general = Structure(GENERAL_ORDER, 0, False, GENERAL_ORDER + max(options.delays))
+    found = yield from _named('searching the gap', search(searched, general))
+    wild = _outliers(searched, found[0])
+    if wild.any():
+        searched = searched.without(wild)
+        found = yield from _named('searching the gap again', search(searched, general))
+    candidates = _distinct(found)[:CANDIDATES]
+    compared = yield from _named('comparing orders and delays', compare(
+        searched, [one.point for one in candidates], options.orders, options.delays,
+        options.integrators, options.held_out,
+    ))
+    chosen = selected(compared)
+    best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
+    samples, outliers = searched, int(wild.sum())
+    if len(v) > len(searched.v):
+        samples = Samples(v, y, first)
+        best = _on_all(samples, best)
+        wild = _outliers(samples, best)
+        outliers = int(wild.sum())
+        if outliers:
+            samples = samples.without(wild)
+            best = fit(samples, best.structure, best.point)
+    yield 'judging'
+    return _described(
+        samples, searched, best, compared, chosen, rivals, curve, outliers,
+        Identification(sample_period, v, y), options,
+    )
+
+
+def _check(v: Array, y: Array) -> None:
+    if v.ndim != 1 or v.shape != y.shape:
+        raise ValueError(f'v {v.shape} and y {y.shape} must be of one length')
+    if not np.isfinite(v).all():
+        raise ValueError('v must be finite in every sample')
+    if np.isinf(y).any():
+        raise ValueError('y must be finite, or nan where it was lost')
+
+
+def _nothing(v: Array, y: Array, sample_period: float, options: Options) -> Identification | None:
+    """Where there is nothing to fit: why."""
+    first = max(options.delays) + 1
+    known = int(np.isfinite(y[first:]).sum())
+    unknowns = Structure(max(options.orders), 0, False).unknowns
+    reason = ''
+    if known < FEWEST * unknowns:
+        reason = (
+            f'{known} samples of y are too few for an order of up to {max(options.orders)}, '
+            f'{FEWEST * unknowns} are needed: record for longer, or limit --order'
+        )
+    elif np.ptp(v) == 0.0:
+        reason = 'v stood still: move it to and fro, past the gap'
+    elif np.nanmax(y) == np.nanmin(y):
+        reason = 'y stood still: let v swing wider than the gap, and see that y is measured'
+    return Identification(sample_period, v, y, reasons=(reason,)) if reason else None
+
+
+def _named(stage: str, work: Generator[None, None, T]) -> Generator[str, None, T]:
+    """The pieces of a generator under the name of what is done."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            result: T = done.value
+            return result
+        yield stage
+
+
+def _busiest(v: Array) -> slice:
+    """The stretch for the search in which v moves most."""
+    if len(v) <= SEARCHED_AT_MOST:
+        return slice(0, len(v))
+    path = np.append(0.0, np.cumsum(np.abs(np.diff(v))))
+    first = int(np.argmax(path[SEARCHED_AT_MOST - 1:] - path[:len(v) - SEARCHED_AT_MOST + 1]))
+    return slice(first, first + SEARCHED_AT_MOST)
+
+
+def _outliers(samples: Samples, found: Fit) -> NDArray[np.bool_]:
+    """Readings that are none, by the bulk of the residuals; none at all where they are many."""
+    residual = np.abs(samples.y - found.simulated)
+    known = residual[np.isfinite(residual)]
+    wild = residual > GATE * max(NORMAL_MAD * float(np.median(known)), _quantum(samples.y))
+    return wild if np.count_nonzero(wild) <= OUTLYING * len(known) else np.zeros_like(wild)
+
+
+def _distinct(found: Sequence[Fit]) -> list[Fit]:
+    """Those whose gaps differ from all better ones."""
+    kept: list[Fit] = []
+    for one in found:
+        gap = one.point.gap
+        if all(abs(gap - other.point.gap) > SAME * other.point.gap for other in kept):
+            kept.append(one)
+    return kept
+
+
+def _refined(
+    samples: Samples, chosen: Compared,
+) -> Generator[None, None, tuple[Fit, list[tuple[float, float]], Profile]]:
+    """The best fit of the chosen structure, other minima (gap, how far behind), the profile."""
+    structure, swing = chosen.structure, samples.play.swing
+    best = chosen.fit
+    whole = np.append(0.0, np.geomspace(1e-3, 0.99, PROFILE_GAPS) * swing)
+    curve = yield from profile(samples, structure, whole, best)
+    around = best.point.gap * NEAR
+    near = yield from profile(samples, structure, around[(around > 0.0) & (around < swing)], best)
+    minima: list[Fit] = []
+    for minimum in [*near.minima()[:3], *curve.minima()[:3]]:
+        minima.append(fit(samples, structure, minimum.point))
+        yield
+    best = min([best, *minima], key=lambda one: one.squares)
+    rows = effective_rows(samples, best)
+    rivals = sorted(
+        (behind, one.point.gap) for one in minima
+        if abs(one.point.gap - best.point.gap) > judgement.APART * best.point.gap
+        for behind in [0.5 * rows * float(np.log(one.squares / max(best.squares, TINY)))]
+    )
+    gaps = np.concatenate([curve.gaps, near.gaps, [best.point.gap]])
+    order = np.argsort(gaps, kind='stable')
+    fits = [*curve.fits, *near.fits, best]
+    merged = Profile(
+        gaps[order], np.array([fits[k].squares for k in order]), [fits[k] for k in order]
+    )
+    return best, [(gap, behind) for behind, gap in rivals], merged
+
+
+def _on_all(samples: Samples, best: Fit) -> Fit:
+    """The same structure on a longer record, at whose begin p may be anywhere in the gap."""
+    v0, gap = float(samples.v[0]), best.point.gap
+    fits = [
+        fit(samples, best.structure, Point(best.point.a, gap, v0 + share * gap))
+        for share in (0.0, 0.5, 1.0)
+    ]
+    return min(fits, key=lambda one: one.squares)
+
+
+def _described(
+    samples: Samples, searched: Samples, best: Fit, compared: Sequence[Compared],
+    chosen: Compared, rivals: list[tuple[float, float]], curve: Profile, outliers: int,
+    given: Identification, options: Options,
+) -> Identification:
+    """Everything there is to say of the best fit."""
+    covariance = uncertainty.covariance_of(samples, best)
+    crossings = uncertainty.crossings_covariance(best, covariance)
+    gap_var, c_r_var = float(crossings[0, 0]), float(crossings[1, 1])
+    c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
+    band = frequencies_of(best.simulated)
+    frequencies = np.geomspace(max(band[0], np.pi / samples.count), max(band[1], 1e-3), FREQUENCIES)
+    spread = uncertainty.response_std(best, covariance, frequencies)
+    gain_std = float(uncertainty.response_std(best, covariance, np.zeros(1))[0])
+    residual = samples.y - best.simulated
+    rows = effective_rows(samples, best)
+    still = _still(samples, best)
+    correlation = max(lag_one(samples, best) - 3.0 / np.sqrt(len(samples.known)), 0.0)
+    held_out = _held_out(searched, chosen, options.held_out)
+    numerator = best.numerator / options.slope
+    evidence = judgement.Evidence(
+        samples, best, float(np.sqrt(gap_var)), float(np.sqrt(c_r_var)), gain_std,
+        float(spread.max()), 0.5 * rows * float(np.log(still / max(best.squares, TINY))),
+        correlation, held_out.rms, held_out.trained, rivals,
+        float(np.abs(uncertainty.response(best, np.sqrt(frequencies[:1] * frequencies[-1:])))[0]),
+        _quantum(samples.y), np.roots(best.denominator).astype(complex),
+        np.roots(numerator).astype(complex),
+    )
+    freedom = max(len(samples.known) - best.structure.unknowns, 1)
+    return replace(
+        given, m=options.slope, gap=best.point.gap, c_r=best.c_r, c_l=best.c_r - best.point.gap,
+        std={
+            'm': options.slope * gain_std, 'gap': float(np.sqrt(gap_var)),
+            'c_r': float(np.sqrt(c_r_var)), 'c_l': float(np.sqrt(c_l_var)),
+        },
+        numerator=tuple(numerator.tolist()), denominator=tuple(best.denominator.tolist()),
+        delay=best.structure.delay, delays=tuple(equal_delays(compared, chosen)),
+        integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
+        quantum=evidence.quantum, correlation=correlation,
+        ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
+        uncertainty=_as_parameter(float(spread.max())), outliers=outliers,
+        reasons=tuple(judgement.reasons(evidence)), remarks=tuple(judgement.remarks(evidence)),
+        samples=samples, fit=best, covariance=covariance, compared=tuple(compared),
+        chosen=chosen, profile=curve, held_out=held_out,
+    )
+
+
+def _still(samples: Samples, best: Fit) -> float:
+    """Squares left over by a u that stands still, through the same G."""
+    structure = best.structure
+    columns = linear_columns(samples, structure, best.point.a, best.play.p)
+    columns = columns[samples.known, structure.numerator_taps:]
+    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
+    basis = np.linalg.qr(columns / np.where(scale > 0.0, scale, 1.0))[0]
+    left = samples.target - basis @ (basis.T @ samples.target)
+    return max(float(left @ left), TINY)
+
+
+def _held_out(samples: Samples, chosen: Compared, share: float) -> HeldOut:
+    """What the structure, fitted to the first part alone, predicts of the last."""
+    cut = samples.last - round(share * samples.count)
+    later = samples.part(cut, samples.last)
+    trained = chosen.trained
+    return HeldOut(cut, predicted(trained, later), held_out_rms(trained, later), trained.rms)
+
+
+def _quantum(y: Array) -> float:
+    """Step of a quantised y (N,), 0 where it is not."""
+    values = np.unique(y[np.isfinite(y)])
+    if len(values) < 2 or len(values) > FEW_VALUES * len(y):
+        return 0.0
+    steps = np.diff(values)
+    step = float(steps[steps > 1e-9 * (values[-1] - values[0])].min())
+    whole = (values - values[0]) / step
+    return step if np.abs(whole - np.round(whole)).max() < 0.05 else 0.0
+
+
+def _as_parameter(spread: float) -> float:
+    """plant.uncertainty for a relative deviation of G: of two deviations, one digit, upwards."""
+    value = min(max(2.0 * spread, LEAST_UNCERTAINTY), 1.0)
+    digit = 10.0 ** np.floor(np.log10(value))
+    return float(min(round(np.ceil(value / digit - 1e-9) * digit, 6), 1.0))

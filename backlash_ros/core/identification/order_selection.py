@@ -1,0 +1,153 @@
+"""Which order, delay and integrator: compared on samples that the fit has not seen.
+
+Structures whose held-out error is within a few percent of the least are equally good predictors.
+Among them the least
+
+    N' log(squares) + unknowns log(N)          (BIC over all samples)
+
+is taken, with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual: what repeats
+itself from sample to sample, as the error of a quantised y does, speaks less often.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core.identification.output_error import (
+    Fit,
+    Point,
+    Samples,
+    Structure,
+    fit,
+)
+from backlash_ros.core.identification.starting_models import steiglitz_mcbride
+
+Array = NDArray[np.float64]
+
+WITHIN = 1.05  # times the least held-out error: equally good
+EXTRA_POLES = (0.3, 0.85)  # where one more pole than in the order below may begin
+PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
+
+
+class Compared(NamedTuple):
+    """One structure. trained: fitted to the first part, with which held_out, the rms of the error on
+    the last part, is made. fit: to all samples. criterion: as above, the smaller the better.
+    """
+
+    structure: Structure
+    held_out: float
+    trained: Fit
+    fit: Fit
+    criterion: float
+
+
+def compare(
+    samples: Samples, candidates: Sequence[Point], orders: Sequence[int], delays: Sequence[int],
+    integrators: Sequence[bool], held_out: float,
+) -> Generator[None, None, list[Compared]]:
+    """Fit every structure, from gaps and starts that are about right; yields between them.
+
+    held_out: share at the end of the record that is compared on.
+    """
+    cut = samples.last - round(held_out * samples.count)
+    train, later = samples.part(samples.first, cut), samples.part(cut, samples.last)
+    found: list[tuple[float, Fit, Fit]] = []
+    for integrator in integrators:
+        for delay in delays:
+            below: Fit | None = None
+            for order in orders:
+                structure = Structure(order, delay, integrator)
+                below = _fit_from(train, structure, candidates, below)
+                whole = fit(samples, structure, below.point)
+                found.append((held_out_rms(below, later), below, whole))
+                yield
+    best = min((whole for _, _, whole in found), key=lambda whole: whole.squares)
+    rows = effective_rows(samples, best)
+    smallest = np.finfo(float).tiny
+    return [
+        Compared(
+            whole.structure, rms, trained, whole,
+            rows * float(np.log(max(whole.squares, smallest)))
+            + whole.structure.unknowns * float(np.log(len(samples.known))),
+        )
+        for rms, trained, whole in found
+    ]
+
+
+def selected(compared: Sequence[Compared]) -> Compared:
+    """The structure that is taken."""
+    least = min(one.held_out for one in compared)
+    good = [one for one in compared if one.held_out <= WITHIN * least]
+    return min(good, key=lambda one: one.criterion)
+
+
+def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:
+    """Delays of its order that explain y as well as the chosen one."""
+    return sorted(
+        one.structure.delay for one in compared
+        if one.structure._replace(delay=0) == chosen.structure._replace(delay=0)
+        and one.criterion <= chosen.criterion + PLATEAU
+    )
+
+
+def _fit_from(
+    samples: Samples, structure: Structure, candidates: Sequence[Point], below: Fit | None,
+) -> Fit:
+    fits: list[Fit] = []
+    for point in candidates:
+        p = samples.play.output(point.gap, point.start).p
+        for a in steiglitz_mcbride(samples, structure, p)[:1]:
+            fits.append(fit(samples, structure, point._replace(a=a)))
+    if below is not None and below.structure.free_poles == structure.free_poles - 1:
+        for pole in EXTRA_POLES:
+            a = np.convolve(np.append(1.0, below.point.a), (1.0, -pole))[1:]
+            fits.append(fit(samples, structure, below.point._replace(a=a)))
+    return min(fits, key=lambda found: found.squares)
+
+
+def held_out_rms(found: Fit, later: Samples) -> float:
+    """Error of what the fit predicts for later samples."""
+    residual = later.target - predicted(found, later)[later.known]
+    rms = float(np.sqrt(np.mean(residual**2)))
+    return rms if np.isfinite(rms) else inf
+
+
+def predicted(found: Fit, later: Samples) -> Array:
+    """Simulation over samples (M,), begun in the state and with the offset that fit them best."""
+    structure, count = found.structure, later.count
+    inputs = np.zeros((2, count))
+    p = later.play.output(found.point.gap, found.point.start).p
+    inputs[0] = later.delayed(p, structure.delay) - found.centre
+    inputs[1, 0] = 1.0
+    denominator = found.denominator
+    simulated = lfilter(found.numerator, denominator, inputs[0])
+    impulse = lfilter([1.0], denominator, inputs[1])
+    columns = np.zeros((count, 1 + structure.state_terms))
+    columns[:, 0] = np.cumsum(impulse)
+    for i in range(structure.state_terms):
+        columns[i:, 1 + i] = impulse[:count - i]
+    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
+    columns /= np.where(scale > 0.0, scale, 1.0)
+    error = later.target - simulated[later.known]
+    best = np.linalg.lstsq(columns[later.known], error, rcond=None)[0]
+    return np.asarray(simulated + columns @ best)
+
+
+def effective_rows(samples: Samples, found: Fit) -> float:
+    """N' of the formula above."""
+    r = lag_one(samples, found)
+    return len(samples.known) * (1.0 - r) / (1.0 + r)
+
+
+def lag_one(samples: Samples, found: Fit) -> float:
+    """Correlation of successive residuals, at least 0."""
+    residual = samples.y - found.simulated
+    pairs = residual[1:] * residual[:-1]
+    energy = float(np.nanmean(residual**2))
+    return min(max(float(np.nanmean(pairs)) / energy, 0.0), 0.99) if energy > 0.0 else 0.0

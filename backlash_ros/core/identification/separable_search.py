@@ -1,0 +1,93 @@
+"""Outer search over the gap: for each gap the best start and model, then the best few set free.
+
+The squares left over have a local minimum wherever a turn of p passes a sample: a search from one
+start alone would end in any of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.identification.output_error import Fit, Point, Samples, Structure, fit
+from backlash_ros.core.identification.starting_models import steiglitz_mcbride
+
+Array = NDArray[np.float64]
+
+GAPS = 48  # that the whole swing of v is searched with
+SMALLEST = 2e-3  # of them, in swings of v
+NEAR, NEAR_GAPS = 0.2, 13  # reach around a minimum, relative, and gaps that it is searched with
+STARTS = (0.0, 0.5, 1.0)  # places in the gap at which p may begin
+AFRESH = 3  # every so many gaps a model is looked for anew
+STEPS = 3  # of the model per gap; it goes on from that of the gap before
+MINIMA = 3  # that are set free
+
+
+class Profile(NamedTuple):
+    """Squares left over for each gap, with everything else free. fits: of the same gaps."""
+
+    gaps: Array
+    squares: Array
+    fits: Sequence[Fit]
+
+    @property
+    def best(self) -> Fit:
+        """The fit with the least squares."""
+        return self.fits[int(np.argmin(self.squares))]
+
+    def minima(self) -> list[Fit]:
+        """The fits at the local minima, the best first."""
+        left = np.append(np.inf, self.squares[:-1])
+        right = np.append(self.squares[1:], np.inf)
+        found = np.flatnonzero((self.squares <= left) & (self.squares <= right))
+        return [self.fits[i] for i in found[np.argsort(self.squares[found], kind='stable')]]
+
+
+def search(samples: Samples, structure: Structure) -> Generator[None, None, list[Fit]]:
+    """Fits with everything free from the best minima, the best first; yields between pieces."""
+    swing = samples.play.swing
+    gaps = np.append(0.0, np.geomspace(SMALLEST, 0.98, GAPS) * swing)
+    first = yield from profile(samples, structure, gaps)
+    found: list[Fit] = []
+    for minimum in first.minima()[:MINIMA]:
+        around = minimum.point.gap * np.linspace(1.0 - NEAR, 1.0 + NEAR, NEAR_GAPS)
+        around = around[around < swing]
+        if not len(around):
+            found.append(minimum)
+            continue
+        near = yield from profile(samples, structure, around, minimum)
+        found += [fit(samples, structure, better.point) for better in near.minima()[:2]]
+        yield
+    return sorted(found, key=lambda fit: fit.squares)
+
+
+def profile(
+    samples: Samples, structure: Structure, gaps: Array, known: Fit | None = None,
+) -> Generator[None, None, Profile]:
+    """The best fit for each gap. known: of which the model is a good start."""
+    v0 = float(samples.v[0])
+    fits: list[Fit] = []
+    model = None if known is None else known.point.a
+    for number, gap in enumerate(gaps.tolist()):
+        best: Fit | None = None
+        for share in STARTS if gap > 0.0 else STARTS[:1]:
+            start = v0 + share * gap
+            models = [] if model is None else [model]
+            if best is not None:
+                models = [best.point.a]
+            elif known is not None or number % AFRESH == 0:
+                p = samples.play.output(gap, start).p
+                models += steiglitz_mcbride(samples, structure, p)[:1]
+            for a in models:
+                found = fit(samples, structure, Point(a, gap, start), gap_free=False,
+                            iterations=STEPS)
+                if best is None or found.squares < best.squares:
+                    best = found
+        assert best is not None
+        model = best.point.a
+        fits.append(best)
+        yield
+    return Profile(gaps, np.array([found.squares for found in fits]), fits)

@@ -1,0 +1,87 @@
+"""First models for a known play output: Steiglitz-McBride, from several first filters.
+
+A y = B p + e + X, with p and y filtered by 1/A of the step before: what is left is white where the
+noise of y is, so that the poles are not biased as those of a plain ARX fit are.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core.identification.output_error import (
+    Samples,
+    Structure,
+    full_denominator,
+    solve_linear,
+)
+
+Array = NDArray[np.float64]
+
+FIRST_FILTERS = (0.0, 0.7, 0.92, 0.98)  # pole of the first filter, as often as G has poles
+STEPS = 5
+INSIDE = 0.999  # a pole outside is put back to here
+
+
+def steiglitz_mcbride(samples: Samples, structure: Structure, p: Array) -> list[Array]:
+    """Free coefficients of A, the best first; at least one."""
+    tried: list[tuple[float, int, Array]] = []
+    y = _without_losses(samples)
+    for first in FIRST_FILTERS:
+        a = np.atleast_1d(np.poly(np.full(structure.free_poles, first)))[1:]
+        for _ in range(STEPS):
+            squares = solve_linear(samples, structure, a, p).squares
+            tried.append((squares, len(tried), a))
+            better = _refined(samples, structure, a, p, y)
+            if better is None:
+                break
+            a = better
+        else:
+            tried.append((solve_linear(samples, structure, a, p).squares, len(tried), a))
+    return [a for _, _, a in sorted(tried)]
+
+
+def _without_losses(samples: Samples) -> Array:
+    if samples.complete:
+        return samples.y
+    return np.asarray(np.interp(np.arange(samples.count), samples.known, samples.target))
+
+
+def _refined(
+    samples: Samples, structure: Structure, a: Array, p: Array, y: Array,
+) -> Array | None:
+    """One step: the least squares in A and B with everything filtered by 1/A."""
+    count, taps, poles = samples.count, structure.numerator_taps, structure.free_poles
+    if not poles:
+        return None
+    inputs = np.zeros((2, count))
+    inputs[0] = samples.delayed(p, structure.delay) - samples.centre
+    inputs[1, 0] = 1.0
+    moved, impulse = lfilter([1.0], full_denominator(structure, a), inputs)
+    # A y over A: with an integrator in both, 1 - 1/z cancels.
+    filtered = lfilter([1.0], np.append(1.0, a), y)
+    columns = np.zeros((count, poles + taps + 1 + structure.state_terms))
+    for j in range(poles):
+        columns[j + 1:, j] = -filtered[:count - j - 1]
+    for i in range(taps):
+        columns[i:, poles + i] = moved[:count - i]
+    columns[:, poles + taps] = np.cumsum(impulse)
+    for i in range(structure.state_terms):
+        columns[i:, poles + taps + 1 + i] = impulse[:count - i]
+    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
+    scale[scale == 0.0] = 1.0
+    with np.errstate(all='ignore'):
+        solution = np.linalg.lstsq(columns / scale, filtered, rcond=1e-13)[0] / scale
+    a = solution[:poles]
+    return stable(a) if np.isfinite(a).all() else None
+
+
+def stable(a: Array) -> Array:
+    """The same with poles outside of the unit circle put inside."""
+    poles = np.roots(np.append(1.0, a))
+    size = np.abs(poles)
+    if not len(poles) or size.max() <= INSIDE:
+        return a
+    poles = np.where(size > INSIDE, poles / np.maximum(size, 1e-12) * INSIDE, poles)
+    return np.real(np.poly(poles))[1:]
