@@ -41,6 +41,7 @@ setup(
             f'report = {PACKAGE}.tools.report:main',
             f'compare = {PACKAGE}.tools.compare:main',
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
+            f'identify = {PACKAGE}.tools.identify.command:main',
         ],
     },
 )

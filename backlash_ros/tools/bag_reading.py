@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,8 @@ SOURCES: dict[str, dict[str, str]] = {
         name: name for name in ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l')
     },
 }
-ARRAY = 'std_msgs/msg/Float64MultiArray'
+ARRAY, NUMBER = 'std_msgs/msg/Float64MultiArray', 'std_msgs/msg/Float64'
+Wanted = Callable[[str, str], bool]  # whether a topic of this name and type is to be read
 MODEL_LABELS = ('numerator', 'denominator', 'delay_samples')  # by which a renamed one is known
 TRUE_BACKLASH = {'true_m': 'm', 'true_c_r': 'c_r', 'true_c_l': 'c_l'}
 
@@ -79,7 +80,7 @@ def read_bag(
     did within the span. axis: of several, empty for the first one. Raises InputError, in one line,
     for a bag that cannot be read or holds no run.
     """
-    content = _read_content(path)
+    content = _read_content(path, _is_array_topic)
     try:
         tables, note, models = _find_tables(path, content, axis)
     except InputError as error:
@@ -169,19 +170,38 @@ def _median_period(
     return period
 
 
-def _read_content(path: Path) -> _Content:
+def read_plain_numbers(
+    path: Path, ends: Sequence[str],
+) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], str]:
+    """Stamps [ns] and values of each Float64 topic whose name ends like one of these.
+
+    Returns them with what is wrong with the bag, empty if it is complete. Raises InputError.
+    """
+    def wanted(name: str, message_type: str) -> bool:
+        return message_type == NUMBER and _last_part(name) in ends
+
+    content = _read_content(path, wanted)
+    found = {}
+    for name, pairs in sorted(content.messages.items()):
+        messages = [(stamp, float(message.data)) for stamp, message in pairs]
+        stamps = np.array([stamp for stamp, _ in messages], dtype=np.int64)
+        found[name] = stamps.astype(float), np.array([value for _, value in messages])
+    return found, content.damage
+
+
+def _read_content(path: Path, wanted_topic: Wanted) -> _Content:
     if not path.is_dir():
         rule = 'is a file: give the folder of the bag' if path.exists() else 'does not exist'
         raise InputError(f'{path}: {rule}')
     reason = visible_damage(path)
     if not reason:
         try:
-            return _read_complete(path)
+            return _read_complete(path, wanted_topic)
         # Whatever a damaged file makes the library stumble over, the file is damaged.
         except Exception as error:
             reason = f'is damaged ({" ".join(str(error).split()) or type(error).__name__})'
     try:
-        return _read_remains(path, reason)
+        return _read_remains(path, reason, wanted_topic)
     except BagError as error:
         raise InputError(f'{path}: {reason}, and nothing of it can be read: {error}') from None
 
@@ -196,12 +216,12 @@ def _last_part(name: str) -> str:
     return name.rpartition('/')[2]
 
 
-def _read_complete(path: Path) -> _Content:
+def _read_complete(path: Path, wanted_topic: Wanted) -> _Content:
     content = _Content()
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         content.names = {connection.topic for connection in reader.connections}
         wanted = [
-            found for found in reader.connections if _is_array_topic(found.topic, found.msgtype)
+            found for found in reader.connections if wanted_topic(found.topic, found.msgtype)
         ]
         # No choice would be all of them.
         for connection, stamp_ns, raw in reader.messages(wanted) if wanted else ():
@@ -210,12 +230,12 @@ def _read_complete(path: Path) -> _Content:
     return content
 
 
-def _read_remains(path: Path, reason: str) -> _Content:
+def _read_remains(path: Path, reason: str, wanted_topic: Wanted) -> _Content:
     content, types = _Content(), get_typestore(Stores.ROS2_JAZZY)
     remains = open_remains(path)
     first, last, count, garbled = 2**63, 0, 0, 0
     for topic, stamp_ns, raw in remains.messages():
-        if _is_array_topic(topic.name, topic.message_type):
+        if wanted_topic(topic.name, topic.message_type):
             try:
                 message = types.deserialize_cdr(raw, topic.message_type)
             # Whatever the damaged bytes make the library stumble over, the message is lost.

@@ -174,6 +174,12 @@ def write_config(parameters: Parameters, path: Path) -> None:
     write_atomically(path, yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000))
 
 
+def yaml_value(value: Value) -> str:
+    """A value as one line of YAML that every reader takes for the same type."""
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.dump(plain, Dumper=_Dumper, width=10000).removesuffix('...\n').strip()
+
+
 def _tree(parameters: Parameters, written: Sequence[Parameter]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for parameter in written:

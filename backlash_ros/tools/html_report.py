@@ -59,26 +59,37 @@ def render_page(
     summary: as in summary.json. configuration: the effective parameters as YAML, if known.
     """
     parts = [
-        '<!DOCTYPE html>', '<html lang="en">', '<head>', '<meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>', '<body>',
-        '<main>', f'<h1>{escape(title)}</h1>', f'<p class="lead">{headline(summary)}</p>',
+        f'<h1>{escape(title)}</h1>', f'<p class="lead">{headline(summary)}</p>',
         *(f'<p class="warning">{escape(warning)}</p>' for warning in warnings),
         '<section>', _backlash_table(summary), _facts_table(summary), '</section>',
+        *(picture_section(picture) for picture in pictures),
     ]
-    for picture in pictures:
-        encoded = base64.b64encode(picture.data).decode('ascii')
-        parts += [
-            '<section>', f'<h2>{escape(picture.heading)}</h2>', f'<p>{picture.caption}</p>',
-            f'<img alt="{escape(picture.heading)}" src="data:image/png;base64,{encoded}">',
-            '</section>',
-        ]
     if configuration is not None:
         parts += [
             '<section><details><summary>Parameters of this run</summary>',
             f'<pre>{escape(configuration)}</pre></details></section>',
         ]
-    return '\n'.join([*parts, '</main>', '</body>', '</html>', ''])
+    return page(title, parts)
+
+
+def page(title: str, parts: Sequence[str]) -> str:
+    """A page of these parts, which are HTML."""
+    return '\n'.join([
+        '<!DOCTYPE html>', '<html lang="en">', '<head>', '<meta charset="utf-8">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>', '<body>',
+        '<main>', *parts, '</main>', '</body>', '</html>', '',
+    ])
+
+
+def picture_section(picture: Picture) -> str:
+    """A section with a heading, what to see, and the picture itself."""
+    encoded = base64.b64encode(picture.data).decode('ascii')
+    return '\n'.join([
+        '<section>', f'<h2>{escape(picture.heading)}</h2>', f'<p>{picture.caption}</p>',
+        f'<img alt="{escape(picture.heading)}" src="data:image/png;base64,{encoded}">',
+        '</section>',
+    ])
 
 
 def headline(summary: Mapping[str, Any]) -> str:
@@ -110,7 +121,7 @@ def _backlash_table(summary: Mapping[str, Any]) -> str:
             UNITS[name],
         ))
     rows.append(('f', _number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
-    return _table(header, rows)
+    return table(header, rows)
 
 
 def relative_error(final: float, truth: float | None) -> str:
@@ -150,7 +161,8 @@ def _facts_table(summary: Mapping[str, Any]) -> str:
     return f'<table class="facts">{body}</table>'
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of cells that are HTML."""
     head = ''.join(f'<th>{cell}</th>' for cell in header)
     body = ''.join(f'<tr>{"".join(f"<td>{cell}</td>" for cell in row)}</tr>' for row in rows)
     return f'<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>'

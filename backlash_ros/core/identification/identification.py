@@ -50,7 +50,7 @@ PROFILE_GAPS = 40  # gaps of the profile over the swing of v
 NEAR = np.linspace(0.8, 1.2, 17)  # gaps around the best one, relative
 OUTLYING = 0.2  # share of the samples that may be outliers
 NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
-FEW_VALUES = 0.5  # distinct values of y per sample, more of which are not quantised
+FEW_VALUES = 0.8  # distinct values of y per sample, more of which are not quantised
 LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
 TINY = float(np.finfo(float).tiny)
 FREQUENCIES = 60  # at which the response is told
@@ -83,10 +83,12 @@ class Identification:
     """What was found. u = m (p - c_r), y = z^-delay numerator / denominator u + noise.
 
     std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain of G. delays: that
-    explain y equally well. response_std: relative deviation of G at `frequencies` [rad/sample].
+    explain y equally well. response_std: relative deviation of G at `frequencies` [rad/sample],
+    between which y moves.
     uncertainty: of G, as the parameter plant.uncertainty. reasons: why it is of no use, remarks:
-    what to know, a sentence each. fit, covariance, compared, profile, held_out: what pictures show;
-    None where nothing was fitted. outliers: samples of y that were left out.
+    what to know, a sentence each. samples, fit, covariance, compared, profile, held_out: what pictures
+    show; None where nothing was fitted. searched: the part, from sample searched_from on, in which
+    structures were compared. outliers: samples of y that were left out.
     """
 
     sample_period: float
@@ -113,6 +115,8 @@ class Identification:
     reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     samples: Samples | None = None
+    searched: Samples | None = None
+    searched_from: int = 0
     fit: Fit | None = None
     covariance: Covariance | None = None
     compared: tuple[Compared, ...] = ()
@@ -151,7 +155,7 @@ def identifying(
     if nothing is not None:
         return nothing
     first = max(options.delays) + 1
-    part = _busiest(v, first)
+    part = _busiest(v)
     searched = Samples(v[part], y[part], first)
     general = Structure(GENERAL_ORDER, 0, False, GENERAL_ORDER + max(options.delays))
     found = yield from _named('searching the gap', search(searched, general))
@@ -178,7 +182,7 @@ def identifying(
     yield 'judging'
     return _described(
         samples, searched, best, compared, chosen, rivals, curve, outliers,
-        Identification(sample_period, v, y), options,
+        Identification(sample_period, v, y, searched_from=part.start), options,
     )
 
 
@@ -329,7 +333,7 @@ def _described(
         ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
         uncertainty=_as_parameter(float(spread.max())), outliers=outliers,
         reasons=tuple(judgement.reasons(evidence)), remarks=tuple(judgement.remarks(evidence)),
-        samples=samples, fit=best, covariance=covariance, compared=tuple(compared),
+        samples=samples, searched=searched, fit=best, covariance=covariance, compared=tuple(compared),
         chosen=chosen, profile=curve, held_out=held_out,
     )
 

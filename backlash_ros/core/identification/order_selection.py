@@ -3,9 +3,10 @@
 Structures whose held-out error is within a few percent of the least are equally good predictors.
 Among them the least
 
-    N' log(squares) + unknowns log(N)          (BIC over all samples)
+    N' log(squares) + 2 unknowns log(N)
 
-is taken, with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual: what repeats
+over all samples is taken (BIC with twice its penalty: a pole that a zero nearly cancels costs more
+in the loop than it tells), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual: what repeats
 itself from sample to sample, as the error of a quantised y does, speaks less often.
 """
 
@@ -30,6 +31,7 @@ from backlash_ros.core.identification.starting_models import steiglitz_mcbride
 
 Array = NDArray[np.float64]
 
+PENALTY = 2.0  # of an unknown, in logarithms of the number of samples
 WITHIN = 1.05  # times the least held-out error: equally good
 EXTRA_POLES = (0.3, 0.85)  # where one more pole than in the order below may begin
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
@@ -74,7 +76,7 @@ def compare(
         Compared(
             whole.structure, rms, trained, whole,
             rows * float(np.log(max(whole.squares, smallest)))
-            + whole.structure.unknowns * float(np.log(len(samples.known))),
+            + PENALTY * whole.structure.unknowns * float(np.log(len(samples.known))),
         )
         for rms, trained, whole in found
     ]

@@ -274,4 +274,8 @@ def largest_pole(a: Array) -> float:
     """Magnitude of the largest root of z^n + a[0] z^(n-1) + ..., 0 for none; inf for no number."""
     if not np.isfinite(a).all():
         return inf
-    return float(np.abs(np.roots(np.append(1.0, a))).max()) if len(a) else 0.0
+    if not len(a):
+        return 0.0
+    companion = np.diag(np.ones(len(a) - 1), -1)
+    companion[0] = -a
+    return float(np.abs(np.linalg.eigvals(companion)).max())

@@ -12,7 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.output_error import Fit, Point, Samples, Structure, fit
+from backlash_ros.core.identification.output_error import (
+    Fit,
+    Point,
+    Samples,
+    Structure,
+    fit,
+    solve_linear,
+)
 from backlash_ros.core.identification.starting_models import steiglitz_mcbride
 
 Array = NDArray[np.float64]
@@ -21,7 +28,7 @@ GAPS = 48  # that the whole swing of v is searched with
 SMALLEST = 2e-3  # of them, in swings of v
 NEAR, NEAR_GAPS = 0.2, 13  # reach around a minimum, relative, and gaps that it is searched with
 STARTS = (0.0, 0.5, 1.0)  # places in the gap at which p may begin
-AFRESH = 3  # every so many gaps a model is looked for anew
+AFRESH = 4  # every so many gaps a model is looked for anew
 STEPS = 3  # of the model per gap; it goes on from that of the gap before
 MINIMA = 3  # that are set free
 
@@ -70,24 +77,20 @@ def profile(
     """The best fit for each gap. known: of which the model is a good start."""
     v0 = float(samples.v[0])
     fits: list[Fit] = []
-    model = None if known is None else known.point.a
+    models = [] if known is None else [known.point.a]
     for number, gap in enumerate(gaps.tolist()):
-        best: Fit | None = None
-        for share in STARTS if gap > 0.0 else STARTS[:1]:
-            start = v0 + share * gap
-            models = [] if model is None else [model]
-            if best is not None:
-                models = [best.point.a]
-            elif known is not None or number % AFRESH == 0:
-                p = samples.play.output(gap, start).p
-                models += steiglitz_mcbride(samples, structure, p)[:1]
-            for a in models:
-                found = fit(samples, structure, Point(a, gap, start), gap_free=False,
-                            iterations=STEPS)
-                if best is None or found.squares < best.squares:
-                    best = found
-        assert best is not None
-        model = best.point.a
-        fits.append(best)
+        starts = [v0 + share * gap for share in (STARTS if gap > 0.0 else STARTS[:1])]
+        if number % AFRESH == 0:
+            p = samples.play.output(gap, starts[len(starts) // 2]).p
+            models = [*models, *steiglitz_mcbride(samples, structure, p)[:1]]
+        points = [Point(a, gap, start) for a in models for start in starts]
+        best = min(points, key=lambda point: _squares(samples, structure, point))
+        fits.append(fit(samples, structure, best, gap_free=False, iterations=STEPS))
+        models = [fits[-1].point.a]
         yield
     return Profile(gaps, np.array([found.squares for found in fits]), fits)
+
+
+def _squares(samples: Samples, structure: Structure, point: Point) -> float:
+    p = samples.play.output(point.gap, point.start).p
+    return solve_linear(samples, structure, point.a, p).squares

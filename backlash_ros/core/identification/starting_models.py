@@ -6,11 +6,15 @@ noise of y is, so that the poles are not biased as those of a plain ARX fit are.
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 from scipy.signal import lfilter
 
 from backlash_ros.core.identification.output_error import (
+    SINGULAR,
     Samples,
     Structure,
     full_denominator,
@@ -19,8 +23,9 @@ from backlash_ros.core.identification.output_error import (
 
 Array = NDArray[np.float64]
 
-FIRST_FILTERS = (0.0, 0.7, 0.92, 0.98)  # pole of the first filter, as often as G has poles
-STEPS = 5
+FIRST_FILTERS = (0.5, 0.9, 0.98)  # pole of the first filter, as often as G has poles
+STEPS = 4
+FIRST_JUDGED = 2  # steps before a model is compared with others
 INSIDE = 0.999  # a pole outside is put back to here
 
 
@@ -30,15 +35,16 @@ def steiglitz_mcbride(samples: Samples, structure: Structure, p: Array) -> list[
     y = _without_losses(samples)
     for first in FIRST_FILTERS:
         a = np.atleast_1d(np.poly(np.full(structure.free_poles, first)))[1:]
-        for _ in range(STEPS):
-            squares = solve_linear(samples, structure, a, p).squares
-            tried.append((squares, len(tried), a))
+        for step in range(STEPS + 1):
+            if step >= FIRST_JUDGED or not structure.free_poles:
+                squares = solve_linear(samples, structure, a, p).squares
+                tried.append((squares, len(tried), a))
             better = _refined(samples, structure, a, p, y)
             if better is None:
                 break
             a = better
-        else:
-            tried.append((solve_linear(samples, structure, a, p).squares, len(tried), a))
+    if not tried:
+        tried.append((inf, 0, np.zeros(structure.free_poles)))
     return [a for _, _, a in sorted(tried)]
 
 
@@ -61,7 +67,7 @@ def _refined(
     moved, impulse = lfilter([1.0], full_denominator(structure, a), inputs)
     # A y over A: with an integrator in both, 1 - 1/z cancels.
     filtered = lfilter([1.0], np.append(1.0, a), y)
-    columns = np.zeros((count, poles + taps + 1 + structure.state_terms))
+    columns = np.zeros((count, poles + taps + 1 + structure.state_terms), order='F')
     for j in range(poles):
         columns[j + 1:, j] = -filtered[:count - j - 1]
     for i in range(taps):
@@ -71,9 +77,10 @@ def _refined(
         columns[i:, poles + taps + 1 + i] = impulse[:count - i]
     scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
     scale[scale == 0.0] = 1.0
-    with np.errstate(all='ignore'):
-        solution = np.linalg.lstsq(columns / scale, filtered, rcond=1e-13)[0] / scale
-    a = solution[:poles]
+    basis, upper = np.linalg.qr(columns / scale)
+    if not np.abs(np.diag(upper)).min() > SINGULAR:
+        return None
+    a = (solve_triangular(upper, basis.T @ filtered, check_finite=False) / scale)[:poles]
     return stable(a) if np.isfinite(a).all() else None
 
 

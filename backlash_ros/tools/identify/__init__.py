@@ -1,0 +1,1 @@
+"""`identify`: from a record of v and y to a checked parameter file."""

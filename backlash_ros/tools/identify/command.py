@@ -1,0 +1,139 @@
+"""`identify`: one command from a record, or from an actuator, to a checked parameter file."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from math import inf
+from pathlib import Path
+
+
+from backlash_ros.core.parameter_table import Value
+from backlash_ros.tools.command_line import FAILED, OptionParser, run_tool
+from backlash_ros.tools.errors import InputError
+
+EXECUTABLE = 'identify'
+YAML, JSON, PAGE = 'identified.yaml', 'identified.json', 'identify.html'
+INTEGRATORS = {'auto': (False, True), 'yes': (True,), 'no': (False,)}
+HIGHEST_ORDER, LONGEST_DELAY = 6, 20
+
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The options."""
+    parser = OptionParser(
+        EXECUTABLE, description=__doc__,
+        epilog='Exit codes: 0 the result is of use, 1 it is not, 2 bad input.',
+    )
+    parser.add_argument('record', type=Path, nargs='?', metavar='RECORD',
+                        help='a bag, a folder of results, or a CSV with t, v, y (lost y empty)')
+    parser.add_argument('--config', type=Path, metavar='FILE',
+                        help='parameter file that the result goes on from: limits, topics, axes')
+    parser.add_argument('--axis', default='', metavar='NAME', help='of several: the one that is meant')
+    parser.add_argument('--order', type=_range_to(HIGHEST_ORDER, 1), default=(1, 2, 3, 4),
+                        metavar='N[-N]', help='numbers of poles that are compared (default: 1-4)')
+    parser.add_argument('--delay', type=_range_to(LONGEST_DELAY, 0), default=(0, 1, 2, 3),
+                        metavar='N[-N]',
+                        help='delays that are compared [samples] (default: 0-3)')
+    parser.add_argument('--integrator', choices=sorted(INTEGRATORS), default='auto',
+                        help='whether G has a pole at 1 (default: auto)')
+    parser.add_argument('--slope', type=_positive, default=1.0, metavar='M',
+                        help='m, a gear ratio for instance; it cannot be told from the gain of G '
+                             '(default: 1)')
+    parser.add_argument('--held-out', type=_share, default=1.0 / 3.0, metavar='SHARE',
+                        help='share at the end of the record on which structures are compared '
+                             '(default: 0.33)')
+    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
+                        help='leave out what was before this time [s]')
+    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
+                        help='leave out what was from this time [s] on')
+    parser.add_argument('--out', type=Path, metavar='DIR',
+                        help='folder of the results (default: results/<UTC time>, and '
+                             'results/latest points at it)')
+    return parser
+
+
+def _range_to(most: int, least: int) -> object:
+    def parse(text: str) -> tuple[int, ...]:
+        first, dash, last = text.partition('-')
+        try:
+            low = int(first)
+            high = int(last) if dash else low
+        except ValueError:
+            raise argparse.ArgumentTypeError(f'{text!r} must be like {least} or {least}-4') \
+                from None
+        if not least <= low <= high <= most:
+            raise argparse.ArgumentTypeError(
+                f'{text} must lie within {least}-{most}, the smaller number first'
+            )
+        return tuple(range(low, high + 1))
+    return parse
+
+
+def _positive(text: str) -> float:
+    number = float(text)
+    if not 0.0 < number < inf:
+        raise argparse.ArgumentTypeError(f'{text} must be finite and > 0')
+    return number
+
+
+def _share(text: str) -> float:
+    number = float(text)
+    if not 0.1 <= number <= 0.6:
+        raise argparse.ArgumentTypeError(f'{text} must lie within 0.1 and 0.6')
+    return number
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `identify`."""
+    outcome: list[bool] = []
+    code = run_tool(EXECUTABLE, lambda: outcome.append(_identify(args)))
+    return FAILED if outcome == [False] else code
+
+
+def _identify(args: Sequence[str] | None) -> bool:
+    """Do what the options say; returns whether the result is of use."""
+    parser = make_parser()
+    options = parser.parse_args(args)
+    if options.record is None:
+        parser.error('give a RECORD')
+    if not options.from_s < options.to_s:
+        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+    # numpy, scipy and matplotlib are loaded once the options are known to be right.
+    from backlash_ros.tools.bag_sections import Span
+    from backlash_ros.tools.identify.measured_record import read_measured
+    given = given_values(options.config, options.axis)
+    period = given.get('sample_period')
+    record = read_measured(
+        options.record, float(period) if isinstance(period, float) else None,
+        Span(options.from_s, options.to_s), options.axis,
+    )
+    for note in record.notes:
+        print(f'{EXECUTABLE}: warning: {note}', file=sys.stderr)
+    from backlash_ros.tools.identify.outcome import identified, write_outcome
+    found = identified(record, options)
+    return write_outcome(found, record, given, options)
+
+
+def given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
+    """What the user's file holds for the axis; nothing without a file."""
+    if config is None:
+        return {}
+    from backlash_ros.tools.configuration import find_config
+    from backlash_ros.tools.parameter_file import no_such_axis, read_parameter_file
+    file = read_parameter_file(find_config(config))
+    axes = file.axes
+    file.check_axes(axes)
+    if axes and not axis:
+        raise InputError(
+            f'{file.path}: holds the axes {", ".join(axes)}: choose one, like --axis {axes[0]}'
+        )
+    if axes and axis not in axes:
+        raise InputError(no_such_axis(axis, axes))
+    return file.values(axis)
+
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,204 @@
+"""identified.yaml and identified.json: what was found, as parameters and as numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.identification.identification import Identification
+from backlash_ros.core.parameter_table import (
+    BRINGUP,
+    PARAMETERS,
+    RECORDER,
+    Parameter,
+    Value,
+)
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools.configuration import yaml_value
+
+WIDER = 3.0  # bounds of the estimates, in times of what was found
+SIMULATED = ('truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance')
+OF_ONE_RUN = ('estimates', 'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes')
+SHARE_OF_MOTION = 0.25  # of the range of y in the record: amplitude of the reference
+
+
+def identified_parameters(found: Identification, given: Mapping[str, Value]) -> Parameters:
+    """The complete set: what was found, in what the user has given, and defaults for the rest.
+
+    Raises ParameterError where the controller does not take it.
+    """
+    values: dict[str, Any] = {
+        name: value for name, value in given.items()
+        if not name.startswith(SIMULATED) and not name.startswith(OF_ONE_RUN)
+    }
+    scale = WIDER * max(found.gap, found.c_r, -found.c_l)
+    values.update({
+        'sample_period': found.sample_period,
+        'plant.numerator': tuple(_significant(found.numerator)),
+        'plant.denominator': tuple(_significant(found.denominator)),
+        'plant.uncertainty': found.uncertainty,
+        'control.delay_samples': found.delay,
+        'estimator.initial.m': found.m,
+        'estimator.initial.c_r': float(f'{max(found.c_r, 0.0):.6g}'),
+        'estimator.initial.c_l': float(f'{min(found.c_l, 0.0):.6g}'),
+        'estimator.bounds.m': (float(f'{found.m / WIDER:.3g}'), float(f'{found.m * WIDER:.3g}')),
+        'estimator.bounds.c_r': (0.0, float(f'{max(scale, 1e-9):.3g}')),
+        'estimator.bounds.c_l': (float(f'{-max(scale, 1e-9):.3g}'), 0.0),
+        'estimator.output_noise_std': float(f'{max(found.noise_std, 1e-12):.3g}'),
+        # The simulated plant is the one that was found, so that the file can be tried out.
+        'backlash.m': found.m,
+        'backlash.c_r': float(f'{found.c_r:.6g}'), 'backlash.c_l': float(f'{found.c_l:.6g}'),
+        'output_quantum': float(f'{found.quantum:.6g}'),
+        'output_noise_std': 0.0 if found.quantum else float(f'{found.noise_std:.3g}'),
+    })
+    for name, value in _reference(found, given).items():
+        values.setdefault(name, value)
+    parameters = Parameters(values)
+    if 'structure' not in given:
+        parameters = _with_structure(values)
+    build_controller(parameters)
+    return parameters
+
+
+def _with_structure(values: dict[str, Any]) -> Parameters:
+    """y follows y_m where gains for that can be designed, else u_d = y_m."""
+    try:
+        parameters = Parameters({**values, 'structure': 'tracking'})
+        build_controller(parameters)
+    except (ParameterError, ValueError, ArithmeticError, np.linalg.LinAlgError):
+        return Parameters({**values, 'structure': 'proportional', 'proportional.f': 0.0})
+    return parameters
+
+
+def _reference(found: Identification, given: Mapping[str, Value]) -> dict[str, Value]:
+    """A reference that the actuator can follow, unless one is given."""
+    if {'waveform', 'amplitude', 'frequency', 'bias', 'file'} & set(given):
+        return {}
+    y = found.y[np.isfinite(found.y)]
+    middle = 0.0 if found.integrator else 0.5 * float(np.percentile(y, 5) + np.percentile(y, 95))
+    if found.integrator:
+        k = np.flatnonzero(np.isfinite(found.y))
+        y = y - np.polyval(np.polyfit(k, y, 1), k)
+    reach = float(np.percentile(y, 95) - np.percentile(y, 5))
+    return {
+        'waveform': 'sine', 'amplitude': float(f'{SHARE_OF_MOTION * reach:.3g}'),
+        'bias': float(f'{middle:.3g}'),
+        'frequency': float(f'{found.frequencies[0] / found.sample_period:.3g}'),
+    }
+
+
+def _significant(values: tuple[float, ...]) -> list[float]:
+    """Twelve digits: fewer would move poles near 1, more are noise."""
+    return [float(f'{value:.12g}') for value in values]
+
+
+def numbers(found: Identification) -> dict[str, Any]:
+    """Content of identified.json."""
+    return {
+        'usable': found.usable, 'reasons': list(found.reasons), 'remarks': list(found.remarks),
+        'm': found.m, 'gap': found.gap, 'c_r': found.c_r, 'c_l': found.c_l,
+        'std': dict(found.std) if found.std else {name: None for name in ('m', 'gap', 'c_r', 'c_l')},
+        'numerator': list(found.numerator), 'denominator': list(found.denominator),
+        'delay_samples': found.delay, 'equally_good_delays': list(found.delays),
+        'integrator': found.integrator, 'sample_period': found.sample_period,
+        'output_noise_std': found.noise_std, 'output_quantum': found.quantum,
+        'uncertainty': found.uncertainty,
+        'response': {
+            'frequency_hz': (found.frequencies / (2.0 * np.pi * found.sample_period)).tolist(),
+            'relative_std': found.response_std.tolist(),
+        },
+        'held_out': None if found.held_out is None else {
+            'rms': found.held_out.rms, 'rms_of_fit': found.held_out.trained,
+        },
+        'residual': {'lag_one_correlation': found.correlation, 'ljung_box_p': found.ljung_box},
+        'samples': len(found.y), 'lost_samples': int(np.isnan(found.y).sum()),
+        'outliers': found.outliers,
+    }
+
+
+def commented_yaml(
+    parameters: Parameters, found: Identification, source: str, axis: str = '',
+) -> str:
+    """A parameter file that says of each value what it is and, where it was found, how surely."""
+    comments = _found(found)
+    head = [
+        f'# Identified from {source}: {len(found.y)} samples of {found.sample_period:g} s.',
+        f'# {"; ".join(found.remarks)}.' if found.remarks else '# Nothing spoke against it.',
+        '# Values with ± were found, the others are as they were given, or defaults.',
+    ]
+    lines: list[tuple[str, str]] = []
+    section = f'/{axis}/**' if axis else '/**'
+    lines += [(f'{section}:', ''), ('  ros__parameters:', '')]
+    written = [
+        p for p in PARAMETERS
+        if p.used_by not in ((BRINGUP,), (RECORDER,)) and not p.name.startswith('estimates.')
+        and parameters[p.name] != () and not p.name.startswith('truth.')
+    ]
+    groups: list[str] = []
+    for parameter in _grouped(written):
+        *path, leaf = parameter.name.split('.')
+        shared = 0
+        while shared < min(len(path), len(groups)) and path[shared] == groups[shared]:
+            shared += 1
+        for depth in range(shared, len(path)):
+            lines.append((f'{"  " * (depth + 2)}{path[depth]}:', ''))
+        groups = path
+        lines.append((
+            f'{"  " * (len(path) + 2)}{leaf}: {yaml_value(parameters[parameter.name])}',
+            comments.get(parameter.name) or _described(parameter),
+        ))
+    if axis:
+        lines += [('/bringup:', ''), ('  ros__parameters:', ''), (f"    axes: ['{axis}']", '')]
+    return '\n'.join([*head, *(_aligned(text, comment) for text, comment in lines), ''])
+
+
+def _grouped(parameters: list[Parameter]) -> list[Parameter]:
+    """With the members of each group together, groups in the order of their first member."""
+    order: dict[tuple[str, ...], int] = {}
+    for place, parameter in enumerate(parameters):
+        path = parameter.name.split('.')
+        for depth in range(1, len(path) + 1):
+            order.setdefault(tuple(path[:depth]), place)
+    return sorted(parameters, key=lambda p: [
+        order[tuple(p.name.split('.')[:depth + 1])] for depth in range(p.name.count('.') + 1)
+    ])
+
+
+def _aligned(text: str, comment: str) -> str:
+    return f'{text.ljust(52)}  # {comment}' if comment else text
+
+
+def _described(parameter: Parameter) -> str:
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    return f'{parameter.description}{unit}'
+
+
+def _found(found: Identification) -> dict[str, str]:
+    """Comments on what was found."""
+    std = found.std
+    delays = (
+        f'; {found.delays[0]} to {found.delays[-1]} fit alike' if len(found.delays) > 1 else ''
+    )
+    worst = float(found.response_std.max()) if len(found.response_std) else inf
+    hertz = found.frequencies / (2.0 * np.pi * found.sample_period)
+    band = f'{hertz[0]:.2g} to {hertz[-1]:.2g} Hz' if len(hertz) else 'no band'
+    return {
+        'sample_period': 'of the record [s]',
+        'plant.numerator': f'G to ± {worst:.2g} of itself from {band}; its gain is that for m = '
+                           f'{found.m:g}, ± {std["m"] / found.m:.2g} of itself',
+        'plant.denominator': f'{len(found.denominator) - 1} poles'
+                             + (', one of them an integrator' if found.integrator else ''),
+        'plant.uncertainty': 'twice the deviation of G, and 0.01 at least',
+        'control.delay_samples': f'found by comparison{delays}',
+        'estimator.initial.m': 'as told with --slope, 1 where it was not: G has the gain for it',
+        'estimator.initial.c_r': f'± {std["c_r"]:.2g} [v]',
+        'estimator.initial.c_l': f'± {std["c_l"]:.2g} [v]',
+        'estimator.output_noise_std': 'deviation of y from the simulation [y]',
+        'backlash.m': 'the simulated plant is the one that was found',
+    }
+

@@ -1,0 +1,239 @@
+"""v and y, sample by sample, from a CSV, a folder of results or a bag."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import inf, isfinite, nan
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros import topics
+from backlash_ros.bags.content import is_bag
+from backlash_ros.tools.bag_reading import read_plain_numbers
+from backlash_ros.tools.bag_sections import WHOLE, Span, choose_namespace
+from backlash_ros.tools.errors import InputError
+from backlash_ros.tools.report import BAG, open_source
+from backlash_ros.tools.results import RECORD, SAMPLES
+
+Array = NDArray[np.float64]
+
+COLUMNS = ('t', 'v', 'y')
+OFF_GRID = 0.25  # of a period that a row of a CSV may miss its time
+REPORTED = 0.9  # share of the samples that applied_control has to report to be believed
+LONGEST = 1_000_000  # samples, lost ones included: more is a t that jumps
+
+
+@dataclass(frozen=True)
+class MeasuredRecord:
+    """v (N,) from sample k to k+1 and y (N,) at k, nan where lost. source: where they are from.
+
+    notes: what else to know, a sentence each.
+    """
+
+    v: Array
+    y: Array
+    sample_period: float
+    source: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def lost(self) -> int:
+        """Samples without a y."""
+        return int(np.isnan(self.y).sum())
+
+
+def read_measured(
+    path: Path, sample_period: float | None = None, span: Span = WHOLE, axis: str = '',
+) -> MeasuredRecord:
+    """Read a bag, a folder of results, or a CSV with the columns t, v, y.
+
+    sample_period: None tells it from the record. Raises InputError, in one line.
+    """
+    if not path.exists():
+        raise InputError(f'{path}: does not exist')
+    if path.is_file() and path.suffix == '.csv':
+        return _cut(_from_csv(path, sample_period), span)
+    if path.is_dir():
+        for folder in (path, path / BAG):
+            if is_bag(folder):
+                return _cut(_from_bag(folder, sample_period, axis), span)
+        if not any((path / name).is_file() for name in (RECORD, SAMPLES)):
+            raise InputError(
+                f'{path}: holds no bag, no {RECORD} and no {SAMPLES}: give one of them, or a CSV '
+                f'with the columns {", ".join(COLUMNS)}'
+            )
+    run = open_source(path).run
+    if not run.samples:
+        raise InputError(f'{path}: holds no sample')
+    return _cut(_on_grid(
+        path, run.column('t'), run.column('v'), run.column('y'),
+        sample_period or run.sample_period,
+    ), span)
+
+
+def _from_csv(path: Path, sample_period: float | None) -> MeasuredRecord:
+    try:
+        with path.open(newline='', encoding='utf-8') as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f'{path}: cannot be read: {error}') from None
+    header = [name.strip() for name in rows[0]] if rows else []
+    missing = [name for name in COLUMNS if name not in header]
+    if missing:
+        raise InputError(
+            f'{path}: line 1: must be a header with {", ".join(COLUMNS)}; {", ".join(missing)} '
+            f'{"is" if len(missing) == 1 else "are"} missing'
+        )
+    places = [header.index(name) for name in COLUMNS]
+    values: list[list[float]] = []
+    for number, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        try:
+            cells = [row[place].strip() for place in places]
+            values.append([float(cell) if cell else nan for cell in cells])
+        except (ValueError, IndexError):
+            raise InputError(
+                f'{path}: line {number}: must hold numbers for {", ".join(COLUMNS)}; a lost y is '
+                'left empty'
+            ) from None
+        if not isfinite(values[-1][0]):
+            raise InputError(f'{path}: line {number}: t={values[-1][0]!r} must be finite')
+        if len(values) > 1 and not values[-1][0] > values[-2][0]:
+            raise InputError(f'{path}: line {number}: t must rise from row to row')
+    if len(values) < 2:
+        raise InputError(f'{path}: holds {len(values)} sample, which is no motion')
+    t, v, y = np.array(values).T
+    period = float(np.median(np.diff(t))) if sample_period is None else sample_period
+    return _on_grid(path, t, v, y, period)
+
+
+def _on_grid(path: Path, t: Array, v: Array, y: Array, period: float) -> MeasuredRecord:
+    """Rows by time, those between them being lost."""
+    place = (t - t[0]) / period
+    index = np.round(place)
+    if not index[-1] < LONGEST:
+        raise InputError(f'{path}: spans {index[-1]:.3g} sample periods of {period:g} s')
+    odd = np.flatnonzero((np.abs(place - index) > OFF_GRID) | (np.diff(index, prepend=-1) < 1))
+    if len(odd):
+        raise InputError(
+            f'{path}: row {odd[0] + 1}: t={t[odd[0]]:.6g} is no whole number of sample periods of '
+            f'{period:.6g} s: resample it, or give sample_period in --config'
+        )
+    whole = index.astype(int)
+    count = int(whole[-1]) + 1
+    full_v, full_y = np.full(count, nan), np.full(count, nan)
+    full_v[whole], full_y[whole] = v, y
+    return _usable(path, full_v, full_y, period)
+
+
+def _usable(
+    path: Path, v: Array, y: Array, period: float, notes: Sequence[str] = (),
+) -> MeasuredRecord:
+    """From the first known v on; a v that is not known is the one before it."""
+    for name, values in (('v', v), ('y', y)):
+        if np.isinf(values).any():
+            raise InputError(f'{path}: {name} holds what is not finite')
+        if not np.isfinite(values).any():
+            raise InputError(f'{path}: {name} holds no number')
+    known = np.isfinite(v)
+    first = int(np.argmax(known))
+    newest = np.maximum.accumulate(np.where(known, np.arange(len(v)), 0))
+    return MeasuredRecord(v[newest][first:], y[first:], float(f'{period:.9g}'), str(path), tuple(notes))
+
+
+def _cut(record: MeasuredRecord, span: Span) -> MeasuredRecord:
+    if span == WHOLE:
+        return record
+    t = record.sample_period * np.arange(len(record.v))
+    # A time that is a sample's up to rounding is that sample's.
+    slack = 1e-6 * record.sample_period
+    kept = (t >= span.from_s - slack) & (t < span.to_s - slack)
+    if not kept.any():
+        raise InputError(f'{record.source}: there is no sample between --from and --to')
+    return replace(record, v=record.v[kept], y=record.y[kept])
+
+
+def _from_bag(path: Path, sample_period: float | None, axis: str) -> MeasuredRecord:
+    names = (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL)
+    numbers, damage = read_plain_numbers(path, names)
+    notes = [damage] if damage else []
+    chosen: dict[str, tuple[Array, Array]] = {}
+    for topic in names:
+        ends = sorted(name for name in numbers if f'/{name}'.endswith(f'/{topic}'))
+        if ends:
+            name, note = choose_namespace(ends, axis)
+            if name:
+                chosen[topic] = numbers[name]
+                axis = axis or (name.strip('/').split('/')[0] if note else '')
+            if topic == topics.PLANT_OUTPUT and note:
+                notes.append(note)
+    output = chosen.get(topics.PLANT_OUTPUT)
+    if output is None or len(output[0]) < 2:
+        return _from_signals(path, sample_period, axis)
+    of_axis = f' of axis {axis}' if axis else ''
+    commands = chosen.get(topics.APPLIED_CONTROL)
+    if commands is None or len(commands[0]) < REPORTED * len(output[0]):
+        commands = chosen.get(topics.CONTROL)
+    if commands is None or not len(commands[0]):
+        raise InputError(f'{path}: holds no {topics.CONTROL}{of_axis}: record it as well')
+    record = from_messages(path, output, commands, sample_period)
+    return replace(record, notes=(*record.notes, *notes))
+
+
+def _from_signals(path: Path, sample_period: float | None, axis: str) -> MeasuredRecord:
+    """From what the controller says that it heard and sent."""
+    source = open_source(path, axis=axis)
+    run = source.run
+    record = _on_grid(
+        path, run.column('t'), run.column('v'), run.column('y'),
+        sample_period or run.sample_period,
+    )
+    return replace(record, notes=(*record.notes, *source.notes, *filter(None, [source.damage])))
+
+
+def from_messages(
+    path: Path, output: tuple[Array, Array], commands: tuple[Array, Array],
+    sample_period: float | None,
+) -> MeasuredRecord:
+    """From stamps [ns] and values of y, and of v (or its reports just before each y).
+
+    v over an interval is the newest one when the next y comes.
+    """
+    stamps, values = output
+    steps = np.diff(stamps)
+    period = float(np.median(steps)) * 1e-9 if sample_period is None else sample_period
+    if not period > 0.0:
+        raise InputError(f'{path}: its stamps do not tell the sample period: give --config')
+    jumps = np.round(steps * 1e-9 / period)
+    # A sample that comes at once after another one is none.
+    kept = np.append(True, jumps >= 1.0)
+    index = np.append(0.0, np.cumsum(jumps))[kept].astype(np.int64)
+    if index[-1] >= LONGEST:
+        raise InputError(f'{path}: spans {index[-1]:.3g} sample periods of {period:g} s')
+    count = int(index[-1]) + 1
+    y = np.full(count, nan)
+    y[index] = values[kept]
+    begin = stamps[0]
+    times = np.interp(np.arange(1, count + 1), index, (stamps[kept] - begin).astype(float))
+    times[-1] = inf
+    newest = np.searchsorted((commands[0] - begin).astype(float), times, side='right') - 1
+    v = np.append(commands[1], nan)[newest]
+    return _usable(path, v, y, period)
+
+
+def by_topic(rows: Sequence[tuple[str, int, float]]) -> Mapping[str, tuple[Array, Array]]:
+    """Stamps [ns] and values of each topic from rows of (topic, stamp, value)."""
+    found: dict[str, tuple[list[int], list[float]]] = {}
+    for topic, stamp, value in rows:
+        stamps, values = found.setdefault(topic, ([], []))
+        stamps.append(stamp)
+        values.append(value)
+    return {
+        topic: (np.array(stamps, dtype=np.int64).astype(float), np.array(values))
+        for topic, (stamps, values) in found.items()
+    }

@@ -1,0 +1,108 @@
+"""From a measured record to the files of a result and what the terminal shows of it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.identification.identification import (
+    Identification,
+    Options,
+    identifying,
+)
+from backlash_ros.core.parameter_table import Value
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.files import write_atomically
+from backlash_ros.tools.command_line import format_table
+from backlash_ros.tools.identify.command import INTEGRATORS, JSON, PAGE, YAML
+from backlash_ros.tools.identify.identified_file import (
+    commented_yaml,
+    identified_parameters,
+    numbers,
+)
+from backlash_ros.tools.identify.measured_record import MeasuredRecord
+from backlash_ros.tools.identify.page import render
+from backlash_ros.tools.identify.pictures import draw
+from backlash_ros.tools.results import result_directory, write_summary, write_table
+
+
+def options_of(options: argparse.Namespace) -> Options:
+    """What is compared, from the options of the command line."""
+    return Options(
+        options.order, options.delay, INTEGRATORS[options.integrator], options.slope,
+        options.held_out,
+    )
+
+
+def identified(record: MeasuredRecord, options: argparse.Namespace) -> Identification:
+    """Identify, with a bar on a terminal."""
+    work = identifying(record.v, record.y, record.sample_period, options_of(options))
+    with tqdm(file=sys.stderr, disable=None, leave=False, bar_format='{desc}: {elapsed}') as bar:
+        while True:
+            try:
+                bar.set_description_str(next(work))
+            except StopIteration as done:
+                found: Identification = done.value
+                return found
+
+
+def write_outcome(
+    found: Identification, record: MeasuredRecord, given: Mapping[str, Value],
+    options: argparse.Namespace,
+) -> bool:
+    """Write the files, print the outcome; returns whether it is of use."""
+    parameters: Parameters | None = None
+    if found.usable:
+        try:
+            parameters = identified_parameters(found, given)
+        except ParameterError as error:
+            found = replace(found, reasons=(f'the controller does not take it: {error}',))
+    out = result_directory(options.out)
+    write_summary(numbers(found), out / JSON)
+    write_record(record, out / 'record.csv')
+    pictures = list(draw(found))
+    for picture in pictures:
+        write_atomically(out / picture.name, picture.data)
+    text = None
+    if parameters is not None:
+        text = commented_yaml(parameters, found, record.source, options.axis)
+        write_atomically(out / YAML, text)
+    write_atomically(out / PAGE, render(found, record.source, pictures, text))
+    _tell(found, record, out)
+    return found.usable
+
+
+def write_record(record: MeasuredRecord, path: Path) -> None:
+    """Write t, v, y as a CSV that `identify` reads."""
+    rows = [
+        (k * record.sample_period, v, y)
+        for k, (v, y) in enumerate(zip(record.v.tolist(), record.y.tolist(), strict=True))
+    ]
+    write_table(path, ('t', 'v', 'y'), rows)
+
+
+def _tell(found: Identification, record: MeasuredRecord, out: Path) -> None:
+    if found.fit is not None:
+        print(format_table(('', 'found', '±'), [
+            (name, f'{value:.6g}', f'{found.std[name]:.2g}')
+            for name, value in (('gap', found.gap), ('c_r', found.c_r), ('c_l', found.c_l))
+        ]))
+        print(f'G(z): {len(found.denominator) - 1} poles'
+              + (', one of them an integrator' if found.integrator else '')
+              + f', delay {found.delay}'
+              + (f' ({found.delays[0]} to {found.delays[-1]} fit alike)'
+                 if len(found.delays) > 1 else '')
+              + f', known to {found.response_std.max():.2g} of itself; noise of y '
+              + f'{found.noise_std:.3g}')
+    for text in found.remarks:
+        print(f'note: {text}')
+    for text in found.reasons:
+        print(f'not of use: {text}')
+    print(out / (YAML if found.usable else JSON))
+    print(out / PAGE)

@@ -1,0 +1,81 @@
+"""identify.html: what was found, how surely, and the pictures, on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from math import isfinite
+
+import numpy as np
+
+from backlash_ros.core.identification.identification import Identification
+from backlash_ros.tools.html_report import NOTHING, Picture, page, picture_section, table
+
+TITLE = 'Identification of backlash and G(z)'
+
+
+def render(
+    found: Identification, source: str, pictures: Sequence[Picture], parameters: str | None,
+) -> str:
+    """The page as text. parameters: content of identified.yaml, None where there is none."""
+    parts = [
+        f'<h1>{TITLE}</h1>', f'<p class="lead">{_headline(found, source)}</p>',
+        *(f'<p class="warning">{escape(text)}</p>' for text in (*found.reasons, *found.remarks)),
+    ]
+    if found.fit is not None:
+        parts += ['<section>', _numbers(found), _facts(found), '</section>']
+    parts += [picture_section(picture) for picture in pictures]
+    if parameters is not None:
+        parts += [
+            '<section><details><summary>identified.yaml</summary>',
+            f'<pre>{escape(parameters)}</pre></details></section>',
+        ]
+    return page(TITLE, parts)
+
+
+def _headline(found: Identification, source: str) -> str:
+    about = f'{len(found.y)} samples of {found.sample_period:g} s from {escape(source)}'
+    return f'<b>{"Of use" if found.usable else "Not of use"}</b>: {about}.'
+
+
+def _numbers(found: Identification) -> str:
+    rows = [
+        (symbol, f'{value:.6g}', f'{found.std[name]:.2g}', unit)
+        for name, symbol, value, unit in (
+            ('gap', 'gap', found.gap, 'of v'),
+            ('c_r', 'c<sub>r</sub>', found.c_r, 'of v'),
+            ('c_l', 'c<sub>l</sub>', found.c_l, 'of v'),
+            ('m', 'm (told, or 1; deviation: of the gain of m G)', found.m, 'of u/v'),
+        )
+    ]
+    return table(('', 'found', 'std. deviation', 'unit'), rows)
+
+
+def _facts(found: Identification) -> str:
+    poles = np.roots(found.denominator)
+    hertz = found.frequencies / (2.0 * np.pi * found.sample_period)
+    delays = ' (' + ', '.join(map(str, found.delays)) + ' fit alike)' \
+        if len(found.delays) > 1 else ''
+    held = found.held_out
+    facts = [
+        ('numerator of G', ', '.join(f'{value:.6g}' for value in found.numerator)),
+        ('denominator of G', ', '.join(f'{value:.6g}' for value in found.denominator)),
+        ('poles', ', '.join(_root(pole) for pole in poles)),
+        ('delay', f'{found.delay} samples{delays}'),
+        ('G is known to', f'{found.response_std.max():.2g} of itself, {hertz[0]:.2g} to '
+                          f'{hertz[-1]:.2g} Hz'),
+        ('noise of y', f'{found.noise_std:.3g}' + (
+            f', steps of {found.quantum:.3g}' if found.quantum else '')),
+        ('error on samples held out', NOTHING if held is None else
+         f'{held.rms:.3g} (fit: {held.trained:.3g})'),
+        ('correlation of the residual', f'{found.correlation:.2g} from sample to sample'
+         if isfinite(found.correlation) else NOTHING),
+        ('lost samples, outliers', f'{int(np.isnan(found.y).sum())}, {found.outliers}'),
+    ]
+    body = ''.join(f'<tr><td>{name}</td><td>{value}</td></tr>' for name, value in facts)
+    return f'<table class="facts">{body}</table>'
+
+
+def _root(root: complex) -> str:
+    return f'{root.real:.5g}' if abs(root.imag) < 1e-9 else \
+        f'{root.real:.5g} {"+" if root.imag > 0 else "−"} {abs(root.imag):.5g} i'

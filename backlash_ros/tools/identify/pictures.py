@@ -1,0 +1,309 @@
+"""The pictures of identify.html: a person judges by them whether the result is to be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from numpy.typing import NDArray
+
+from backlash_ros.core.identification.identification import Identification
+from backlash_ros.core.identification.uncertainty import (
+    autocorrelation,
+    response,
+    response_std,
+    root_covariances,
+)
+from backlash_ros.tools.drawing import (
+    COLOURS,
+    curve,
+    label,
+    legend_above,
+    limits,
+    new_figure,
+    png,
+    zero_line,
+)
+from backlash_ros.tools.html_report import Picture
+
+Array = NDArray[np.float64]
+
+TIME = 'time t [s]'
+LAGS = 60  # of the autocorrelation
+MEASURED, SIMULATED, RESIDUAL = COLOURS['y'], COLOURS['u_d'], COLOURS['e']
+ORDER_COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#332288')
+SURE = 2.0  # standard deviations that bands and ellipses reach
+LOOP_POINTS = 4000
+
+
+def draw(found: Identification) -> Iterator[Picture]:
+    """Every picture, in the order of the page; none where nothing was fitted."""
+    if found.fit is None:
+        return
+    yield Picture(
+        'held_out.png', 'Measured and simulated y on samples that were held out',
+        'Simulated from v alone, with a model that was fitted to the samples before: the lines '
+        'should lie on each other, and the difference should look like noise.',
+        png(draw_held_out(found)),
+    )
+    yield Picture(
+        'residual.png', 'Residual of the fit',
+        'y minus the simulation of the whole record. Its autocorrelation should stay within the '
+        'band of white noise; the rounding of an encoder is allowed to leave it for a few lags. '
+        'Over v it should show no shape: a slope or a hook is a nonlinearity that is not in the '
+        'model.', png(draw_residual(found)),
+    )
+    yield Picture(
+        'gap.png', 'Misfit over the gap',
+        'What is left over for each width of the gap, everything else fitted anew. One narrow '
+        'valley: the gap is known. Two valleys of one depth: it is not.',
+        png(draw_profile(found)),
+    )
+    yield Picture(
+        'orders.png', 'Orders and delays compared',
+        'Error on the samples held out. The ring marks the one that was taken.',
+        png(draw_orders(found)),
+    )
+    yield Picture(
+        'poles_zeros.png', 'Poles and zeros of G',
+        'Ellipses reach two standard deviations. A zero on a pole: a lower order does as well.',
+        png(draw_poles(found)),
+    )
+    yield Picture(
+        'bode.png', 'Frequency response of m G',
+        'With a band of two standard deviations. Between the dotted lines y moved; outside of '
+        'them the record says little.', png(draw_bode(found)),
+    )
+    yield Picture(
+        'loop.png', 'The loop of v and y',
+        'Left: v against y as measured. Right: v against the u that was found, between its two '
+        'lines.', png(draw_loop(found)),
+    )
+
+
+def _times(found: Identification) -> Array:
+    return found.sample_period * np.arange(len(found.v))
+
+
+def draw_held_out(found: Identification) -> Figure:
+    """Measured and simulated y over the samples held out, and their difference."""
+    assert found.held_out is not None and found.searched is not None
+    figure = new_figure(6.2)
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
+    first = found.held_out.first
+    samples = found.searched
+    t = (found.searched_from + first + np.arange(len(found.held_out.simulated))) \
+        * found.sample_period
+    y = samples.whole_y[first:first + len(t)]
+    curve(upper, t, y, MEASURED, 'measured', width=2.2)
+    curve(upper, t, found.held_out.simulated, SIMULATED, 'simulated', '--')
+    legend_above(upper)
+    curve(lower, t, y - found.held_out.simulated, RESIDUAL)
+    zero_line(lower)
+    share = 1.0 - found.held_out.rms / max(float(np.nanstd(y)), 1e-300)
+    label(upper, f'{share:.2%} of the motion is predicted', 'y')
+    label(lower, '', 'difference', TIME)
+    return figure
+
+
+def draw_residual(found: Identification) -> Figure:
+    """Residual over time, its autocorrelation, and the residual over v."""
+    assert found.fit is not None and found.samples is not None
+    figure = new_figure(6.6)
+    grid = figure.add_gridspec(2, 2)
+    over_time = figure.add_subplot(grid[0, :])
+    correlated, over_v = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
+    samples = found.samples
+    residual = samples.y - found.fit.simulated
+    t = _times(found)[samples.first:samples.last]
+    curve(over_time, t, residual, RESIDUAL, width=0.8)
+    zero_line(over_time)
+    label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME)
+    known = int(np.isfinite(residual).sum())
+    r = autocorrelation(residual, LAGS)[1:]
+    bound = SURE / np.sqrt(known)
+    correlated.axhspan(-bound, bound, color='#bbbbbb', alpha=0.5, linewidth=0)
+    correlated.vlines(np.arange(1, LAGS + 1), 0.0, r, color=RESIDUAL, linewidth=1.5)
+    zero_line(correlated)
+    correlated.set_ylim(*limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
+    label(correlated, f'Autocorrelation (Ljung–Box p = {found.ljung_box:.2g})', '', 'lag [samples]')
+    v = samples.delayed(samples.v, found.fit.structure.delay)
+    over_v.plot(v, residual, '.', color=RESIDUAL, markersize=2, alpha=0.4, rasterized=True)
+    centres, means = _means_over(v, residual)
+    over_v.plot(centres, means, color='#000000', linewidth=1.6)
+    zero_line(over_v)
+    label(over_v, 'Over v, with its mean', '', 'v')
+    return figure
+
+
+def _means_over(v: Array, residual: Array, bins: int = 25) -> tuple[Array, Array]:
+    edges = np.linspace(v.min(), v.max(), bins + 1)
+    place = np.clip(np.digitize(v, edges) - 1, 0, bins - 1)
+    means = np.full(bins, np.nan)
+    for i in range(bins):
+        inside = residual[(place == i) & np.isfinite(residual)]
+        if len(inside) > 3:
+            means[i] = inside.mean()
+    return 0.5 * (edges[1:] + edges[:-1]), means
+
+
+def draw_profile(found: Identification) -> Figure:
+    """RMS of the residual over the gap, whole and near its minimum."""
+    assert found.profile is not None and found.fit is not None
+    figure = new_figure(4.2)
+    whole, near = figure.subplots(1, 2)
+    gaps = found.profile.gaps
+    rms = np.sqrt(found.profile.squares / max(found.profile.best.rows, 1))
+    close = np.abs(gaps - found.gap) <= 0.21 * found.gap
+    for axes, chosen in ((whole, np.full(len(gaps), True)), (near, close)):
+        axes.plot(gaps[chosen], rms[chosen], '.-', color=COLOURS['m'], markersize=4)
+        axes.axvline(found.gap, color=COLOURS['c_r'], linewidth=1.0)
+    whole.set_yscale('log')
+    std = found.std['gap']
+    near.axvspan(found.gap - SURE * std, found.gap + SURE * std, color=COLOURS['c_r'], alpha=0.2,
+                 linewidth=0)
+    label(whole, 'Over the swing of v', 'RMS of the residual', 'gap [v]')
+    label(near, f'Near {found.gap:.4g} ± {std:.2g}', '', 'gap [v]')
+    return figure
+
+
+def draw_orders(found: Identification) -> Figure:
+    """Error on the samples held out, over the order, a line per delay."""
+    figure = new_figure(4.2)
+    integrators = sorted({one.structure.integrator for one in found.compared})
+    rooms = np.atleast_1d(np.asarray(figure.subplots(1, len(integrators), sharey=True)))
+    for axes, integrator in zip(rooms.tolist(), integrators, strict=True):
+        _draw_orders(axes, found, integrator)
+        label(axes, 'With an integrator' if integrator else 'Without integrator',
+              'RMS on samples held out' if axes is rooms[0] else '', 'order: number of poles')
+    handles, labels = rooms[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside lower center', ncol=len(labels), frameon=False)
+    return figure
+
+
+def _draw_orders(axes: Axes, found: Identification, integrator: bool) -> None:
+    delays = sorted({one.structure.delay for one in found.compared})
+    for delay, colour in zip(delays, _cycled(len(delays)), strict=True):
+        line = sorted(
+            (one.structure.order, one.held_out) for one in found.compared
+            if one.structure.delay == delay and one.structure.integrator == integrator
+        )
+        axes.plot(*zip(*line, strict=True), 'o-', color=colour, markersize=5, alpha=0.8,
+                  label=f'delay {delay}')
+    assert found.chosen is not None
+    if found.chosen.structure.integrator == integrator:
+        axes.plot(found.chosen.structure.order, found.chosen.held_out, 'o', markersize=15,
+                  markerfacecolor='none', markeredgecolor='#000000', markeredgewidth=1.5)
+    axes.set_yscale('log')
+    axes.set_xticks(sorted({one.structure.order for one in found.compared}))
+
+
+def _cycled(count: int) -> list[str]:
+    return [ORDER_COLOURS[i % len(ORDER_COLOURS)] for i in range(count)]
+
+
+def draw_poles(found: Identification) -> Figure:
+    """Poles and zeros in the plane of z, whole and near 1."""
+    assert found.fit is not None and found.covariance is not None
+    fit, covariance = found.fit, found.covariance
+    figure = new_figure(5.2)
+    rooms = figure.subplots(1, 2)
+    count = covariance.poles
+    a_cov = np.zeros((count + 1, count + 1))
+    a_cov[1:, 1:] = covariance.matrix[:count, :count]
+    poles, pole_spreads = root_covariances(np.append(1.0, fit.point.a), a_cov)
+    if found.integrator:
+        poles = np.append(poles, 1.0)
+        pole_spreads = np.concatenate([pole_spreads, np.zeros((1, 2, 2))])
+    of_b = covariance.numerator
+    zeros, zero_spreads = root_covariances(fit.numerator, covariance.matrix[of_b, of_b])
+    span = max([0.02, *(1.3 * np.abs(poles - 1.0)).tolist()])
+    for axes, near in zip(rooms, (False, True), strict=True):
+        circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 720))
+        axes.plot(circle.real, circle.imag, color='#777777', linewidth=0.8)
+        for roots, spreads, mark, colour, name in (
+            (poles, pole_spreads, 'x', COLOURS['c_r'], 'poles'),
+            (zeros, zero_spreads, 'o', COLOURS['m'], 'zeros'),
+        ):
+            axes.plot(roots.real, roots.imag, mark, color=colour, markerfacecolor='none',
+                      markersize=8, label=name)
+            for root, spread in zip(roots, spreads, strict=True):
+                _ellipse(axes, root, spread, colour)
+        axes.set_aspect('equal')
+        reach = 1.25 if not near else min(span, 1.25)
+        centre = 1.0 if near else 0.0
+        axes.set_xlim(centre - reach, centre + (0.35 * reach if near else reach))
+        axes.set_ylim(-0.7 * reach if near else -reach, 0.7 * reach if near else reach)
+        label(axes, 'Near 1' if near else 'Plane of z', 'imaginary part', 'real part')
+    outside = [zero for zero in zeros if abs(zero) > 1.25]
+    if outside:
+        text = ', '.join(
+            f'{z.real:.3g}' if abs(z.imag) < 1e-9 else f'{z:.3g}' for z in outside
+        )
+        rooms[0].set_xlabel(f'real part (outside of the picture: zeros at {text})')
+    legend_above(rooms[1])
+    return figure
+
+
+def _ellipse(axes: Axes, root: complex, spread: Array, colour: str) -> None:
+    if not np.isfinite(spread).all():
+        return
+    sizes, directions = np.linalg.eigh(0.5 * (spread + spread.T))
+    width, height = 2.0 * SURE * np.sqrt(np.maximum(sizes, 0.0))
+    angle = float(np.degrees(np.arctan2(directions[1, 0], directions[0, 0])))
+    axes.add_patch(Ellipse(
+        (root.real, root.imag), width, height, angle=angle, facecolor=colour, alpha=0.2,
+        edgecolor=colour,
+    ))
+
+
+def draw_bode(found: Identification) -> Figure:
+    """Magnitude and phase of m G, its delay included."""
+    assert found.fit is not None and found.covariance is not None
+    figure = new_figure(5.6)
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    low = max(found.frequencies[0] / 5.0, 1e-5)
+    w = np.geomspace(low, 0.98 * np.pi, 400)
+    value = response(found.fit, w) * np.exp(-1j * w * found.delay)
+    spread = SURE * response_std(found.fit, found.covariance, w)
+    hertz = w / (2.0 * np.pi * found.sample_period)
+    size = np.abs(value)
+    upper.fill_between(hertz, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread),
+                       color=COLOURS['m'], alpha=0.25, linewidth=0)
+    upper.loglog(hertz, size, color=COLOURS['m'])
+    phase = np.degrees(np.unwrap(np.angle(value)))
+    turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))
+    lower.fill_between(hertz, phase - turn, phase + turn, color=COLOURS['m'], alpha=0.25,
+                       linewidth=0)
+    lower.semilogx(hertz, phase, color=COLOURS['m'])
+    for axes in (upper, lower):
+        for edge in (found.frequencies[0], found.frequencies[-1]):
+            axes.axvline(edge / (2.0 * np.pi * found.sample_period), color='#444444',
+                         linestyle=':', linewidth=1.0)
+    label(upper, 'Magnitude', '|m G| [y/v]')
+    label(lower, 'Phase', 'degrees', 'frequency [Hz]')
+    upper.set_ylim(float(size.min()) / 3.0, float(size.max()) * 3.0)
+    return figure
+
+
+def draw_loop(found: Identification) -> Figure:
+    """v against y, and v against the u that was found with its two lines."""
+    assert found.fit is not None and found.samples is not None
+    figure = new_figure(4.6)
+    left, right = figure.subplots(1, 2)
+    v = found.samples.v[-LOOP_POINTS:]
+    left.plot(v, found.samples.whole_y[-LOOP_POINTS:], color=COLOURS['y'], linewidth=0.8)
+    label(left, 'As measured', 'y', 'v')
+    u = found.m * (found.fit.play.p[-LOOP_POINTS:] - found.c_r)
+    right.plot(v, u, color='#999999', linewidth=1.0, label='u')
+    ends = np.array([v.min(), v.max()])
+    right.plot(ends, found.m * (ends - found.c_r), '--', color=COLOURS['c_r'],
+               label=f'c_r = {found.c_r:.4g}')
+    right.plot(ends, found.m * (ends - found.c_l), '--', color=COLOURS['c_l'],
+               label=f'c_l = {found.c_l:.4g}')
+    label(right, 'As found', 'u', 'v')
+    right.legend(frameon=False, loc='upper left', fontsize=10)
+    return figure
