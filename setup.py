@@ -42,6 +42,7 @@ setup(
             f'compare = {PACKAGE}.tools.compare:main',
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
             f'identify = {PACKAGE}.tools.identify.command:main',
+            f'replay = {PACKAGE}.tools.replay:main',
         ],
     },
 )

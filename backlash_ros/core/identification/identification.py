@@ -316,8 +316,7 @@ def _described(
         float(spread.max()), 0.5 * rows * float(np.log(still / max(best.squares, TINY))),
         correlation, held_out.rms, held_out.trained, rivals,
         float(np.abs(uncertainty.response(best, np.sqrt(frequencies[:1] * frequencies[-1:])))[0]),
-        _quantum(samples.y), np.roots(best.denominator).astype(complex),
-        np.roots(numerator).astype(complex),
+        _quantum(samples.y),
     )
     freedom = max(len(samples.known) - best.structure.unknowns, 1)
     return replace(

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.identification.order_selection import cancelled_pole
 from backlash_ros.core.identification.output_error import Fit, Samples
 
 Array = NDArray[np.float64]
@@ -26,7 +27,6 @@ ONE_SPEED = 0.05  # relative spread of the speeds of v that are one speed
 STUCK = 5  # samples at the largest or smallest y in a row, while v goes on
 APART = 0.02  # relative distance of two gaps that are not the same
 UNDECIDED = 6.0  # log-likelihood by which another gap may fall behind
-CANCELS = 0.01  # distance of a pole and a zero, relative to that from 1
 
 
 class Evidence(NamedTuple):
@@ -52,8 +52,6 @@ class Evidence(NamedTuple):
     rivals: list[tuple[float, float]]
     gain: float
     quantum: float
-    poles: NDArray[np.complex128]
-    zeros: NDArray[np.complex128]
 
 
 def reasons(e: Evidence) -> list[str]:
@@ -92,6 +90,12 @@ def reasons(e: Evidence) -> list[str]:
     unexplained = unexplained_of(e)
     if unexplained > UNEXPLAINED:
         found.append(_why_unexplained(e, unexplained))
+    c_l = e.fit.c_r - gap
+    if e.fit.c_r < -SURE * e.c_r_std or c_l > SURE * e.c_r_std:
+        found.append(
+            f'0 of v lies outside of the gap (c_r = {e.fit.c_r:.4g}, c_l = {c_l:.4g}), where the '
+            'controller expects it: shift the zero of v, or that of y'
+        )
     return found
 
 
@@ -116,16 +120,10 @@ def remarks(e: Evidence) -> list[str]:
             'v moved at one speed only: a lag before the gap would look like a wider gap; move v '
             'at several speeds'
         )
-    c_l = e.fit.c_r - gap
-    if e.fit.c_r < -SURE * e.c_r_std or c_l > SURE * e.c_r_std:
+    cancelled = cancelled_pole(e.fit)
+    if cancelled is not None:
         found.append(
-            f'0 of v lies outside of the gap (c_r = {e.fit.c_r:.4g}, c_l = {c_l:.4g}), where the '
-            'controller expects it: shift the zero of v, or that of y'
-        )
-    pair = _cancelling(e.poles, e.zeros)
-    if pair is not None:
-        found.append(
-            f'the pole {_text(pair)} is cancelled by a zero: a lower order does as well; limit '
+            f'the pole {_text(cancelled)} is cancelled by a zero: a lower order does as well; limit '
             '--order'
         )
     if e.held_out > WORSE_LATER * e.trained:
@@ -191,15 +189,6 @@ def _one_speed(v: Array) -> bool:
     speeds = np.abs(np.diff(v))
     speeds = speeds[speeds > 0.01 * speeds.max(initial=0.0)]
     return bool(len(speeds) and np.std(speeds) < ONE_SPEED * np.mean(speeds))
-
-
-def _cancelling(
-    poles: NDArray[np.complex128], zeros: NDArray[np.complex128],
-) -> complex | None:
-    for pole in poles:
-        if len(zeros) and np.abs(zeros - pole).min() < CANCELS * max(abs(1.0 - pole), 0.01):
-            return complex(pole)
-    return None
 
 
 def _text(root: complex) -> str:

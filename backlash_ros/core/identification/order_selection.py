@@ -1,6 +1,6 @@
 """Which order, delay and integrator: compared on samples that the fit has not seen.
 
-Structures whose held-out error is within a few percent of the least are equally good predictors.
+A pole that a zero cancels is none. Structures whose held-out error is within a few percent of the least are equally good predictors.
 Among them the least
 
     N' log(squares) + 2 unknowns log(N)
@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 PENALTY = 2.0  # of an unknown, in logarithms of the number of samples
 WITHIN = 1.05  # times the least held-out error: equally good
 EXTRA_POLES = (0.3, 0.85)  # where one more pole than in the order below may begin
+CANCELS = 0.02  # distance of a pole and a zero that cancel, relative to that of the pole from 1
+SLOWEST = 0.01  # ... which counts as this much at least: a zero at 1 cancels an integrator
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
 
 
@@ -86,7 +88,20 @@ def selected(compared: Sequence[Compared]) -> Compared:
     """The structure that is taken."""
     least = min(one.held_out for one in compared)
     good = [one for one in compared if one.held_out <= WITHIN * least]
-    return min(good, key=lambda one: one.criterion)
+    plain = [one for one in good if cancelled_pole(one.fit) is None]
+    return min(plain or good, key=lambda one: one.criterion)
+
+
+def cancelled_pole(found: Fit) -> complex | None:
+    """A pole that a zero all but cancels, so that neither shows; None where there is none."""
+    zeros = np.roots(found.numerator)
+    if not len(zeros) or not np.isfinite(zeros).all():
+        return None
+    for pole in np.roots(found.denominator):
+        near = float(np.abs(zeros - pole).min())
+        if near < CANCELS * max(abs(1.0 - pole), SLOWEST):
+            return complex(pole)
+    return None
 
 
 def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:

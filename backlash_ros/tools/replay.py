@@ -1,0 +1,188 @@
+"""`replay`: a recorded run through the controller once more, with other parameters if wanted."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from math import inf, isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from backlash_ros.core.parameter_table import Value
+from backlash_ros.tools.command_line import (
+    OptionParser,
+    format_table,
+    print_warnings,
+    run_tool,
+)
+from backlash_ros.tools.errors import InputError
+
+if TYPE_CHECKING:
+    from backlash_ros.core.parameters import Parameters
+    from backlash_ros.core.run_record import RunRecord
+
+EXECUTABLE = 'replay'
+FIGURE, TABLE = 'replay.png', 'replays.csv'
+HEADER = ('run', 'changed', 'm', 'c_r', 'c_l', 'std_m', 'std_c_r', 'std_c_l', 'tracking from [s]',
+          'innovation RMS')
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The options."""
+    parser = OptionParser(EXECUTABLE, description=__doc__)
+    parser.add_argument('runs', type=Path, nargs='+', metavar='RUN',
+                        help='a bag, or a folder of results; several give a table')
+    parser.add_argument('--config', type=Path, metavar='FILE',
+                        help='parameters (default: parameters.yaml beside the run)')
+    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
+                        dest='settings', help='change one parameter; may be given again')
+    parser.add_argument('--sweep', action='append', default=[], metavar='KEY=V1,V2,...',
+                        help='once for each value; several sweeps: for each combination')
+    parser.add_argument('--axis', default='', metavar='NAME', help='of a bag with several')
+    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
+                        help='leave out what was before this time [s]')
+    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
+                        help='leave out what was from this time [s] on')
+    parser.add_argument('--out', type=Path, metavar='DIR',
+                        help='folder of the results (default: results/<UTC time>, and '
+                             'results/latest points at it)')
+    return parser
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `replay`."""
+    return run_tool(EXECUTABLE, lambda: _replay(args))
+
+
+def _replay(args: Sequence[str] | None) -> None:
+    parser = make_parser()
+    options = parser.parse_args(args)
+    if not options.from_s < options.to_s:
+        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+    from backlash_ros.tools.batch import combinations, parse_sweep, value_text
+    changes = combinations([parse_sweep(text) for text in options.sweep])
+    runs = [(path, *_opened(path, options)) for path in options.runs]
+    jobs = []
+    for path, recorded, parameters in runs:
+        for change in changes:
+            changed = parameters.replaced(change) if change else parameters
+            words = ' '.join(f'{name}={value_text(value)}' for name, value in change.items())
+            jobs.append((path, recorded, changed, words))
+    if len(jobs) > 1:
+        _several(jobs, options.out)
+    else:
+        _one(jobs[0], options.out)
+
+
+def _opened(path: Path, options: argparse.Namespace) -> tuple[RunRecord, Parameters]:
+    """The run, and the parameters with which it is to be replayed."""
+    from backlash_ros.tools.bag_sections import Span
+    from backlash_ros.tools.report import open_source
+    source = open_source(
+        path.resolve(), options.config, Span(options.from_s, options.to_s), options.axis
+    )
+    for text in (source.damage, *source.notes):
+        if text:
+            print(f'{EXECUTABLE}: warning: {text}', file=sys.stderr)
+    if source.run.samples == 0:
+        raise InputError(f'{path}: holds no sample')
+    if source.parameters is None:
+        raise InputError(f'{path}: no parameters.yaml stands beside it: give --config')
+    return source.run, _with_settings(source.parameters, options.settings)
+
+
+def _with_settings(parameters: Parameters, settings: Sequence[str]) -> Parameters:
+    from backlash_ros.tools.configuration import parse_setting
+    changes: dict[str, Value] = {}
+    for text in settings:
+        setting = parse_setting(text)
+        if setting.axis:
+            raise InputError(f'--set {text!r}: leave out the axis: there is one run')
+        changes[setting.name] = setting.value
+    return parameters.replaced(changes) if changes else parameters
+
+
+def _run(recorded: RunRecord, parameters: Parameters, title: str) -> RunRecord:
+    from tqdm import tqdm
+
+    from backlash_ros.core.replay import replay
+    from backlash_ros.tools.errors import BrokenOffError
+    with tqdm(total=recorded.samples, file=sys.stderr, disable=None, leave=False, desc=title) \
+            as bar:
+        try:
+            return replay(recorded, parameters, lambda _: bar.update())
+        except ValueError as error:
+            raise BrokenOffError(f'the replay broke off: {error}') from error
+
+
+def _one(job: tuple[Path, RunRecord, Parameters, str], out: Path | None) -> None:
+    """What `simulate` writes, a figure beside it, and where the replay parts from the run."""
+    path, recorded, parameters, _ = job
+    print_warnings(EXECUTABLE, parameters)
+    replayed = _run(recorded, parameters, path.name)
+    from backlash_ros.files import write_atomically
+    from backlash_ros.tools.drawing import png
+    from backlash_ros.tools.replay_figure import draw_replay
+    from backlash_ros.tools.report import PAGE, report_run
+    from backlash_ros.tools.results import result_directory
+    directory = result_directory(out)
+    summary = report_run(replayed, directory, parameters)
+    write_atomically(directory / FIGURE, png(draw_replay(recorded, replayed)))
+    print(format_table(('', 'run', 'replay', '±'), _compared(recorded, summary)))
+    print(_parted(recorded, replayed))
+    print(directory / FIGURE)
+    print(directory / PAGE)
+
+
+def _compared(recorded: RunRecord, summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    return [
+        (name, f'{recorded.column(name)[-1]:.6g}', f'{summary["final"][name]:.6g}',
+         f'{summary["final_std"][name]:.2g}')
+        for name in ('m', 'c_r', 'c_l')
+    ]
+
+
+def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
+    from backlash_ros.core.replay import parting
+    parted = parting(recorded, replayed)
+    if parted is None:
+        return 'the estimates are those of the run, to the last bit'
+    return (
+        f'the estimates part from those of the run at t = {parted.t:.4g} s: {parted.name} was '
+        f'{parted.recorded:.6g} and is {parted.replayed:.6g}; by {parted.largest:.3g} standard '
+        'deviations at most'
+    )
+
+
+def _several(jobs: Sequence[tuple[Path, RunRecord, Parameters, str]], out: Path | None) -> None:
+    """A table with a row for each run and each value."""
+    from backlash_ros.tools.results import result_directory, write_table
+    rows: list[tuple[object, ...]] = []
+    for path, recorded, parameters, words in jobs:
+        replayed = _run(recorded, parameters, f'{path.name} {words}')
+        rows.append((str(path), words, *_figures(replayed)))
+    directory = result_directory(out)
+    write_table(directory / TABLE, HEADER, rows)
+    print(format_table(HEADER, [
+        tuple(f'{cell:.4g}' if isinstance(cell, float) and isfinite(cell) else
+              '–' if isinstance(cell, float) else str(cell) for cell in row) for row in rows
+    ]))
+    print(directory / TABLE)
+
+
+def _figures(run: RunRecord) -> tuple[float, ...]:
+    import numpy as np
+
+    from backlash_ros.core.estimation.protocol import Status
+    last = [float(run.column(name)[-1]) for name in HEADER[2:8]]
+    tracking = np.flatnonzero(run.column('status') == Status.TRACKING)
+    begins = float(run.column('t')[tracking[0]]) if len(tracking) else float('nan')
+    innovation = run.column('innovation')[run.samples // 2:]
+    known = innovation[np.isfinite(innovation)]
+    rms = float(np.sqrt(np.mean(known**2))) if len(known) else float('nan')
+    return (*last, begins, rms)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
