@@ -39,7 +39,7 @@ from backlash_ros.nodes.driver_findings import (
 )
 from backlash_ros.nodes.driver_motion import record_of
 from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
-from backlash_ros.nodes.gentle_drive import GentleDrive, drive_range
+from backlash_ros.nodes.gentle_drive import Drive, GentleDrive, Range, drive_range
 from backlash_ros.nodes.messages import DEPTH
 from backlash_ros.nodes.presence import Presence
 from backlash_ros.nodes.prompt_executor import PromptExecutor
@@ -73,7 +73,7 @@ class CheckDriverNode(ProcessNode):
         self._limits = (
             drive_range(self.settings, options.amplitude, options.rate) if options.drive else None
         )
-        self._drive: GentleDrive | None = None
+        self._drive: Drive | None = None
         self._driving = False
         self._heard, self._graph = Heard(), Graph()
         self._range_left: float | None = None
@@ -194,11 +194,11 @@ class CheckDriverNode(ProcessNode):
             self._range_left = y
             return
         if self._drive is None:
-            self._drive = GentleDrive(
-                self._limits, self._period, self._options.duration, self._options.rising,
-                self._v_at_start(),
-            )
+            self._drive = self._begin_drive(self._limits)
         self._command(self._drive.step())
+
+    def _begin_drive(self, limits: Range) -> Drive:
+        return GentleDrive(limits, self._period, self._options.duration, self._v_at_start())
 
     def _v_at_start(self) -> float:
         """The v that acts before the drive, 0 where nobody says it."""
@@ -373,8 +373,6 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
                         help='drive: keep v within ±V as well')
     parser.add_argument('--rate', type=_positive, metavar='V_PER_S',
                         help='drive: keep v slower than this as well')
-    parser.add_argument('--rising', action='store_true',
-                        help='drive: once upwards without turning back, to find G(z)')
     parser.add_argument('--rest', type=_positive, default=30.0, metavar='SECONDS',
                         help='drive: longest way to rest at the end, after which v is held '
                              '(default: 30); a signal on that way holds v at once')
@@ -385,8 +383,6 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     for name in ('amplitude', 'rate'):
         if getattr(options, name) is not None and not options.drive:
             parser.error(f'--{name} says how to drive: give --drive as well')
-    if options.rising and not options.drive:
-        parser.error('--rising says how to drive: give --drive as well')
     return options
 
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from math import inf, pi, sin
 
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.parameters import Parameters
 
 PERIODS = 3.0  # of the slower sine, where the speed allows them
 SHARE, FASTER = 0.3, 2.7  # of the second sine; together they tell a delay from a wider gap
 STEEPEST = 1.0 - SHARE + SHARE * FASTER
-STEPS = 24  # on the way up; each shows the response of G at all frequencies
-UNEVEN = 0.618  # share of a step by which their times differ, lest they excite one frequency only
 
 
 @dataclass(frozen=True)
@@ -54,25 +53,37 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
     return Range(low, high, speed)
 
 
-class GentleDrive:
-    """v(k) from one sample to the next.
+class Drive:
+    """v(k) from one sample to the next within limits; `step` is for subclasses."""
 
-    rising: once from the lower to the upper limit, step by step, instead of to and fro.
-    """
+    def __init__(self, limits: Range, sample_period: float, v: float) -> None:
+        self.limits, self.v = limits, v
+        self._sample_period = sample_period
+        self._move = limits.rate * sample_period
+
+    def step(self) -> float:
+        """The next v."""
+        raise NotImplementedError
+
+    def step_to_rest(self) -> bool:
+        """Move v towards rest; return whether it has got there."""
+        return self._towards(self.limits.rest) == self.limits.rest
+
+    def _towards(self, target: float) -> float:
+        self.v = min(max(target, self.v - self._move), self.v + self._move)
+        return self.v
+
+
+class GentleDrive(Drive):
+    """To and fro along two sines."""
 
     def __init__(
-        self, limits: Range, sample_period: float, duration: float, rising: bool = False,
-        v: float = 0.0,
+        self, limits: Range, sample_period: float, duration: float, v: float = 0.0,
     ) -> None:
-        self.limits, self.v = limits, v
-        self._move = limits.rate * sample_period
-        self._sample_period, self._rising = sample_period, rising
+        super().__init__(limits, sample_period, v)
         self._t = 0.0
         half = 0.5 * (limits.high - limits.low)
-        if rising:
-            self._speed = 1.0 / max(duration - 2.0 * half / limits.rate, sample_period)
-        else:
-            self._speed = min(2.0 * pi * PERIODS / duration, limits.rate / (half * STEEPEST))
+        self._speed = min(2.0 * pi * PERIODS / duration, limits.rate / (half * STEEPEST))
 
     def step(self) -> float:
         """The next v, towards the wave."""
@@ -83,21 +94,24 @@ class GentleDrive:
             self._t += self._sample_period
         return v
 
-    def step_to_rest(self) -> bool:
-        """Move v towards rest; return whether it has got there."""
-        return self._towards(self.limits.rest) == self.limits.rest
-
-    def _towards(self, target: float) -> float:
-        self.v = min(max(target, self.v - self._move), self.v + self._move)
-        return self.v
-
     def _wave(self) -> float:
         low, high = self.limits.low, self.limits.high
         x = self._speed * self._t
-        if self._rising:
-            steps = STEPS * min(x, 1.0)
-            number = int(steps)
-            up = number + (steps - number > UNEVEN * (number * UNEVEN % 1.0))
-            return low + (high - low) * min(up / STEPS, 1.0)
         swing = (1.0 - SHARE) * sin(x) + SHARE * sin(FASTER * x)
         return 0.5 * (low + high) + 0.5 * (high - low) * swing
+
+
+class IdentificationDrive(Drive):
+    """Strokes of several speeds and amplitudes, with rests, as core/identification has them."""
+
+    def __init__(
+        self, limits: Range, sample_period: float, duration: float, v: float = 0.0,
+    ) -> None:
+        super().__init__(limits, sample_period, v)
+        self._strokes = strokes(
+            limits.low, limits.high, limits.rate, sample_period, duration, v
+        )
+
+    def step(self) -> float:
+        """The next v."""
+        return self._towards(next(self._strokes))

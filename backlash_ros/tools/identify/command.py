@@ -7,11 +7,15 @@ import sys
 from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.tools.command_line import FAILED, OptionParser, run_tool
 from backlash_ros.tools.errors import InputError
+
+if TYPE_CHECKING:
+    from backlash_ros.tools.identify.measured_record import MeasuredRecord
 
 EXECUTABLE = 'identify'
 YAML, JSON, PAGE = 'identified.yaml', 'identified.json', 'identify.html'
@@ -51,6 +55,24 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--out', type=Path, metavar='DIR',
                         help='folder of the results (default: results/<UTC time>, and '
                              'results/latest points at it)')
+    drive = parser.add_argument_group('with --drive')
+    drive.add_argument('--drive', action='store_true',
+                       help='move the actuator within control.min, control.max and '
+                            'control.rate_max of --config, record, bring it to rest, identify')
+    drive.add_argument('--duration', type=_positive, metavar='S', default=20.0,
+                       help='longest motion [s] (default: 20)')
+    drive.add_argument('--precision', type=_percent, default=0.0, metavar='P%',
+                       help='end the motion as soon as gap and G are known to this (default: 0, '
+                            'the whole duration)')
+    drive.add_argument('--amplitude', type=_positive, metavar='V', help='keep v within ±V as well')
+    drive.add_argument('--rate', type=_positive, metavar='V_PER_S',
+                       help='keep v slower than this as well')
+    drive.add_argument('--output-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
+                       help='end the motion when y leaves this range')
+    drive.add_argument('--wait', type=_positive, default=10.0, metavar='S',
+                       help='how long to wait for a driver (default: 10)')
+    drive.add_argument('--rest', type=_positive, default=30.0, metavar='S',
+                       help='longest way to rest at the end (default: 30)')
     return parser
 
 
@@ -78,6 +100,13 @@ def _positive(text: str) -> float:
     return number
 
 
+def _percent(text: str) -> float:
+    number = float(text.removesuffix('%')) / (100.0 if text.endswith('%') else 1.0)
+    if not 0.0 <= number < 1.0:
+        raise argparse.ArgumentTypeError(f'{text} must be like 1% or 0.01')
+    return number
+
+
 def _share(text: str) -> float:
     number = float(text)
     if not 0.1 <= number <= 0.6:
@@ -95,25 +124,41 @@ def main(args: Sequence[str] | None = None) -> int:
 def _identify(args: Sequence[str] | None) -> bool:
     """Do what the options say; returns whether the result is of use."""
     parser = make_parser()
-    options = parser.parse_args(args)
-    if options.record is None:
-        parser.error('give a RECORD')
+    arguments = list(sys.argv[1:] if args is None else args)
+    # Names of topics are changed as for every node.
+    of_ros = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
+    options = parser.parse_args(arguments[:of_ros])
+    if options.drive == (options.record is not None):
+        parser.error('give a RECORD, or --drive')
     if not options.from_s < options.to_s:
         parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
-    # numpy, scipy and matplotlib are loaded once the options are known to be right.
-    from backlash_ros.tools.bag_sections import Span
-    from backlash_ros.tools.identify.measured_record import read_measured
+    if arguments[of_ros:] and not options.drive:
+        parser.error('--ros-args are for --drive')
     given = given_values(options.config, options.axis)
-    period = given.get('sample_period')
-    record = read_measured(
-        options.record, float(period) if isinstance(period, float) else None,
-        Span(options.from_s, options.to_s), options.axis,
-    )
+    record = _recorded(options, given, arguments[of_ros:])
     for note in record.notes:
         print(f'{EXECUTABLE}: warning: {note}', file=sys.stderr)
     from backlash_ros.tools.identify.outcome import identified, write_outcome
     found = identified(record, options)
     return write_outcome(found, record, given, options)
+
+
+def _recorded(
+    options: argparse.Namespace, given: Mapping[str, Value], ros_arguments: Sequence[str],
+) -> MeasuredRecord:
+    # numpy, scipy and matplotlib are loaded once the options are known to be right.
+    if options.drive:
+        from backlash_ros.tools.identify.drive import drive
+        if options.axis:
+            ros_arguments = [*(ros_arguments or ['--ros-args']), '-r', f'__ns:=/{options.axis}']
+        return drive(options, given, ros_arguments)
+    from backlash_ros.tools.bag_sections import Span
+    from backlash_ros.tools.identify.measured_record import read_measured
+    period = given.get('sample_period')
+    return read_measured(
+        options.record, float(period) if isinstance(period, float) else None,
+        Span(options.from_s, options.to_s), options.axis,
+    )
 
 
 def given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
