@@ -209,21 +209,30 @@ def from_messages(
     period = float(np.median(steps)) * 1e-9 if sample_period is None else sample_period
     if not period > 0.0:
         raise InputError(f'{path}: its stamps do not tell the sample period: give --config')
-    jumps = np.round(steps * 1e-9 / period)
-    # A sample that comes at once after another one is none.
-    kept = np.append(True, jumps >= 1.0)
-    index = np.append(0.0, np.cumsum(jumps))[kept].astype(np.int64)
+    index = _numbered(steps * 1e-9 / period)
     if index[-1] >= LONGEST:
         raise InputError(f'{path}: spans {index[-1]:.3g} sample periods of {period:g} s')
     count = int(index[-1]) + 1
     y = np.full(count, nan)
-    y[index] = values[kept]
+    y[index] = values
     begin = stamps[0]
-    times = np.interp(np.arange(1, count + 1), index, (stamps[kept] - begin).astype(float))
+    times = np.interp(np.arange(1, count + 1), index, stamps - begin)
     times[-1] = inf
     newest = np.searchsorted((commands[0] - begin).astype(float), times, side='right') - 1
     v = np.append(commands[1], nan)[newest]
     return _usable(path, v, y, period)
+
+
+def _numbered(steps: Array) -> NDArray[np.int64]:
+    """Number of each sample from the steps of time between them, in sample periods.
+
+    Samples are late, never early: those that come in a heap belong before the last of it.
+    """
+    times = np.append(0.0, np.cumsum(np.round(steps))).astype(np.int64)
+    # Strictly rising, the last of a heap keeping its place.
+    place = np.arange(len(times))
+    numbers = np.minimum.accumulate((times - place)[::-1])[::-1] + place
+    return np.asarray(numbers - numbers[0], dtype=np.int64)
 
 
 def by_topic(rows: Sequence[tuple[str, int, float]]) -> Mapping[str, tuple[Array, Array]]:
