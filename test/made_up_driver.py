@@ -64,16 +64,15 @@ def heard_from_driver(
     it publishes applied_control. limit: of v inside the driver. rising: v only rises, from
     0, so that the left side is never engaged.
     """
-    low = 0.0 if rising else reach * LIMITS.low
-    limits = Range(low, reach * LIMITS.high, LIMITS.rate)
-    drive = GentleDrive(limits, PERIOD_S, samples * PERIOD_S, rising)
+    limits = Range(reach * LIMITS.low, reach * LIMITS.high, LIMITS.rate)
+    drive = GentleDrive(limits, PERIOD_S, samples * PERIOD_S)
     plant = build_plant(plant_parameters())
     v: list[float] = []
     y: list[float] = []
     applied: list[float] = []
     for k in range(samples):
         y.append(sign * plant.measure())
-        v.append(drive.step())
+        v.append(reach * LIMITS.high * k / samples if rising else drive.step())
         late = v[k - delay] if k >= delay else 0.0
         applied.append(min(max(late, -limit), limit))
         plant.step(applied[-1])

@@ -18,7 +18,6 @@ from ros_processes import Probe, RosWorld, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.nodes.gentle_drive import GentleDrive, Range
 from backlash_ros.tools.processes import child_environment, free_domain
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,9 +50,6 @@ motor_driver.motor = SlowMotor(motor_driver.SAMPLE_PERIOD_S)
 motor_driver.main()
 """
 PATHS = os.pathsep.join((str(EXAMPLES), str(ROOT)))
-sys.path.insert(0, str(EXAMPLES))
-from find_model import find_model, rising_part  # noqa: E402
-from simulated_motor import ENCODER_STEP, SimulatedMotor  # noqa: E402
 
 
 @contextmanager
@@ -111,20 +107,6 @@ def test_example_drivers_end_on_a_signal(
             )
             process.send_signal(number)
             assert process.wait(DEADLINE_S) == 0
-
-
-def test_model_is_found_from_a_rising_record() -> None:
-    motor, drive = SimulatedMotor(0.005), GentleDrive(Range(-12.6, 12.6, 300.0), 0.005, 5.0, True)
-    v, y = np.empty(1000), np.empty(1000)
-    for k in range(1000):
-        y[k] = ENCODER_STEP * round(motor._x1 / ENCODER_STEP)
-        v[k] = drive.step()
-        motor.move_to(v[k])
-        motor._step()
-    numerator, denominator, noise_std = find_model(*rising_part(v, y, 100), 2)
-    assert numerator / 0.098 == pytest.approx([0.15678154, 0.12688103], rel=0.01)
-    assert denominator == pytest.approx([1.0, -1.24982552, 0.53348809], rel=0.01)
-    assert noise_std == pytest.approx(ENCODER_STEP / 12.0**0.5, rel=0.1)
 
 
 class MotorBench:
@@ -197,8 +179,9 @@ def runnable(words: list[str]) -> list[str]:
     modules = dict(
         re.findall(r"f'(\w+) = \{PACKAGE\}\.([\w.]+):main'", (ROOT / 'setup.py').read_text())
     )
-    for i, argument in enumerate(arguments[:-1]):
-        arguments[i + 1] = SHORT.get(argument, arguments[i + 1])
+    if name != 'identify':  # which needs its time
+        for i, argument in enumerate(arguments[:-1]):
+            arguments[i + 1] = SHORT.get(argument, arguments[i + 1])
     arguments = [a.replace('.venv/bin/python', sys.executable) for a in arguments]
     if name == 'python':
         return [sys.executable, *arguments]

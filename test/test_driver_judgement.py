@@ -33,7 +33,7 @@ from backlash_ros.nodes.driver_findings import (
     graph_findings,
 )
 from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
-from backlash_ros.nodes.gentle_drive import GentleDrive, Range, drive_range
+from backlash_ros.nodes.gentle_drive import GentleDrive, IdentificationDrive, Range, drive_range
 
 
 def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
@@ -303,12 +303,12 @@ def test_a_model_that_is_exact_is_not_called_off() -> None:
 
 @given(
     st.floats(-20.0, 5.0), st.floats(0.1, 30.0), st.floats(0.1, 200.0), st.floats(-3.0, 3.0),
-    st.booleans(),
+    st.sampled_from([GentleDrive, IdentificationDrive]),
 )
-def test_gentle_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, rising) -> None:
+def test_a_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, kind) -> None:
     limits = Range(low, low + width, rate)
     start = min(max(start, limits.low), limits.high)
-    drive = GentleDrive(limits, 0.01, 2.0, rising, start)
+    drive = kind(limits, 0.01, 2.0, start)
     path = [start] + [drive.step() for _ in range(200)]
     for _ in range(100_000):
         done = drive.step_to_rest()
@@ -320,13 +320,6 @@ def test_gentle_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start
     assert moves.max() <= rate * 0.01 * (1.0 + 1e-9) + 1e-12
     assert min(path) >= limits.low
     assert max(path) <= limits.high
-
-
-def test_rising_drive_never_turns_back_once_it_has_begun() -> None:
-    drive = GentleDrive(LIMITS, 0.01, 4.0, rising=True, v=LIMITS.low)
-    path = [drive.step() for _ in range(400)]
-    assert np.all(np.diff(path) >= 0.0)
-    assert path[-1] == LIMITS.high
 
 
 @pytest.mark.parametrize(('limits', 'name'), [

@@ -78,17 +78,31 @@ class HeldOut(NamedTuple):
     trained: float
 
 
+class Details(NamedTuple):
+    """What pictures show. samples: all that was fitted; searched: the part of it, from sample
+    searched_from on, in which structures were compared. profile: of the gap."""
+
+    samples: Samples
+    searched: Samples
+    searched_from: int
+    fit: Fit
+    covariance: Covariance
+    compared: tuple[Compared, ...]
+    chosen: Compared
+    profile: Profile
+    held_out: HeldOut
+
+
 @dataclass(frozen=True)
 class Identification:
     """What was found. u = m (p - c_r), y = z^-delay numerator / denominator u + noise.
 
     std: deviations of gap, c_r, c_l and, for m, of the product of m and the gain of G. delays: that
-    explain y equally well. response_std: relative deviation of G at `frequencies` [rad/sample],
-    between which y moves.
-    uncertainty: of G, as the parameter plant.uncertainty. reasons: why it is of no use, remarks:
-    what to know, a sentence each. samples, fit, covariance, compared, profile, held_out: what pictures
-    show; None where nothing was fitted. searched: the part, from sample searched_from on, in which
-    structures were compared. outliers: samples of y that were left out.
+    explain y equally well. quantum: step of a quantised y, 0 for none. correlation: of successive
+    residuals beyond chance. ljung_box: probability of a white residual. response_std: relative
+    deviation of G at `frequencies` [rad/sample], between which y moves. uncertainty: of G, as the
+    parameter plant.uncertainty. outliers: samples of y that were left out. reasons: why it is of no
+    use, remarks: what to know, a sentence each. details: None where nothing was fitted.
     """
 
     sample_period: float
@@ -114,15 +128,7 @@ class Identification:
     outliers: int = 0
     reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
-    samples: Samples | None = None
-    searched: Samples | None = None
-    searched_from: int = 0
-    fit: Fit | None = None
-    covariance: Covariance | None = None
-    compared: tuple[Compared, ...] = ()
-    chosen: Compared | None = None
-    profile: Profile | None = None
-    held_out: HeldOut | None = None
+    details: Details | None = None
 
     @property
     def usable(self) -> bool:
@@ -182,7 +188,7 @@ def identifying(
     yield 'judging'
     return _described(
         samples, searched, best, compared, chosen, rivals, curve, outliers,
-        Identification(sample_period, v, y, searched_from=part.start), options,
+        Identification(sample_period, v, y), options, part.start,
     )
 
 
@@ -257,10 +263,11 @@ def _refined(
     """The best fit of the chosen structure, other minima (gap, how far behind), the profile."""
     structure, swing = chosen.structure, samples.play.swing
     best = chosen.fit
-    whole = np.append(0.0, np.geomspace(1e-3, 0.99, PROFILE_GAPS) * swing)
+    whole: Array = np.append(0.0, np.geomspace(1e-3, 0.99, PROFILE_GAPS) * swing)
     curve = yield from profile(samples, structure, whole, best)
-    around = best.point.gap * NEAR
-    near = yield from profile(samples, structure, around[(around > 0.0) & (around < swing)], best)
+    around: Array = best.point.gap * NEAR
+    around = around[(around > 0.0) & (around < swing)]
+    near = yield from profile(samples, structure, around, best)
     minima: list[Fit] = []
     for minimum in [*near.minima()[:3], *curve.minima()[:3]]:
         minima.append(fit(samples, structure, minimum.point))
@@ -294,7 +301,7 @@ def _on_all(samples: Samples, best: Fit) -> Fit:
 def _described(
     samples: Samples, searched: Samples, best: Fit, compared: Sequence[Compared],
     chosen: Compared, rivals: list[tuple[float, float]], curve: Profile, outliers: int,
-    given: Identification, options: Options,
+    given: Identification, options: Options, searched_from: int,
 ) -> Identification:
     """Everything there is to say of the best fit."""
     covariance = uncertainty.covariance_of(samples, best)
@@ -302,7 +309,8 @@ def _described(
     gap_var, c_r_var = float(crossings[0, 0]), float(crossings[1, 1])
     c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
     band = frequencies_of(best.simulated)
-    frequencies = np.geomspace(max(band[0], np.pi / samples.count), max(band[1], 1e-3), FREQUENCIES)
+    low = max(band[0], np.pi / samples.count)
+    frequencies = np.geomspace(low, max(band[1], 1.01 * low), FREQUENCIES, dtype=np.float64)
     spread = uncertainty.response_std(best, covariance, frequencies)
     gain_std = float(uncertainty.response_std(best, covariance, np.zeros(1))[0])
     residual = samples.y - best.simulated
@@ -332,8 +340,10 @@ def _described(
         ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
         uncertainty=_as_parameter(float(spread.max())), outliers=outliers,
         reasons=tuple(judgement.reasons(evidence)), remarks=tuple(judgement.remarks(evidence)),
-        samples=samples, searched=searched, fit=best, covariance=covariance, compared=tuple(compared),
-        chosen=chosen, profile=curve, held_out=held_out,
+        details=Details(
+            samples, searched, searched_from, best, covariance, tuple(compared), chosen, curve,
+            held_out,
+        ),
     )
 
 

@@ -123,8 +123,8 @@ def remarks(e: Evidence) -> list[str]:
     cancelled = cancelled_pole(e.fit)
     if cancelled is not None:
         found.append(
-            f'the pole {_text(cancelled)} is cancelled by a zero: a lower order does as well; limit '
-            '--order'
+            f'the pole {_text(cancelled)} is cancelled by a zero: a lower order does as well; '
+            'limit --order'
         )
     if e.held_out > WORSE_LATER * e.trained:
         found.append(

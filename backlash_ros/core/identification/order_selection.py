@@ -1,13 +1,13 @@
 """Which order, delay and integrator: compared on samples that the fit has not seen.
 
-A pole that a zero cancels is none. Structures whose held-out error is within a few percent of the least are equally good predictors.
-Among them the least
+A pole that a zero cancels is none. Structures whose held-out error is within a few percent of the
+least are equally good predictors. Among them the least
 
     N' log(squares) + 2 unknowns log(N)
 
 over all samples is taken (BIC with twice its penalty: a pole that a zero nearly cancels costs more
-in the loop than it tells), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the residual: what repeats
-itself from sample to sample, as the error of a quantised y does, speaks less often.
+in the loop than it tells), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the
+residual: what repeats itself from sample to sample, as the error of a quantised y, speaks less.
 """
 
 from __future__ import annotations
@@ -40,8 +40,10 @@ PLATEAU = 10.0  # difference of the criterion below which two delays are equally
 
 
 class Compared(NamedTuple):
-    """One structure. trained: fitted to the first part, with which held_out, the rms of the error on
-    the last part, is made. fit: to all samples. criterion: as above, the smaller the better.
+    """One structure.
+
+    trained: fitted to the first part, with which held_out, the rms of the error on the last part,
+    is made. fit: to all samples. criterion: as above, the smaller the better.
     """
 
     structure: Structure

@@ -243,7 +243,8 @@ def fit(
         diagonal[diagonal <= 0.0] = 1.0
         before = linear.squares
         while damping < MOST_DAMPING:
-            step = np.linalg.lstsq(gram + damping * np.diag(diagonal), downhill, rcond=None)[0]
+            damped = gram + damping * np.diag(diagonal)
+            step = np.asarray(np.linalg.lstsq(damped, downhill, rcond=None)[0], dtype=np.float64)
             new = _moved(point, step, gap_free, top, v0)
             if largest_pole(new.a) <= 1.0:
                 new_play, new_linear = evaluate(new)

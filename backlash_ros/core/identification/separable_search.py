@@ -56,11 +56,11 @@ class Profile(NamedTuple):
 def search(samples: Samples, structure: Structure) -> Generator[None, None, list[Fit]]:
     """Fits with everything free from the best minima, the best first; yields between pieces."""
     swing = samples.play.swing
-    gaps = np.append(0.0, np.geomspace(SMALLEST, 0.98, GAPS) * swing)
+    gaps: Array = np.append(0.0, np.geomspace(SMALLEST, 0.98, GAPS) * swing)
     first = yield from profile(samples, structure, gaps)
     found: list[Fit] = []
     for minimum in first.minima()[:MINIMA]:
-        around = minimum.point.gap * np.linspace(1.0 - NEAR, 1.0 + NEAR, NEAR_GAPS)
+        around: Array = minimum.point.gap * np.linspace(1.0 - NEAR, 1.0 + NEAR, NEAR_GAPS)
         around = around[around < swing]
         if not len(around):
             found.append(minimum)

@@ -139,7 +139,9 @@ def response_std(found: Fit, covariance: Covariance, frequencies: Array) -> Arra
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
-def root_covariances(coefficients: Array, covariance: Array) -> tuple[NDArray[np.complex128], Array]:
+def root_covariances(
+    coefficients: Array, covariance: Array,
+) -> tuple[NDArray[np.complex128], Array]:
     """Roots of c[0] z^n + ... (n,), and the covariance of (real, imaginary) of each, (n, 2, 2).
 
     covariance: of the coefficients.
@@ -157,15 +159,3 @@ def root_covariances(coefficients: Array, covariance: Array) -> tuple[NDArray[np
         both = np.vstack([by.real, by.imag])
         out[k] = both @ covariance @ both.T
     return roots, out
-
-
-def time_constant_spread(found: Fit, covariance: Covariance) -> float:
-    """Largest relative deviation of log(pole): of time constants, frequencies and damping."""
-    count = covariance.poles
-    matrix = np.zeros((count + 1, count + 1))
-    matrix[1:, 1:] = covariance.matrix[:count, :count]
-    roots, spreads = root_covariances(np.append(1.0, found.point.a), matrix)
-    size = np.maximum(np.abs(roots * np.log(np.where(roots == 0.0, 1e-12, roots))), 1e-12)
-    return max((float(np.sqrt(np.trace(c)) / s) for c, s in zip(spreads, size, strict=True)),
-               default=0.0)
-

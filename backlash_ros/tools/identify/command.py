@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
-
 
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.tools.command_line import FAILED, OptionParser, run_tool
@@ -34,7 +33,8 @@ def make_parser() -> argparse.ArgumentParser:
                         help='a bag, a folder of results, or a CSV with t, v, y (lost y empty)')
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameter file that the result goes on from: limits, topics, axes')
-    parser.add_argument('--axis', default='', metavar='NAME', help='of several: the one that is meant')
+    parser.add_argument('--axis', default='', metavar='NAME',
+                        help='of several: the one that is meant')
     parser.add_argument('--order', type=_range_to(HIGHEST_ORDER, 1), default=(1, 2, 3, 4),
                         metavar='N[-N]', help='numbers of poles that are compared (default: 1-4)')
     parser.add_argument('--delay', type=_range_to(LONGEST_DELAY, 0), default=(0, 1, 2, 3),
@@ -76,7 +76,7 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _range_to(most: int, least: int) -> object:
+def _range_to(most: int, least: int) -> Callable[[str], tuple[int, ...]]:
     def parse(text: str) -> tuple[int, ...]:
         first, dash, last = text.partition('-')
         try:

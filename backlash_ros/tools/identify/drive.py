@@ -118,7 +118,7 @@ def _follow(
 
 
 def _told(found: Identification) -> str:
-    if found.fit is None:
+    if found.details is None:
         return found.reasons[0]
     return (
         f'gap {found.gap:.4g} ± {found.std["gap"]:.1g}, c_r {found.c_r:.4g} ± '

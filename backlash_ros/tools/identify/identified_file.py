@@ -102,7 +102,7 @@ def numbers(found: Identification) -> dict[str, Any]:
     return {
         'usable': found.usable, 'reasons': list(found.reasons), 'remarks': list(found.remarks),
         'm': found.m, 'gap': found.gap, 'c_r': found.c_r, 'c_l': found.c_l,
-        'std': dict(found.std) if found.std else {name: None for name in ('m', 'gap', 'c_r', 'c_l')},
+        'std': dict(found.std) or dict.fromkeys(('m', 'gap', 'c_r', 'c_l')),
         'numerator': list(found.numerator), 'denominator': list(found.denominator),
         'delay_samples': found.delay, 'equally_good_delays': list(found.delays),
         'integrator': found.integrator, 'sample_period': found.sample_period,
@@ -112,8 +112,9 @@ def numbers(found: Identification) -> dict[str, Any]:
             'frequency_hz': (found.frequencies / (2.0 * np.pi * found.sample_period)).tolist(),
             'relative_std': found.response_std.tolist(),
         },
-        'held_out': None if found.held_out is None else {
-            'rms': found.held_out.rms, 'rms_of_fit': found.held_out.trained,
+        'held_out': None if found.details is None else {
+            'rms': found.details.held_out.rms,
+            'rms_of_fit': found.details.held_out.trained,
         },
         'residual': {'lag_one_correlation': found.correlation, 'ljung_box_p': found.ljung_box},
         'samples': len(found.y), 'lost_samples': int(np.isnan(found.y).sum()),

@@ -143,7 +143,9 @@ def _usable(
     known = np.isfinite(v)
     first = int(np.argmax(known))
     newest = np.maximum.accumulate(np.where(known, np.arange(len(v)), 0))
-    return MeasuredRecord(v[newest][first:], y[first:], float(f'{period:.9g}'), str(path), tuple(notes))
+    return MeasuredRecord(
+        v[newest][first:], y[first:], float(f'{period:.9g}'), str(path), tuple(notes)
+    )
 
 
 def _cut(record: MeasuredRecord, span: Span) -> MeasuredRecord:

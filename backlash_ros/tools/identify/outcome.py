@@ -88,7 +88,7 @@ def write_record(record: MeasuredRecord, path: Path) -> None:
 
 
 def _tell(found: Identification, record: MeasuredRecord, out: Path) -> None:
-    if found.fit is not None:
+    if found.details is not None:
         print(format_table(('', 'found', '±'), [
             (name, f'{value:.6g}', f'{found.std[name]:.2g}')
             for name, value in (('gap', found.gap), ('c_r', found.c_r), ('c_l', found.c_l))

@@ -22,7 +22,7 @@ def render(
         f'<h1>{TITLE}</h1>', f'<p class="lead">{_headline(found, source)}</p>',
         *(f'<p class="warning">{escape(text)}</p>' for text in (*found.reasons, *found.remarks)),
     ]
-    if found.fit is not None:
+    if found.details is not None:
         parts += ['<section>', _numbers(found), _facts(found), '</section>']
     parts += [picture_section(picture) for picture in pictures]
     if parameters is not None:
@@ -56,7 +56,7 @@ def _facts(found: Identification) -> str:
     hertz = found.frequencies / (2.0 * np.pi * found.sample_period)
     delays = ' (' + ', '.join(map(str, found.delays)) + ' fit alike)' \
         if len(found.delays) > 1 else ''
-    held = found.held_out
+    held = found.details.held_out if found.details else None
     facts = [
         ('numerator of G', ', '.join(f'{value:.6g}' for value in found.numerator)),
         ('denominator of G', ', '.join(f'{value:.6g}' for value in found.denominator)),

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.identification import Identification
+from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.identification.uncertainty import (
     autocorrelation,
     response,
@@ -41,84 +41,81 @@ LOOP_POINTS = 4000
 
 def draw(found: Identification) -> Iterator[Picture]:
     """Every picture, in the order of the page; none where nothing was fitted."""
-    if found.fit is None:
+    details = found.details
+    if details is None:
         return
     yield Picture(
         'held_out.png', 'Measured and simulated y on samples that were held out',
         'Simulated from v alone, with a model that was fitted to the samples before: the lines '
         'should lie on each other, and the difference should look like noise.',
-        png(draw_held_out(found)),
+        png(draw_held_out(found, details)),
     )
     yield Picture(
         'residual.png', 'Residual of the fit',
         'y minus the simulation of the whole record. Its autocorrelation should stay within the '
         'band of white noise; the rounding of an encoder is allowed to leave it for a few lags. '
         'Over v it should show no shape: a slope or a hook is a nonlinearity that is not in the '
-        'model.', png(draw_residual(found)),
+        'model.', png(draw_residual(found, details)),
     )
     yield Picture(
         'gap.png', 'Misfit over the gap',
         'What is left over for each width of the gap, everything else fitted anew. One narrow '
         'valley: the gap is known. Two valleys of one depth: it is not.',
-        png(draw_profile(found)),
+        png(draw_profile(found, details)),
     )
     yield Picture(
         'orders.png', 'Orders and delays compared',
         'Error on the samples held out. The ring marks the one that was taken.',
-        png(draw_orders(found)),
+        png(draw_orders(found, details)),
     )
     yield Picture(
         'poles_zeros.png', 'Poles and zeros of G',
         'Ellipses reach two standard deviations. A zero on a pole: a lower order does as well.',
-        png(draw_poles(found)),
+        png(draw_poles(found, details)),
     )
     yield Picture(
         'bode.png', 'Frequency response of m G',
         'With a band of two standard deviations. Between the dotted lines y moved; outside of '
-        'them the record says little.', png(draw_bode(found)),
+        'them the record says little.', png(draw_bode(found, details)),
     )
     yield Picture(
         'loop.png', 'The loop of v and y',
         'Left: v against y as measured. Right: v against the u that was found, between its two '
-        'lines.', png(draw_loop(found)),
+        'lines.', png(draw_loop(found, details)),
     )
 
 
-def _times(found: Identification) -> Array:
-    return found.sample_period * np.arange(len(found.v))
-
-
-def draw_held_out(found: Identification) -> Figure:
+def draw_held_out(found: Identification, details: Details) -> Figure:
     """Measured and simulated y over the samples held out, and their difference."""
-    assert found.held_out is not None and found.searched is not None
     figure = new_figure(6.2)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
-    first = found.held_out.first
-    samples = found.searched
-    t = (found.searched_from + first + np.arange(len(found.held_out.simulated))) \
-        * found.sample_period
+    first = details.held_out.first
+    samples = details.searched
+    begin = details.searched_from + first
+    t: Array = found.sample_period * np.arange(
+        begin, begin + len(details.held_out.simulated), dtype=float
+    )
     y = samples.whole_y[first:first + len(t)]
     curve(upper, t, y, MEASURED, 'measured', width=2.2)
-    curve(upper, t, found.held_out.simulated, SIMULATED, 'simulated', '--')
+    curve(upper, t, details.held_out.simulated, SIMULATED, 'simulated', '--')
     legend_above(upper)
-    curve(lower, t, y - found.held_out.simulated, RESIDUAL)
+    curve(lower, t, y - details.held_out.simulated, RESIDUAL)
     zero_line(lower)
-    share = 1.0 - found.held_out.rms / max(float(np.nanstd(y)), 1e-300)
+    share = 1.0 - details.held_out.rms / max(float(np.nanstd(y)), 1e-300)
     label(upper, f'{share:.2%} of the motion is predicted', 'y')
     label(lower, '', 'difference', TIME)
     return figure
 
 
-def draw_residual(found: Identification) -> Figure:
+def draw_residual(found: Identification, details: Details) -> Figure:
     """Residual over time, its autocorrelation, and the residual over v."""
-    assert found.fit is not None and found.samples is not None
     figure = new_figure(6.6)
     grid = figure.add_gridspec(2, 2)
     over_time = figure.add_subplot(grid[0, :])
     correlated, over_v = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    samples = found.samples
-    residual = samples.y - found.fit.simulated
-    t = _times(found)[samples.first:samples.last]
+    samples = details.samples
+    residual = samples.y - details.fit.simulated
+    t: Array = found.sample_period * np.arange(samples.first, samples.last, dtype=float)
     curve(over_time, t, residual, RESIDUAL, width=0.8)
     zero_line(over_time)
     label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME)
@@ -130,7 +127,7 @@ def draw_residual(found: Identification) -> Figure:
     zero_line(correlated)
     correlated.set_ylim(*limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
     label(correlated, f'Autocorrelation (Ljung–Box p = {found.ljung_box:.2g})', '', 'lag [samples]')
-    v = samples.delayed(samples.v, found.fit.structure.delay)
+    v = samples.delayed(samples.v, details.fit.structure.delay)
     over_v.plot(v, residual, '.', color=RESIDUAL, markersize=2, alpha=0.4, rasterized=True)
     centres, means = _means_over(v, residual)
     over_v.plot(centres, means, color='#000000', linewidth=1.6)
@@ -150,13 +147,12 @@ def _means_over(v: Array, residual: Array, bins: int = 25) -> tuple[Array, Array
     return 0.5 * (edges[1:] + edges[:-1]), means
 
 
-def draw_profile(found: Identification) -> Figure:
+def draw_profile(found: Identification, details: Details) -> Figure:
     """RMS of the residual over the gap, whole and near its minimum."""
-    assert found.profile is not None and found.fit is not None
     figure = new_figure(4.2)
     whole, near = figure.subplots(1, 2)
-    gaps = found.profile.gaps
-    rms = np.sqrt(found.profile.squares / max(found.profile.best.rows, 1))
+    gaps = details.profile.gaps
+    rms = np.sqrt(details.profile.squares / max(details.profile.best.rows, 1))
     close = np.abs(gaps - found.gap) <= 0.21 * found.gap
     for axes, chosen in ((whole, np.full(len(gaps), True)), (near, close)):
         axes.plot(gaps[chosen], rms[chosen], '.-', color=COLOURS['m'], markersize=4)
@@ -170,13 +166,13 @@ def draw_profile(found: Identification) -> Figure:
     return figure
 
 
-def draw_orders(found: Identification) -> Figure:
+def draw_orders(found: Identification, details: Details) -> Figure:
     """Error on the samples held out, over the order, a line per delay."""
     figure = new_figure(4.2)
-    integrators = sorted({one.structure.integrator for one in found.compared})
+    integrators = sorted({one.structure.integrator for one in details.compared})
     rooms = np.atleast_1d(np.asarray(figure.subplots(1, len(integrators), sharey=True)))
     for axes, integrator in zip(rooms.tolist(), integrators, strict=True):
-        _draw_orders(axes, found, integrator)
+        _draw_orders(axes, details, integrator)
         label(axes, 'With an integrator' if integrator else 'Without integrator',
               'RMS on samples held out' if axes is rooms[0] else '', 'order: number of poles')
     handles, labels = rooms[0].get_legend_handles_labels()
@@ -184,31 +180,29 @@ def draw_orders(found: Identification) -> Figure:
     return figure
 
 
-def _draw_orders(axes: Axes, found: Identification, integrator: bool) -> None:
-    delays = sorted({one.structure.delay for one in found.compared})
+def _draw_orders(axes: Axes, details: Details, integrator: bool) -> None:
+    delays = sorted({one.structure.delay for one in details.compared})
     for delay, colour in zip(delays, _cycled(len(delays)), strict=True):
         line = sorted(
-            (one.structure.order, one.held_out) for one in found.compared
+            (one.structure.order, one.held_out) for one in details.compared
             if one.structure.delay == delay and one.structure.integrator == integrator
         )
         axes.plot(*zip(*line, strict=True), 'o-', color=colour, markersize=5, alpha=0.8,
                   label=f'delay {delay}')
-    assert found.chosen is not None
-    if found.chosen.structure.integrator == integrator:
-        axes.plot(found.chosen.structure.order, found.chosen.held_out, 'o', markersize=15,
+    if details.chosen.structure.integrator == integrator:
+        axes.plot(details.chosen.structure.order, details.chosen.held_out, 'o', markersize=15,
                   markerfacecolor='none', markeredgecolor='#000000', markeredgewidth=1.5)
     axes.set_yscale('log')
-    axes.set_xticks(sorted({one.structure.order for one in found.compared}))
+    axes.set_xticks(sorted({one.structure.order for one in details.compared}))
 
 
 def _cycled(count: int) -> list[str]:
     return [ORDER_COLOURS[i % len(ORDER_COLOURS)] for i in range(count)]
 
 
-def draw_poles(found: Identification) -> Figure:
+def draw_poles(found: Identification, details: Details) -> Figure:
     """Poles and zeros in the plane of z, whole and near 1."""
-    assert found.fit is not None and found.covariance is not None
-    fit, covariance = found.fit, found.covariance
+    fit, covariance = details.fit, details.covariance
     figure = new_figure(5.2)
     rooms = figure.subplots(1, 2)
     count = covariance.poles
@@ -260,15 +254,14 @@ def _ellipse(axes: Axes, root: complex, spread: Array, colour: str) -> None:
     ))
 
 
-def draw_bode(found: Identification) -> Figure:
+def draw_bode(found: Identification, details: Details) -> Figure:
     """Magnitude and phase of m G, its delay included."""
-    assert found.fit is not None and found.covariance is not None
     figure = new_figure(5.6)
     upper, lower = figure.subplots(2, 1, sharex=True)
     low = max(found.frequencies[0] / 5.0, 1e-5)
     w = np.geomspace(low, 0.98 * np.pi, 400)
-    value = response(found.fit, w) * np.exp(-1j * w * found.delay)
-    spread = SURE * response_std(found.fit, found.covariance, w)
+    value = response(details.fit, w) * np.exp(-1j * w * found.delay)
+    spread = SURE * response_std(details.fit, details.covariance, w)
     hertz = w / (2.0 * np.pi * found.sample_period)
     size = np.abs(value)
     upper.fill_between(hertz, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread),
@@ -289,15 +282,14 @@ def draw_bode(found: Identification) -> Figure:
     return figure
 
 
-def draw_loop(found: Identification) -> Figure:
+def draw_loop(found: Identification, details: Details) -> Figure:
     """v against y, and v against the u that was found with its two lines."""
-    assert found.fit is not None and found.samples is not None
     figure = new_figure(4.6)
     left, right = figure.subplots(1, 2)
-    v = found.samples.v[-LOOP_POINTS:]
-    left.plot(v, found.samples.whole_y[-LOOP_POINTS:], color=COLOURS['y'], linewidth=0.8)
+    v = details.samples.v[-LOOP_POINTS:]
+    left.plot(v, details.samples.whole_y[-LOOP_POINTS:], color=COLOURS['y'], linewidth=0.8)
     label(left, 'As measured', 'y', 'v')
-    u = found.m * (found.fit.play.p[-LOOP_POINTS:] - found.c_r)
+    u = found.m * (details.fit.play.p[-LOOP_POINTS:] - found.c_r)
     right.plot(v, u, color='#999999', linewidth=1.0, label='u')
     ends = np.array([v.min(), v.max()])
     right.plot(ends, found.m * (ends - found.c_r), '--', color=COLOURS['c_r'],
