@@ -121,7 +121,7 @@ def tracking_error(parameters: Parameters) -> float:
 
 def percent(value: float) -> str:
     """A share as text."""
-    return f'{100.0 * value:.2g} %'
+    return f'{100.0 * value:.{1 if value > 0.1 else 2}{"f" if value > 0.1 else "g"}} %'
 
 
 def table(outcomes: list[Outcome]) -> list[list[str]]:

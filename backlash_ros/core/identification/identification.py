@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.constants import GATE
 from backlash_ros.core.estimation.record_fit import frequencies_of
 from backlash_ros.core.identification import judgement, uncertainty
+from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.order_selection import (
     Compared,
     compare,
@@ -176,6 +177,11 @@ def identifying(
     ))
     chosen = selected(compared)
     best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
+    delays = equal_delays(compared, chosen)
+    rows = effective_rows(searched, best)
+    best = yield from _named('choosing the delay', least_response(
+        searched, best, _with_delays(searched, best, delays), best.squares / rows,
+    ))
     samples, outliers = searched, int(wild.sum())
     if len(v) > len(searched.v):
         samples = Samples(v, y, first)
@@ -296,6 +302,14 @@ def _on_all(samples: Samples, best: Fit) -> Fit:
         for share in (0.0, 0.5, 1.0)
     ]
     return min(fits, key=lambda one: one.squares)
+
+
+def _with_delays(samples: Samples, best: Fit, delays: Sequence[int]) -> list[Fit]:
+    """The same structure with the other delays that fit alike."""
+    return [
+        fit(samples, best.structure._replace(delay=delay), best.point)
+        for delay in delays if delay != best.structure.delay
+    ]
 
 
 def _described(

@@ -26,6 +26,7 @@ from backlash_ros.core.identification.output_error import (
     Samples,
     Structure,
     fit,
+    squares_of,
 )
 from backlash_ros.core.identification.starting_models import steiglitz_mcbride
 
@@ -33,6 +34,7 @@ Array = NDArray[np.float64]
 
 PENALTY = 2.0  # of an unknown, in logarithms of the number of samples
 WITHIN = 1.05  # times the least held-out error: equally good
+STARTS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # places in the gap at which p may begin
 EXTRA_POLES = (0.3, 0.85)  # where one more pole than in the order below may begin
 CANCELS = 0.02  # distance of a pole and a zero that cancel, relative to that of the pole from 1
 SLOWEST = 0.01  # ... which counts as this much at least: a zero at 1 cancels an integrator
@@ -121,8 +123,14 @@ def _fit_from(
     fits: list[Fit] = []
     for point in candidates:
         p = samples.play.output(point.gap, point.start).p
-        for a in steiglitz_mcbride(samples, structure, p)[:1]:
-            fits.append(fit(samples, structure, point._replace(a=a)))
+        a = steiglitz_mcbride(samples, structure, p)[0]
+        v0 = float(samples.v[0])
+        # A state of fewer numbers does not hide a start that is wrong.
+        starts = [point.start, *(v0 + share * point.gap for share in STARTS)]
+        fits.append(fit(samples, structure, min(
+            (Point(a, point.gap, start) for start in starts),
+            key=lambda one: squares_of(samples, structure, one),
+        )))
     if below is not None and below.structure.free_poles == structure.free_poles - 1:
         for pole in EXTRA_POLES:
             a = np.convolve(np.append(1.0, below.point.a), (1.0, -pole))[1:]

@@ -150,7 +150,10 @@ def full_denominator(structure: Structure, a: Array) -> Array:
 
 
 class Linear(NamedTuple):
-    """The exact solution for a given A and p. basis: orthonormal, over the known rows."""
+    """The exact solution for a given A and p.
+
+    basis: orthonormal, over the known rows and those of a penalty; residual and squares likewise.
+    """
 
     solution: Array
     basis: Array
@@ -175,22 +178,38 @@ def linear_columns(samples: Samples, structure: Structure, a: Array, p: Array) -
     return columns
 
 
-def solve_linear(samples: Samples, structure: Structure, a: Array, p: Array) -> Linear:
-    """All that is linear, for free coefficients a of A and a play output p (N,)."""
+def solve_linear(
+    samples: Samples, structure: Structure, a: Array, p: Array, penalty: Array | None = None,
+) -> Linear:
+    """All that is linear, for free coefficients a of A and a play output p (N,).
+
+    penalty: rows (K, taps) whose product with B is to be small as well.
+    """
     columns = linear_columns(samples, structure, a, p)
     known = columns if samples.complete else columns[samples.known]
+    target = samples.target
+    if penalty is not None:
+        more = np.zeros((len(penalty), columns.shape[1]))
+        more[:, :structure.numerator_taps] = penalty
+        known, target = np.vstack([known, more]), np.append(target, np.zeros(len(penalty)))
     scale = np.sqrt(np.einsum('ij,ij->j', known, known))
     scale[scale == 0.0] = 1.0
     basis, upper = np.linalg.qr(known / scale)
-    along = basis.T @ samples.target
+    along = basis.T @ target
     if np.abs(np.diag(upper)).min() > SINGULAR:
         solution = solve_triangular(upper, along, check_finite=False) / scale
     else:
         solution = np.linalg.lstsq(upper, along, rcond=SINGULAR)[0] / scale
-    residual = samples.target - basis @ along
+    residual = target - basis @ along
     squares = float(residual @ residual)
     return Linear(solution, basis, residual, columns @ solution,
                    squares if np.isfinite(squares) else inf)
+
+
+def squares_of(samples: Samples, structure: Structure, point: Point) -> float:
+    """What is left over at a point, with all that is linear at its best."""
+    p = samples.play.output(point.gap, point.start).p
+    return solve_linear(samples, structure, point.a, p).squares
 
 
 def slopes(
@@ -217,15 +236,18 @@ def slopes(
 
 def fit(
     samples: Samples, structure: Structure, start: Point, gap_free: bool = True,
-    iterations: int = ITERATIONS,
+    iterations: int = ITERATIONS, penalty: Array | None = None,
 ) -> Fit:
-    """The least squares nearest to a start. gap_free: whether gap and start of p move as well."""
+    """The least squares nearest to a start. gap_free: whether gap and start of p move as well.
+
+    penalty: as of `solve_linear`; the squares of the fit are without it.
+    """
     top = samples.play.swing
     v0 = float(samples.v[0])
 
     def evaluate(point: Point) -> tuple[PlayOutput, Linear]:
         play = samples.play.output(point.gap, point.start)
-        return play, solve_linear(samples, structure, point.a, play.p)
+        return play, solve_linear(samples, structure, point.a, play.p, penalty)
 
     point = start
     play, linear = evaluate(point)
@@ -237,6 +259,8 @@ def fit(
         )
         if not samples.complete:
             columns = columns[samples.known]
+        if penalty is not None:
+            columns = np.vstack([columns, np.zeros((len(penalty), columns.shape[1]))])
         free = columns - linear.basis @ (linear.basis.T @ columns)
         gram, downhill = free.T @ free, free.T @ linear.residual
         diagonal = np.diag(gram).copy()
@@ -255,9 +279,11 @@ def fit(
             damping *= MORE
         if not linear.squares < before * (1.0 - TOLERANCE):
             break
+    rows = len(samples.known)
+    residual = linear.residual[:rows]
     return Fit(
         structure, point, linear.solution, linear.simulated, play, samples.centre,
-        linear.squares, len(samples.known),
+        float(residual @ residual), rows,
     )
 
 

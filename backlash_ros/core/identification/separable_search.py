@@ -18,7 +18,7 @@ from backlash_ros.core.identification.output_error import (
     Samples,
     Structure,
     fit,
-    solve_linear,
+    squares_of,
 )
 from backlash_ros.core.identification.starting_models import steiglitz_mcbride
 
@@ -84,13 +84,8 @@ def profile(
             p = samples.play.output(gap, starts[len(starts) // 2]).p
             models = [*models, *steiglitz_mcbride(samples, structure, p)[:1]]
         points = [Point(a, gap, start) for a in models for start in starts]
-        best = min(points, key=lambda point: _squares(samples, structure, point))
+        best = min(points, key=lambda point: squares_of(samples, structure, point))
         fits.append(fit(samples, structure, best, gap_free=False, iterations=STEPS))
         models = [fits[-1].point.a]
         yield
     return Profile(gaps, np.array([found.squares for found in fits]), fits)
-
-
-def _squares(samples: Samples, structure: Structure, point: Point) -> float:
-    p = samples.play.output(point.gap, point.start).p
-    return solve_linear(samples, structure, point.a, p).squares

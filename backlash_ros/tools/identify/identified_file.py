@@ -11,8 +11,11 @@ import numpy as np
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.identification.identification import Identification
+from backlash_ros.core.identification.least_response import known_up_to
+from backlash_ros.core.identification.uncertainty import response
 from backlash_ros.core.parameter_table import (
     BRINGUP,
+    BY_NAME,
     PARAMETERS,
     RECORDER,
     Parameter,
@@ -24,7 +27,10 @@ from backlash_ros.tools.configuration import yaml_value
 WIDER = 3.0  # bounds of the estimates, in times of what was found
 SIMULATED = ('truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance')
 OF_ONE_RUN = ('estimates', 'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes')
-SHARE_OF_MOTION = 0.25  # of the range of y in the record: amplitude of the reference
+SHARE_OF_REACH = 0.4  # of the range of v less the gap, which the reference asks for
+LITTLE = 0.1  # of the gain at the lowest frequency: faster motion of y takes too much of v
+USUAL_FREQUENCY = np.pi / 10.0  # [rad/sample] at which tracking.input_weight takes |G|
+PREVIEW, USUAL_PREVIEW, LONGEST_PREVIEW = 6.0, 60, 600  # radians of that motion; samples
 
 
 def identified_parameters(found: Identification, given: Mapping[str, Value]) -> Parameters:
@@ -56,7 +62,9 @@ def identified_parameters(found: Identification, given: Mapping[str, Value]) -> 
         'output_quantum': float(f'{found.quantum:.6g}'),
         'output_noise_std': 0.0 if found.quantum else float(f'{found.noise_std:.3g}'),
     })
-    for name, value in _reference(found, given).items():
+    for name, value in {
+        **_reference(found, given), **_limits(found), **_weights(found),
+    }.items():
         values.setdefault(name, value)
     parameters = Parameters(values)
     if 'structure' not in given:
@@ -81,14 +89,40 @@ def _reference(found: Identification, given: Mapping[str, Value]) -> dict[str, V
         return {}
     y = found.y[np.isfinite(found.y)]
     middle = 0.0 if found.integrator else 0.5 * float(np.percentile(y, 5) + np.percentile(y, 95))
-    if found.integrator:
-        k = np.flatnonzero(np.isfinite(found.y))
-        y = y - np.polyval(np.polyfit(k, y, 1), k)
-    reach = float(np.percentile(y, 95) - np.percentile(y, 5))
+    assert found.details is not None
+    gain = float(np.abs(response(found.details.fit, found.frequencies[:1]))[0])
+    reach = 0.5 * (float(np.ptp(found.v)) - found.gap)
     return {
-        'waveform': 'sine', 'amplitude': float(f'{SHARE_OF_MOTION * reach:.3g}'),
+        'waveform': 'sine', 'amplitude': float(f'{SHARE_OF_REACH * gain * reach:.3g}'),
         'bias': float(f'{middle:.3g}'),
         'frequency': float(f'{found.frequencies[0] / found.sample_period:.3g}'),
+    }
+
+
+def _weights(found: Identification) -> dict[str, Value]:
+    """The usual weight of u, at a frequency where G is known and v still moves y."""
+    assert found.details is not None
+    fit = found.details.fit
+    w = np.linspace(found.frequencies[0], USUAL_FREQUENCY, 200)
+    gain = np.abs(response(fit, w))
+    limit = known_up_to(fit, found.details.covariance)
+    beyond = np.flatnonzero((w > limit) | (gain < LITTLE * gain[0]))
+    if not len(beyond):
+        return {}
+    last = max(int(beyond[0]) - 1, 0)
+    default = BY_NAME['tracking.input_weight'].default
+    assert isinstance(default, float)
+    weight, w = default * max(float(gain[last] / gain[-1]), 1.0)**2, w[last]
+    preview = min(max(round(PREVIEW / w), USUAL_PREVIEW), LONGEST_PREVIEW)
+    return {'tracking.input_weight': float(f'{weight:.2g}'), 'tracking.preview': preview}
+
+
+def _limits(found: Identification) -> dict[str, Value]:
+    """Where none are given: v as far and as fast as it went in the record, and no further."""
+    fastest = float(np.abs(np.diff(found.v)).max()) / found.sample_period
+    return {
+        'control.min': float(f'{found.v.min():.4g}'), 'control.max': float(f'{found.v.max():.4g}'),
+        'control.rate_max': float(f'{fastest:.4g}'),
     }
 
 

@@ -1,0 +1,81 @@
+"""Of models that a record cannot tell apart: the one with the least gain where the record is silent.
+
+High frequencies that v hardly had leave zeros and delay open. Whatever noise puts there, a fast
+controller would act on it. Among the delays that fit alike, and within two standard deviations of
+each fit, the model is taken whose |G|^2, summed over the frequencies at which G is not known, is
+least: sampled plants that are driven through a hold have little gain there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.identification.output_error import Fit, Samples, fit
+from backlash_ros.core.identification.uncertainty import Covariance, covariance_of, response_std
+
+Array = NDArray[np.float64]
+
+POINTS = 40  # frequencies up to half the sampling rate
+UNKNOWN = 0.1  # relative deviation of G beyond which the record is silent
+ALLOWED = 4.0  # by which the squares may grow, in variances of the noise: two standard deviations
+HALVINGS = 12  # of the factor of the penalty
+FIRST_FACTOR = 1e4  # of it, relative to the squares of the fit
+
+
+def least_response(
+    samples: Samples, best: Fit, rivals: Sequence[Fit], noise_variance: float,
+) -> Generator[None, None, Fit]:
+    """The fit to take. rivals: with other delays, that fit alike. noise_variance: effective."""
+    silent = _silent(samples, best)
+    if not len(silent):
+        return best
+    found: list[tuple[float, Fit]] = []
+    for one in (best, *rivals):
+        smooth = _smoothed(samples, one, silent, noise_variance)
+        found.append((_gain(smooth, silent), smooth))
+        yield
+    return min(found, key=lambda pair: pair[0])[1]
+
+
+def _silent(samples: Samples, best: Fit) -> Array:
+    """Frequencies [rad/sample] from which on G is not known."""
+    w = np.pi * (np.arange(POINTS) + 0.5) / POINTS
+    return np.asarray(w[w > known_up_to(best, covariance_of(samples, best))], dtype=np.float64)
+
+
+def known_up_to(found: Fit, covariance: Covariance) -> float:
+    """Frequency [rad/sample] from which on G is not known; pi where it is known throughout."""
+    w = np.pi * (np.arange(POINTS) + 0.5) / POINTS
+    known = np.flatnonzero(response_std(found, covariance, w) <= UNKNOWN)
+    return float(w[known[-1]]) if len(known) else float(w[0])
+
+
+def _rows(found: Fit, silent: Array) -> Array:
+    """Rows whose product with B is G at these frequencies, real and imaginary parts."""
+    back = np.exp(-1j * silent)
+    size = np.abs(np.polynomial.polynomial.polyval(back, found.denominator))
+    rows = back[:, None] ** np.arange(found.structure.numerator_taps) / size[:, None]
+    return np.vstack([rows.real, rows.imag])
+
+
+def _gain(found: Fit, silent: Array) -> float:
+    values = _rows(found, silent) @ found.numerator
+    return float(values @ values)
+
+
+def _smoothed(samples: Samples, found: Fit, silent: Array, noise_variance: float) -> Fit:
+    """The fit with the heaviest penalty whose squares stay within what is allowed."""
+    rows, gain = _rows(found, silent), _gain(found, silent)
+    if gain == 0.0:
+        return found
+    most = found.squares + ALLOWED * noise_variance
+    factor = np.sqrt(FIRST_FACTOR * found.squares / gain)
+    for _ in range(HALVINGS):
+        smooth = fit(samples, found.structure, found.point, penalty=factor * rows)
+        if smooth.squares <= most:
+            return smooth
+        factor *= 0.25
+    return found
