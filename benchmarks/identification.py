@@ -1,6 +1,6 @@
 """Measure the identification: 200 random actuators, each from one record of 10 s.
 
-`python benchmarks/identification.py` prints the table; `--write` puts it into docs/identification.md.
+`python benchmarks/identification.py` prints the table; `--write` puts it into the document.
 `--loops N`: also N closed loops with what was found, beside the true one.
 """
 
@@ -11,7 +11,7 @@ import os
 import re
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, nan
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
@@ -21,14 +21,15 @@ from identification_cases import Case, random_case
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
 from scipy.stats import chi2
 
+from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.identification.identification import Identification, identify
 from backlash_ros.core.identification.uncertainty import crossings_covariance, response
 from backlash_ros.core.metrics import delayed_tracking_error_rms
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.assembly import build_controller
-from backlash_ros.tools.identify.identified_file import identified_parameters
+from backlash_ros.tools.identify.identified_file import as_estimate, identified_parameters
 
 DOCUMENT = ROOT / 'docs' / 'identification.md'
 CASES = 200
@@ -107,13 +108,19 @@ def loop_ratio(case: Case, found: Identification) -> tuple[float, str]:
         'control.delay_samples': case.delay, 'estimator.initial.c_r': case.c_r,
         'estimator.initial.c_l': case.c_l,
     })
-    errors = [tracking_error(p.replaced(plant)) for p in (told, true)]
+    estimate = as_estimate(found, told)
+    known = replace(estimate, c_r=case.c_r, c_l=case.c_l)
+    errors = [
+        tracking_error(p.replaced(plant), begin) for p, begin in ((told, estimate), (true, known))
+    ]
     return errors[0] / errors[1], ''
 
 
-def tracking_error(parameters: Parameters) -> float:
+def tracking_error(parameters: Parameters, begin: Estimate) -> float:
     """Relative RMS of y - y_m over the last half of a simulated run."""
-    run = build_closed_loop(parameters).run(LOOP_SAMPLES)
+    loop = build_closed_loop(parameters)
+    loop.controller = build_controller(parameters, begin)
+    run = loop.run(LOOP_SAMPLES)
     delay = build_controller(parameters).structure.delay
     error = delayed_tracking_error_rms(run, delay, float(run.column('t')[LOOP_SAMPLES // 2]))
     return nan if error is None else error

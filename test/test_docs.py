@@ -16,8 +16,9 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.parameter_table import BY_NAME
 from backlash_ros.nodes import check_driver
-from backlash_ros.tools import batch, bringup, simulate
+from backlash_ros.tools import batch, bringup, replay, simulate
 from backlash_ros.tools.configuration import effective_parameters
+from backlash_ros.tools.identify import command as identify
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'
@@ -163,6 +164,11 @@ def check_tool(program: str, arguments: list[str]) -> None:
     if program in ('controller', 'plant', 'reference', 'recorder'):
         assert arguments[:2] == ['--ros-args', '--params-file']
         assert (ROOT / arguments[2]).is_file()
+        return
+    if program in ('identify', 'replay'):
+        parser = identify.make_parser() if program == 'identify' else replay.make_parser()
+        config = parser.parse_args(arguments).config
+        assert config is None or (ROOT / config).is_file()
         return
     if program == 'check_driver':
         config = check_driver.parse_options(arguments).config

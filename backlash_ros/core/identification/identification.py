@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field, replace
-from math import nan
+from math import inf, nan
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -271,8 +271,7 @@ def _refined(
     best = chosen.fit
     whole: Array = np.append(0.0, np.geomspace(1e-3, 0.99, PROFILE_GAPS) * swing)
     curve = yield from profile(samples, structure, whole, best)
-    around: Array = best.point.gap * NEAR
-    around = around[(around > 0.0) & (around < swing)]
+    around = np.array([gap for gap in best.point.gap * NEAR if 0.0 < gap < swing])
     near = yield from profile(samples, structure, around, best)
     minima: list[Fit] = []
     for minimum in [*near.minima()[:3], *curve.minima()[:3]]:
@@ -335,7 +334,10 @@ def _described(
     numerator = best.numerator / options.slope
     evidence = judgement.Evidence(
         samples, best, float(np.sqrt(gap_var)), float(np.sqrt(c_r_var)), gain_std,
-        float(spread.max()), 0.5 * rows * float(np.log(still / max(best.squares, TINY))),
+        float(spread.max()),
+        # Whatever the correlation: what explains nine tenths of y shows v.
+        inf if best.squares < 0.01 * still
+        else 0.5 * rows * float(np.log(still / max(best.squares, TINY))),
         correlation, held_out.rms, held_out.trained, rivals,
         float(np.abs(uncertainty.response(best, np.sqrt(frequencies[:1] * frequencies[-1:])))[0]),
         _quantum(samples.y),

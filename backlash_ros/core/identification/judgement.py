@@ -20,12 +20,14 @@ PRECISE_RESPONSE = 0.1  # relative deviation of G between the frequencies at whi
 SHOWS = 15.0  # log-likelihood by which the fit must beat a u that stands still
 SURE = 3.0  # standard deviations
 WHOLE_SWING = 0.95  # of the swing of v: a gap as wide as this was not seen from both sides
-UNEXPLAINED = 0.1  # of the motion of y that the gap makes, which play and linear G do not explain
+ROUNDING = 1.5 / 12.0  # mean square of rounding by a quantum of 1, with a margin
+UNEXPLAINED = 0.05  # of the motion of y that the gap makes, which play and linear G do not explain
 WORSE_LATER = 2.0  # ratio of the error on held-out samples to that of the fit
 CONCENTRATED = 2.0  # ratio of the residual while v crosses the gap to that while it is engaged
 ONE_SPEED = 0.05  # relative spread of the speeds of v that are one speed
 STUCK = 5  # samples at the largest or smallest y in a row, while v goes on
 APART = 0.02  # relative distance of two gaps that are not the same
+BEYOND = 5.0  # standard deviations: nearer ones are covered by them
 UNDECIDED = 6.0  # log-likelihood by which another gap may fall behind
 
 
@@ -57,12 +59,12 @@ class Evidence(NamedTuple):
 def reasons(e: Evidence) -> list[str]:
     """Why the result is of no use, a sentence with its cure each; empty where it is of use."""
     swing, gap = e.samples.play.swing, e.fit.point.gap
-    if e.evidence < SHOWS:
+    found = _stuck(e)
+    if e.evidence < SHOWS and not found:
         return [
             f'y shows nothing of v, which swung by {swing:.4g}: let v swing wider than the gap, '
             'and see that v is what the actuator gets'
         ]
-    found = _stuck(e)
     if gap >= WHOLE_SWING * swing:
         return [*found, f'the gap is at its bound, the swing of v ({swing:.4g}): let v swing '
                 'wider, past the gap in both directions']
@@ -73,7 +75,8 @@ def reasons(e: Evidence) -> list[str]:
         )
     found += [
         f'two gaps fit alike, {gap:.4g} and {rival:.4g}: move v at several speeds and amplitudes'
-        for rival, behind in e.rivals[:1] if behind < UNDECIDED
+        for rival, behind in e.rivals
+        if behind < UNDECIDED and abs(rival - gap) > BEYOND * e.gap_std
     ]
     imprecise = e.gap_std > max(PRECISE_GAP * gap, NO_GAP * swing)
     if imprecise:
@@ -102,9 +105,11 @@ def reasons(e: Evidence) -> list[str]:
 def unexplained_of(e: Evidence) -> float:
     """Correlated residual over the motion of y that the gap makes."""
     step = e.gain * e.fit.point.gap
-    if e.correlation <= 0.0 or step <= 0.0:
+    # What an encoder rounds away repeats itself as well, but is explained.
+    excess = e.fit.rms**2 - ROUNDING * e.quantum**2
+    if e.correlation <= 0.0 or step <= 0.0 or excess <= 0.0:
         return 0.0
-    return float(e.fit.rms * np.sqrt(e.correlation) / step)
+    return float(np.sqrt(excess * e.correlation) / step)
 
 
 def remarks(e: Evidence) -> list[str]:
@@ -171,13 +176,16 @@ def _stuck(e: Evidence) -> list[str]:
     """Where y stays at its largest or smallest value while v goes on."""
     y, v = e.samples.whole_y, e.samples.v
     path = np.append(0.0, np.cumsum(np.abs(np.diff(v))))
+    # While v crosses the gap, y may well rest.
+    gap = e.fit.point.gap if e.evidence >= SHOWS else 0.25 * e.samples.play.swing
+    passed = 1.5 * gap + 0.1 * e.samples.play.swing
     found = []
     for name, extreme in (('largest', np.nanmax(y)), ('smallest', np.nanmin(y))):
         at = np.append(False, np.append(y == extreme, False))
         begins, ends = np.flatnonzero(~at[:-1] & at[1:]), np.flatnonzero(at[:-1] & ~at[1:]) - 1
         long = ends - begins >= STUCK
         moved = path[ends[long]] - path[begins[long]]
-        if np.count_nonzero(moved > 1.5 * e.fit.point.gap + 0.1 * e.samples.play.swing) >= 2:
+        if np.count_nonzero(moved > passed) >= 2:
             found.append(
                 f'y stays at its {name} value, {extreme:.4g}, while v goes on: the sensor is at '
                 'its end; move v less far'

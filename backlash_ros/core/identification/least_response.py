@@ -1,4 +1,4 @@
-"""Of models that a record cannot tell apart: the one with the least gain where the record is silent.
+"""Of models that a record cannot tell apart: the one with the least gain where it is silent.
 
 High frequencies that v hardly had leave zeros and delay open. Whatever noise puts there, a fast
 controller would act on it. Among the delays that fit alike, and within two standard deviations of

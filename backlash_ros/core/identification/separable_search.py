@@ -60,8 +60,8 @@ def search(samples: Samples, structure: Structure) -> Generator[None, None, list
     first = yield from profile(samples, structure, gaps)
     found: list[Fit] = []
     for minimum in first.minima()[:MINIMA]:
-        around: Array = minimum.point.gap * np.linspace(1.0 - NEAR, 1.0 + NEAR, NEAR_GAPS)
-        around = around[around < swing]
+        shares = np.linspace(1.0 - NEAR, 1.0 + NEAR, NEAR_GAPS)
+        around = np.array([gap for gap in minimum.point.gap * shares if gap < swing])
         if not len(around):
             found.append(minimum)
             continue

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 EXECUTABLE = 'identify'
 YAML, JSON, PAGE = 'identified.yaml', 'identified.json', 'identify.html'
+ESTIMATES = 'estimates.json'
 INTEGRATORS = {'auto': (False, True), 'yes': (True,), 'no': (False,)}
 HIGHEST_ORDER, LONGEST_DELAY = 6, 20
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import inf
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.identification.least_response import known_up_to
 from backlash_ros.core.identification.uncertainty import response
@@ -24,17 +26,23 @@ from backlash_ros.core.parameter_table import (
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.configuration import yaml_value
 
+LEAST_DEVIATION = 1e-6  # relative: a deviation of 0 would say that a constant was given
 WIDER = 3.0  # bounds of the estimates, in times of what was found
 SIMULATED = ('truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance')
 OF_ONE_RUN = ('estimates', 'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes')
+WIDER_THAN_GAP, MOST_OF_REACH = 0.75, 0.8  # amplitude in gaps that shows the gap, within reach
 SHARE_OF_REACH = 0.4  # of the range of v less the gap, which the reference asks for
 LITTLE = 0.1  # of the gain at the lowest frequency: faster motion of y takes too much of v
 USUAL_FREQUENCY = np.pi / 10.0  # [rad/sample] at which tracking.input_weight takes |G|
 PREVIEW, USUAL_PREVIEW, LONGEST_PREVIEW = 6.0, 60, 600  # radians of that motion; samples
 
 
-def identified_parameters(found: Identification, given: Mapping[str, Value]) -> Parameters:
+def identified_parameters(
+    found: Identification, given: Mapping[str, Value], estimates: Path | None = None,
+) -> Parameters:
     """The complete set: what was found, in what the user has given, and defaults for the rest.
+
+    estimates: file of what the controller is to begin with.
 
     Raises ParameterError where the controller does not take it.
     """
@@ -66,11 +74,22 @@ def identified_parameters(found: Identification, given: Mapping[str, Value]) -> 
         **_reference(found, given), **_limits(found), **_weights(found),
     }.items():
         values.setdefault(name, value)
-    parameters = Parameters(values)
-    if 'structure' not in given:
-        parameters = _with_structure(values)
+    if estimates is not None:
+        values.update({'estimates.file': str(estimates), 'estimates.load': True})
+    parameters = Parameters(values) if 'structure' in given else _with_structure(values)
     build_controller(parameters)
     return parameters
+
+
+def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
+    """What a controller may begin with, as if it had learned it itself."""
+    least = LEAST_DEVIATION * max(found.gap, abs(found.c_r), abs(found.c_l))
+    return Estimate(
+        found.m, parameters.real('estimator.initial.c_r'),
+        parameters.real('estimator.initial.c_l'), parameters.real('proportional.f'),
+        max(found.std['m'], LEAST_DEVIATION * found.m), max(found.std['c_r'], least),
+        max(found.std['c_l'], least),
+    )
 
 
 def _with_structure(values: dict[str, Any]) -> Parameters:
@@ -92,8 +111,9 @@ def _reference(found: Identification, given: Mapping[str, Value]) -> dict[str, V
     assert found.details is not None
     gain = float(np.abs(response(found.details.fit, found.frequencies[:1]))[0])
     reach = 0.5 * (float(np.ptp(found.v)) - found.gap)
+    share = max(SHARE_OF_REACH, min(WIDER_THAN_GAP * found.gap / reach, MOST_OF_REACH))
     return {
-        'waveform': 'sine', 'amplitude': float(f'{SHARE_OF_REACH * gain * reach:.3g}'),
+        'waveform': 'sine', 'amplitude': float(f'{share * gain * reach:.3g}'),
         'bias': float(f'{middle:.3g}'),
         'frequency': float(f'{found.frequencies[0] / found.sample_period:.3g}'),
     }
@@ -171,8 +191,8 @@ def commented_yaml(
     lines += [(f'{section}:', ''), ('  ros__parameters:', '')]
     written = [
         p for p in PARAMETERS
-        if p.used_by not in ((BRINGUP,), (RECORDER,)) and not p.name.startswith('estimates.')
-        and parameters[p.name] != () and not p.name.startswith('truth.')
+        if p.used_by not in ((BRINGUP,), (RECORDER,)) and parameters[p.name] != ()
+        and not p.name.startswith('truth.')
     ]
     groups: list[str] = []
     for parameter in _grouped(written):
@@ -234,6 +254,7 @@ def _found(found: Identification) -> dict[str, str]:
         'estimator.initial.c_r': f'± {std["c_r"]:.2g} [v]',
         'estimator.initial.c_l': f'± {std["c_l"]:.2g} [v]',
         'estimator.output_noise_std': 'deviation of y from the simulation [y]',
+        'estimates.file': 'm, c_r, c_l as found, with which the controller begins',
         'backlash.m': 'the simulated plant is the one that was found',
     }
 

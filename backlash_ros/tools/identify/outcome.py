@@ -11,6 +11,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.storage import save_estimate
 from backlash_ros.core.identification.identification import (
     Identification,
     Options,
@@ -20,8 +21,9 @@ from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.files import write_atomically
 from backlash_ros.tools.command_line import format_table
-from backlash_ros.tools.identify.command import INTEGRATORS, JSON, PAGE, YAML
+from backlash_ros.tools.identify.command import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
 from backlash_ros.tools.identify.identified_file import (
+    as_estimate,
     commented_yaml,
     identified_parameters,
     numbers,
@@ -58,12 +60,12 @@ def write_outcome(
 ) -> bool:
     """Write the files, print the outcome; returns whether it is of use."""
     parameters: Parameters | None = None
+    out = result_directory(options.out)
     if found.usable:
         try:
-            parameters = identified_parameters(found, given)
+            parameters = identified_parameters(found, given, out.resolve() / ESTIMATES)
         except ParameterError as error:
             found = replace(found, reasons=(f'the controller does not take it: {error}',))
-    out = result_directory(options.out)
     write_summary(numbers(found), out / JSON)
     write_record(record, out / 'record.csv')
     pictures = list(draw(found))
@@ -73,6 +75,7 @@ def write_outcome(
     if parameters is not None:
         text = commented_yaml(parameters, found, record.source, options.axis)
         write_atomically(out / YAML, text)
+        save_estimate(out / ESTIMATES, as_estimate(found, parameters), parameters)
     write_atomically(out / PAGE, render(found, record.source, pictures, text))
     _tell(found, record, out)
     return found.usable
