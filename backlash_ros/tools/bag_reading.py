@@ -172,7 +172,7 @@ def _median_period(
 
 def read_plain_numbers(
     path: Path, ends: Sequence[str],
-) -> tuple[dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]], str]:
+) -> tuple[dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]], str]:
     """Stamps [ns] and values of each Float64 topic whose name ends like one of these.
 
     Returns them with what is wrong with the bag, empty if it is complete. Raises InputError.
@@ -185,7 +185,7 @@ def read_plain_numbers(
     for name, pairs in sorted(content.messages.items()):
         messages = [(stamp, float(message.data)) for stamp, message in pairs]
         stamps = np.array([stamp for stamp, _ in messages], dtype=np.int64)
-        found[name] = stamps.astype(float), np.array([value for _, value in messages])
+        found[name] = stamps, np.array([value for _, value in messages])
     return found, content.damage
 
 

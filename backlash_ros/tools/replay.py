@@ -9,6 +9,7 @@ from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.tools.command_line import (
     OptionParser,
@@ -112,6 +113,8 @@ def _run(recorded: RunRecord, parameters: Parameters, title: str) -> RunRecord:
             as bar:
         try:
             return replay(recorded, parameters, lambda _: bar.update())
+        except ParameterError:
+            raise
         except ValueError as error:
             raise BrokenOffError(f'the replay broke off: {error}') from error
 

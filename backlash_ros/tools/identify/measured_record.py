@@ -20,6 +20,7 @@ from backlash_ros.tools.report import BAG, open_source
 from backlash_ros.tools.results import RECORD, SAMPLES
 
 Array = NDArray[np.float64]
+Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values
 
 COLUMNS = ('t', 'v', 'y')
 OFF_GRID = 0.25  # of a period that a row of a CSV may miss its time
@@ -164,7 +165,7 @@ def _from_bag(path: Path, sample_period: float | None, axis: str) -> MeasuredRec
     names = (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL)
     numbers, damage = read_plain_numbers(path, names)
     notes = [damage] if damage else []
-    chosen: dict[str, tuple[Array, Array]] = {}
+    chosen: dict[str, Messages] = {}
     for topic in names:
         ends = sorted(name for name in numbers if f'/{name}'.endswith(f'/{topic}'))
         if ends:
@@ -199,26 +200,29 @@ def _from_signals(path: Path, sample_period: float | None, axis: str) -> Measure
 
 
 def from_messages(
-    path: Path, output: tuple[Array, Array], commands: tuple[Array, Array],
+    path: Path, output: Messages, commands: Messages,
     sample_period: float | None,
 ) -> MeasuredRecord:
     """From stamps [ns] and values of y, and of v (or its reports just before each y).
 
     v over an interval is the newest one when the next y comes.
     """
-    stamps, values = output
-    steps = np.diff(stamps)
-    period = float(np.median(steps)) * 1e-9 if sample_period is None else sample_period
+    begin = output[0][0]
+    stamps, values = (output[0] - begin).astype(float), output[1]
+    steps = np.diff(stamps) * 1e-9
+    period = float(np.median(steps)) if sample_period is None else sample_period
     if not period > 0.0:
         raise InputError(f'{path}: its stamps do not tell the sample period: give --config')
-    index = _numbered(steps * 1e-9 / period)
+    index = _numbered(steps / period)
     if index[-1] >= LONGEST:
         raise InputError(f'{path}: spans {index[-1]:.3g} sample periods of {period:g} s')
+    if sample_period is None:
+        # All steps together tell it better than one does.
+        period = float(f'{stamps[-1] * 1e-9 / index[-1]:.5g}')
     count = int(index[-1]) + 1
     y = np.full(count, nan)
     y[index] = values
-    begin = stamps[0]
-    times = np.interp(np.arange(1, count + 1), index, stamps - begin)
+    times = np.interp(np.arange(1, count + 1), index, stamps)
     times[-1] = inf
     newest = np.searchsorted((commands[0] - begin).astype(float), times, side='right') - 1
     v = np.append(commands[1], nan)[newest]
@@ -237,7 +241,7 @@ def _numbered(steps: Array) -> NDArray[np.int64]:
     return np.asarray(numbers - numbers[0], dtype=np.int64)
 
 
-def by_topic(rows: Sequence[tuple[str, int, float]]) -> Mapping[str, tuple[Array, Array]]:
+def by_topic(rows: Sequence[tuple[str, int, float]]) -> Mapping[str, Messages]:
     """Stamps [ns] and values of each topic from rows of (topic, stamp, value)."""
     found: dict[str, tuple[list[int], list[float]]] = {}
     for topic, stamp, value in rows:
@@ -245,6 +249,6 @@ def by_topic(rows: Sequence[tuple[str, int, float]]) -> Mapping[str, tuple[Array
         stamps.append(stamp)
         values.append(value)
     return {
-        topic: (np.array(stamps, dtype=np.int64).astype(float), np.array(values))
+        topic: (np.array(stamps, dtype=np.int64), np.array(values))
         for topic, (stamps, values) in found.items()
     }

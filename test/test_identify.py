@@ -1,0 +1,281 @@
+"""The command identify: records of every kind, the files it writes, what it says and returns."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+from test_identification import PERIOD_S, motion, record
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.estimation.storage import load_estimate
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools import simulate
+from backlash_ros.tools.configuration import effective_parameters
+from backlash_ros.tools.errors import InputError
+from backlash_ros.tools.identify.command import main
+from backlash_ros.tools.identify.measured_record import from_messages, read_measured
+
+QUICK = ('--order', '1-2', '--delay', '0-1')
+FILES = {
+    'identified.yaml', 'identified.json', 'identify.html', 'estimates.json', 'record.csv',
+    'held_out.png', 'residual.png', 'gap.png', 'orders.png', 'poles_zeros.png', 'bode.png',
+    'loop.png',
+}
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+
+
+def write_csv(path: Path, v: np.ndarray, y: np.ndarray) -> Path:
+    rows = [
+        f'{k * PERIOD_S!r},{float(a)!r},{"" if np.isnan(b) else repr(float(b))}'
+        for k, (a, b) in enumerate(zip(v, y, strict=True))
+    ]
+    path.write_text('t,v,y\n' + '\n'.join(rows) + '\n')
+    return path
+
+
+@pytest.fixture(scope='module')
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of what a good record leads to."""
+    folder = tmp_path_factory.mktemp('identify')
+    config = folder / 'mine.yaml'
+    config.write_text(
+        '/**: {ros__parameters: {control: {min: -4.0, max: 4.0, rate_max: 40.0},'
+        ' on_stop: zero, backlash: {m: 7.0}}}'
+    )
+    v, y = record()
+    y[::50] = np.nan
+    source = write_csv(folder / 'mine.csv', v, y)
+    assert main([str(source), *QUICK, '--slope', '0.5', '--config', str(config),
+                 '--out', str(folder / 'out')]) == 0
+    return folder / 'out'
+
+
+def test_all_files_are_written(result: Path) -> None:
+    assert {path.name for path in result.iterdir()} == FILES
+
+
+def test_numbers_are_those_of_the_actuator(result: Path) -> None:
+    found = json.loads((result / 'identified.json').read_text())
+    assert found['usable'] is True
+    assert found['reasons'] == []
+    assert found['m'] == 0.5
+    for name, true in (('gap', 0.9), ('c_r', 0.5), ('c_l', -0.4)):
+        assert abs(found[name] - true) < 4.0 * found['std'][name] < 0.05
+    assert found['delay_samples'] == 1
+    assert found['denominator'] == pytest.approx([1.0, -1.7, 0.755], abs=0.01)
+    assert found['sample_period'] == PERIOD_S
+    assert found['output_noise_std'] == pytest.approx(2e-3, rel=0.1)
+    assert found['lost_samples'] == 32
+
+
+def test_the_file_is_a_complete_configuration(result: Path) -> None:
+    parameters = effective_parameters(result / 'identified.yaml')
+    numbers = json.loads((result / 'identified.json').read_text())
+    assert parameters.reals('plant.denominator') == pytest.approx(numbers['denominator'])
+    assert parameters.integer('control.delay_samples') == numbers['delay_samples']
+    assert parameters.real('plant.uncertainty') == numbers['uncertainty']
+    # What was given stays, but for the plant that is simulated.
+    assert parameters.real('control.rate_max') == 40.0
+    assert parameters.word('on_stop') == 'zero'
+    assert parameters.real('backlash.m') == 0.5
+    build_controller(parameters)
+
+
+def test_every_value_that_was_found_has_its_deviation_beside_it(result: Path) -> None:
+    text = (result / 'identified.yaml').read_text()
+    assert 'mine.csv' in text
+    for name in ('numerator:', 'c_r: 0.', 'c_l: -0.'):
+        line = next(line for line in text.splitlines() if name in line)
+        assert '±' in line
+
+
+def test_a_controller_begins_with_what_was_found(result: Path) -> None:
+    estimate = load_estimate(effective_parameters(result / 'identified.yaml'))
+    assert estimate is not None
+    assert estimate.learned
+    assert estimate.c_r == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_loop_with_the_file_follows(result: Path, tmp_path: Path) -> None:
+    out = tmp_path / 'out'
+    assert simulate.main(['--config', str(result / 'identified.yaml'), '--duration', '5',
+                          '--out', str(out)]) == 0
+    assert json.loads((out / 'summary.json').read_text())['tracking_error_rms'] < 0.05
+
+
+def test_the_page_needs_nothing_else(result: Path) -> None:
+    page = (result / 'identify.html').read_text()
+    assert page.count('src="data:image/png;base64,') == 7
+    assert 'http' not in page.replace('http-equiv', '')
+
+
+def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    v = 0.1 * motion(1200)
+    source = write_csv(tmp_path / 'a.csv', v, np.random.default_rng(1).standard_normal(1200))
+    assert main([str(source), *QUICK, '--out', str(tmp_path / 'out')]) == 1
+    assert 'not of use: y shows nothing of v' in capsys.readouterr().out
+    assert not (tmp_path / 'out' / 'identified.yaml').exists()
+    assert json.loads((tmp_path / 'out' / 'identified.json').read_text())['usable'] is False
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('', 'line 1: must be a header'), ('t,v\n0,1\n', 'y is missing'),
+    ('t,v,y\n', 'holds 0 sample'), ('t,v,y\n0,1,2\n', 'holds 1 sample'),
+    ('t,v,y\n0,1,2\n0,1,2\n', 'line 3: t must rise'), ('t,v,y\n0,a,2\n1,1,1\n', 'line 2'),
+    ('t,v,y\n0,1,2\n1,1\n', 'line 3'), ('t,v,y\nnan,1,2\n1,1,1\n', 't=nan'),
+    ('t,v,y\n0,1,2\n1,inf,2\n2,1,1\n', 'v holds what is not finite'),
+    ('t,v,y\n0,1,\n1,1,\n', 'y holds no number'), ('t,v,y\n0,,1\n1,,1\n', 'v holds no number'),
+    ('t,v,y\n0,1,1\n1,1,1\n2,1,1\n2.5,1,1\n3,1,1\n4,1,1\n', 'no whole number'),
+    ('t,v,y\n0,1,1\n1,1,1\n2,1,1\n1e300,1,1\n', 'spans'),
+])
+def test_a_bad_file_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str,
+) -> None:
+    source = tmp_path / 'a.csv'
+    source.write_text(text)
+    assert main([str(source), '--out', str(tmp_path / 'out')]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count('\n') == 1
+
+
+@pytest.mark.parametrize('arguments', [
+    [], ['nowhere.csv'], ['--drive', 'a.csv'], ['a.csv', '--order', '0'],
+    ['a.csv', '--order', '4-2'], ['a.csv', '--delay', 'x'], ['a.csv', '--slope', '0'],
+    ['a.csv', '--held-out', '0.9'], ['a.csv', '--from', '3', '--to', '2'],
+    ['a.csv', '--integrator', 'perhaps'], ['a.csv', '--precision', '200%'],
+    ['a.csv', '--config', 'nowhere.yaml'], ['a.csv', '--ros-args', '-r', 'a:=b'],
+])
+def test_bad_options_are_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_csv(tmp_path / 'a.csv', *record(100))
+    assert main(arguments) == 2
+    assert capsys.readouterr().err.count('\n') == 1
+
+
+@settings(max_examples=60, deadline=None,
+          suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.binary(max_size=200) | st.text(alphabet='tvy,.0123456789-e\n "na', max_size=200))
+def test_any_file_ends_with_a_line_and_a_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: bytes | str,
+) -> None:
+    source = tmp_path / 'a.csv'
+    source.write_bytes(content if isinstance(content, bytes) else b't,v,y\n' + content.encode())
+    code = main([str(source), '--out', str(tmp_path / 'out')])
+    assert code in (1, 2)
+    if code == 2:
+        assert capsys.readouterr().err.count('\n') == 1
+
+
+def write_bag(path: Path, v: np.ndarray, y: np.ndarray, report: bool, skipped: int = -1) -> None:
+    """What a driver and whoever moves it say: y(k), then v(k), and its report before y(k+1)."""
+    kind = 'std_msgs/msg/Float64'
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        names = [topics.PLANT_OUTPUT, topics.CONTROL] + [topics.APPLIED_CONTROL] * report
+        connections = {
+            name: writer.add_connection(f'/{name}', kind, typestore=TYPES) for name in names
+        }
+
+        def put(name: str, share: float, value: float) -> None:
+            message = TYPES.types[kind](data=float(value))
+            stamp = 10**18 + round((share + 1.0) * PERIOD_S * 1e9)
+            writer.write(connections[name], stamp, bytes(TYPES.serialize_cdr(message, kind)))
+
+        for k in range(len(v)):
+            if k != skipped:
+                put(topics.PLANT_OUTPUT, k, y[k])
+            # With reports, the command itself is another one.
+            put(topics.CONTROL, k + 0.1, 0.0 if report else v[k])
+            if report:
+                put(topics.APPLIED_CONTROL, k + 0.98, v[k])
+
+
+@pytest.mark.parametrize('report', [False, True])
+def test_a_bag_holds_v_and_y(tmp_path: Path, report: bool) -> None:
+    v, y = record(300)
+    write_bag(tmp_path / 'bag', v, y, report, skipped=120)
+    found = read_measured(tmp_path / 'bag')
+    assert found.sample_period == pytest.approx(PERIOD_S)
+    assert found.v.tolist() == v.tolist()
+    assert found.lost == 1
+    assert np.isnan(found.y[120])
+    assert np.delete(found.y, 120).tolist() == np.delete(y, 120).tolist()
+
+
+def test_a_truncated_bag_is_told_or_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    v, y = record(300)
+    write_bag(tmp_path / 'bag', v, y, False)
+    file = next((tmp_path / 'bag').glob('*.mcap'))
+    for share in (0.0, 0.3, 0.9):
+        file.write_bytes(file.read_bytes()[:int(share * file.stat().st_size)])
+        assert main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) in (1, 2)
+        assert 'Traceback' not in capsys.readouterr().err
+
+
+def test_results_of_a_simulation_are_a_record(tmp_path: Path) -> None:
+    assert simulate.main(['--duration', '2', '--set', 'output_loss=0.1',
+                          '--out', str(tmp_path / 'run')]) == 0
+    found = read_measured(tmp_path / 'run')
+    assert len(found.v) == pytest.approx(200, abs=3)
+    assert 5 < found.lost < 40
+    assert np.isfinite(found.v).all()
+
+
+def test_late_samples_are_numbered_by_the_last_of_their_heap() -> None:
+    # The third and fourth sample come with the fifth.
+    at = (np.array([0.0, 1.0, 3.9, 3.95, 4.0, 5.0]) * PERIOD_S * 1e9).astype(np.int64)
+    late = from_messages(Path('a'), (at, np.arange(6.0)), (at + 1, np.arange(6.0)), PERIOD_S)
+    assert late.y.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+def test_a_lost_sample_leaves_its_place_empty() -> None:
+    at = (np.array([0.0, 1.0, 3.0, 4.0]) * PERIOD_S * 1e9).astype(np.int64)
+    found = from_messages(Path('a'), (at, np.arange(4.0)), (at + 1, np.arange(4.0)), PERIOD_S)
+    assert np.isnan(found.y).tolist() == [False, False, True, False, False]
+    assert found.v.tolist() == [0.0, 1.0, 1.0, 2.0, 3.0]
+
+
+def test_a_span_is_cut_out(tmp_path: Path) -> None:
+    from backlash_ros.tools.bag_sections import Span
+    v, y = record(400)
+    source = write_csv(tmp_path / 'a.csv', v, y)
+    part = read_measured(source, span=Span(0.5, 1.5))
+    assert part.v.tolist() == v[100:300].tolist()
+    with pytest.raises(InputError, match='no sample between'):
+        read_measured(source, span=Span(50.0, 60.0))
+
+
+def test_what_the_controller_refuses_is_of_no_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tmp_path / 'a.yaml'
+    # The gradient law needs another structure.
+    config.write_text('/**: {ros__parameters: {estimator: {law: gradient}, structure: tracking}}')
+    source = write_csv(tmp_path / 'a.csv', *record(800))
+    assert main([str(source), *QUICK, '--config', str(config), '--out', str(tmp_path / 'o')]) == 1
+    assert 'the controller does not take it: structure' in capsys.readouterr().out
+
+
+def test_shipped_limits_are_enough_for_a_drive() -> None:
+    from backlash_ros.nodes.gentle_drive import drive_range
+    from backlash_ros.tools.identify.command import given_values
+    given_by_user = given_values(Path('limits.yaml'), '')
+    assert set(given_by_user) == {
+        'sample_period', 'control.min', 'control.max', 'control.rate_max',
+    }
+    assert drive_range(Parameters(dict(given_by_user)), None, None).rate == 300.0

@@ -1,0 +1,121 @@
+"""The command replay: the run's own estimates to the last bit, or where it parts from them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.replay import parting, replay
+from backlash_ros.tools import simulate
+from backlash_ros.tools.replay import main
+
+NOISY = {'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
+# Losses, a structure that feeds y back, a learned G, a law of another kind, a limited v.
+RUNS: dict[str, dict[str, object]] = {
+    'paper': NOISY,
+    'losses': {**NOISY, 'output_loss': 0.2},
+    'tracking': {**NOISY, 'structure': 'tracking', 'amplitude': 1.0, 'frequency': 3.0},
+    'learned G': {**NOISY, 'plant.uncertainty': 0.2, 'truth.scale_frequency': 1.1,
+                  'structure': 'tracking', 'amplitude': 1.0, 'frequency': 3.0},
+    'lms': {**NOISY, 'estimator.law': 'lms'},
+    'limits': {**NOISY, 'control.min': -8.0, 'control.max': 8.0, 'control.rate_max': 60.0},
+}
+
+
+@pytest.mark.parametrize('name', RUNS)
+def test_a_replay_with_the_own_parameters_gives_the_own_estimates(name: str) -> None:
+    parameters = Parameters({'plant.uncertainty': 0.0, **RUNS[name]})
+    run = build_closed_loop(parameters).run(300)
+    again = replay(run, parameters)
+    assert parting(run, again) is None
+    assert np.array_equal(again.rows, run.rows, equal_nan=True)
+    assert again.learned == run.learned
+
+
+def test_other_parameters_part_from_the_run_and_learn_from_its_v() -> None:
+    parameters = Parameters({'plant.uncertainty': 0.0, **NOISY})
+    run = build_closed_loop(parameters).run(300)
+    again = replay(run, parameters.replaced({'plant.uncertainty': 0.1}))
+    parted = parting(run, again)
+    assert parted is not None
+    assert parted.t == pytest.approx(0.01 * parted.sample)
+    assert parted.recorded != parted.replayed
+    assert again.column('v').tolist() == run.column('v').tolist()
+    assert again.column('c_r')[-1] == pytest.approx(3.0, rel=0.02)
+
+
+def test_a_controller_that_would_have_moved_otherwise_learns_from_what_was_moved() -> None:
+    """The first guess is so wrong that its own commands tell nothing of the record."""
+    parameters = Parameters({'plant.uncertainty': 0.0, **NOISY})
+    run = build_closed_loop(parameters).run(300)
+    again = replay(run, parameters.replaced({
+        'estimator.initial.m': 5.0, 'proportional.f': 0.0,
+    }))
+    assert again.column('m')[-1] == pytest.approx(1.3, rel=0.01)
+    assert again.column('c_l')[-1] == pytest.approx(-3.0, rel=0.01)
+
+
+def test_a_row_without_numbers_is_refused() -> None:
+    parameters = Parameters(NOISY)
+    run = build_closed_loop(parameters).run(50)
+    run.rows[20, 2] = np.nan
+    with pytest.raises(ValueError, match=r't=0\.2'):
+        replay(run, parameters)
+
+
+@pytest.fixture(scope='module')
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('run') / 'run'
+    assert simulate.main(['--duration', '3', '--set', 'output_noise_std=1e-3',
+                          '--out', str(folder)]) == 0
+    return folder
+
+
+def test_the_command_says_that_nothing_parts(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([str(recorded), '--out', str(tmp_path)]) == 0
+    assert 'to the last bit' in capsys.readouterr().out
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {'replay.png', 'report.html', 'summary.json', 'samples.csv', 'record.npz'} <= names
+    own, again = (json.loads((folder / 'summary.json').read_text())
+                  for folder in (recorded, tmp_path))
+    assert again['final'] == own['final']
+    assert again['truth'] == own['truth']
+
+
+def test_the_command_says_where_it_parts(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([str(recorded), '--set', 'plant.uncertainty=0.1', '--out', str(tmp_path)]) == 0
+    assert 'part from those of the run at t = 0.' in capsys.readouterr().out
+
+
+def test_several_runs_and_values_give_a_table(recorded: Path, tmp_path: Path) -> None:
+    assert main([str(recorded), str(recorded), '--sweep', 'plant.uncertainty=0,0.1',
+                 '--out', str(tmp_path)]) == 0
+    with (tmp_path / 'replays.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert [row['changed'] for row in rows] == [
+        'plant.uncertainty=0', 'plant.uncertainty=0.1',
+    ] * 2
+    assert all(float(row['c_r']) == pytest.approx(3.0, rel=0.05) for row in rows)
+
+
+@pytest.mark.parametrize('arguments', [
+    [], ['nowhere'], ['RUN', '--set', 'nothing=1'], ['RUN', '--set', 'x/amplitude=1'],
+    ['RUN', '--sweep', 'amplitude'], ['RUN', '--from', '2', '--to', '1'],
+    ['RUN', '--set', 'estimator.bounds.m=[2.0, 3.0]'],
+])
+def test_bad_input_is_told_in_one_line(
+    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str],
+) -> None:
+    given = [str(recorded) if word == 'RUN' else word for word in arguments]
+    assert main([*given, '--out', str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count('\n') == 1
