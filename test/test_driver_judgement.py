@@ -8,7 +8,7 @@ from math import inf, nan
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from made_up_driver import (
     GOOD_GRAPH,
@@ -305,6 +305,8 @@ def test_a_model_that_is_exact_is_not_called_off() -> None:
     st.floats(-20.0, 5.0), st.floats(0.1, 30.0), st.floats(0.1, 200.0), st.floats(-3.0, 3.0),
     st.sampled_from([GentleDrive, IdentificationDrive]),
 )
+@example(-15.983699780621828, 29.100769855162365, 103.26211025102096, -2.3048063251753783,
+         IdentificationDrive)
 def test_a_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, kind) -> None:
     limits = Range(low, low + width, rate)
     start = min(max(start, limits.low), limits.high)

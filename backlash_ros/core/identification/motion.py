@@ -31,6 +31,7 @@ def strokes(
         # Two strokes from end to end, for a gap may be nearly as wide, then two short ones.
         part = 1.0 if k % 4 < 2 else SMALLEST + (LARGEST - SMALLEST) * (k * GOLDEN % 1.0)
         target = v + part * ((high - v) if up else (low - v))
+        target = min(max(target, low), high)  # whatever rounding does
         fast = k % AT_LIMIT == AT_LIMIT - 1
         speed = rate if fast else ordinary * SLOWEST ** ((0.13 + k * SILVER) % 1.0)
         move = speed * period
