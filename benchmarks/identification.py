@@ -148,7 +148,7 @@ def table(outcomes: list[Outcome]) -> list[list[str]]:
         ['G where y moves: within 3 %', 'all', f'{np.sum(responses <= RESPONSE_BOUND)} of {count}'],
         ['delay among those that are told to fit alike', '98 %',
          percent(np.mean([one.delay_within for one in good]))],
-        ['delay itself', '–', percent(np.mean([one.delay_found for one in good]))],
+        ['delay that was taken of them', '–', percent(np.mean([one.delay_found for one in good]))],
         ['integrator told', '–', percent(np.mean([one.integrator_right for one in good]))],
         ['(gap, c_r): mean of NEES / 2', f'{interval[0]:.2f} to {interval[1]:.2f}',
          f'{nees.mean() / 2.0:.2f}'],

@@ -19,6 +19,7 @@ from backlash_ros.core.estimation.record_fit import frequencies_of
 from backlash_ros.core.identification import judgement, uncertainty
 from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.order_selection import (
+    PLATEAU,
     Compared,
     compare,
     effective_rows,
@@ -179,8 +180,13 @@ def identifying(
     best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
     delays = equal_delays(compared, chosen)
     rows = effective_rows(searched, best)
+    # With as many poles, some of them may fit worse.
+    others = [
+        one for one in _with_delays(searched, best, delays)
+        if rows * np.log(one.squares / max(best.squares, TINY)) <= PLATEAU
+    ]
     best = yield from _named('choosing the delay', least_response(
-        searched, best, _with_delays(searched, best, delays), best.squares / rows,
+        searched, best, others, best.squares / rows,
     ))
     samples, outliers = searched, int(wild.sum())
     if len(v) > len(searched.v):
@@ -350,7 +356,7 @@ def _described(
             'c_r': float(np.sqrt(c_r_var)), 'c_l': float(np.sqrt(c_l_var)),
         },
         numerator=tuple(numerator.tolist()), denominator=tuple(best.denominator.tolist()),
-        delay=best.structure.delay, delays=tuple(equal_delays(compared, chosen)),
+        delay=best.structure.delay, delays=tuple(sorted({*equal_delays(compared, chosen), best.structure.delay})),
         integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
         quantum=evidence.quantum, correlation=correlation,
         ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,

@@ -3,10 +3,9 @@
 A pole that a zero cancels is none. Structures whose held-out error is within a few percent of the
 least are equally good predictors. Among them the least
 
-    N' log(squares) + 2 unknowns log(N)
+    N' log(squares) + unknowns log(N)
 
-over all samples is taken (BIC with twice its penalty: a pole that a zero nearly cancels costs more
-in the loop than it tells), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the
+over all samples is taken (BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the
 residual: what repeats itself from sample to sample, as the error of a quantised y, speaks less.
 """
 
@@ -32,7 +31,6 @@ from backlash_ros.core.identification.starting_models import steiglitz_mcbride
 
 Array = NDArray[np.float64]
 
-PENALTY = 2.0  # of an unknown, in logarithms of the number of samples
 WITHIN = 1.05  # times the least held-out error: equally good
 STARTS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # places in the gap at which p may begin
 EXTRA_POLES = (0.3, 0.85)  # where one more pole than in the order below may begin
@@ -82,7 +80,7 @@ def compare(
         Compared(
             whole.structure, rms, trained, whole,
             rows * float(np.log(max(whole.squares, smallest)))
-            + PENALTY * whole.structure.unknowns * float(np.log(len(samples.known))),
+            + whole.structure.unknowns * float(np.log(len(samples.known))),
         )
         for rms, trained, whole in found
     ]
@@ -109,12 +107,16 @@ def cancelled_pole(found: Fit) -> complex | None:
 
 
 def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:
-    """Delays of its order that explain y as well as the chosen one."""
-    return sorted(
+    """Delays that explain y as well as the chosen one, with as many poles or more.
+
+    A lag that a pole of its own would make may stand for a delay.
+    """
+    order, _, integrator, _ = chosen.structure
+    return sorted({
         one.structure.delay for one in compared
-        if one.structure._replace(delay=0) == chosen.structure._replace(delay=0)
+        if one.structure.integrator == integrator and one.structure.order >= order
         and one.criterion <= chosen.criterion + PLATEAU
-    )
+    })
 
 
 def _fit_from(
