@@ -214,23 +214,20 @@ def squares_of(samples: Samples, structure: Structure, point: Point) -> float:
 
 def slopes(
     samples: Samples, structure: Structure, a: Array, play: PlayOutput, numerator: Array,
-    simulated: Array, gap_free: bool = True,
+    simulated: Array,
 ) -> Array:
-    """Derivatives of the simulated y (M, K) by a and, where free, by the gap and the start."""
+    """Derivatives of the simulated y (M, K) by a, the gap and the start."""
     count = samples.count
-    columns = np.zeros((count, len(a) + (2 if gap_free else 0)), order='F')
+    columns = np.zeros((count, len(a) + 2), order='F')
     if len(a):
         back = -lfilter([1.0], np.append(1.0, a), simulated)
         for j in range(len(a)):
             columns[j + 1:, j] = back[:count - j - 1]
-    if gap_free:
-        inputs = np.vstack([
-            samples.delayed(play.by_gap, structure.delay),
-            samples.delayed(play.by_start, structure.delay),
-        ])
-        columns[:, len(a):] = lfilter(
-            numerator, full_denominator(structure, a), inputs
-        ).T
+    inputs = np.vstack([
+        samples.delayed(play.by_gap, structure.delay),
+        samples.delayed(play.by_start, structure.delay),
+    ])
+    columns[:, len(a):] = lfilter(numerator, full_denominator(structure, a), inputs).T
     return columns
 
 
@@ -238,7 +235,7 @@ def fit(
     samples: Samples, structure: Structure, start: Point, gap_free: bool = True,
     iterations: int = ITERATIONS, penalty: Array | None = None,
 ) -> Fit:
-    """The least squares nearest to a start. gap_free: whether gap and start of p move as well.
+    """The least squares nearest to a start. gap_free: whether the gap moves as well.
 
     penalty: as of `solve_linear`; the squares of the fit are without it.
     """
@@ -255,8 +252,10 @@ def fit(
     for _ in range(iterations):
         columns = slopes(
             samples, structure, point.a, play, linear.solution[:structure.numerator_taps],
-            linear.simulated, gap_free,
+            linear.simulated,
         )
+        if not gap_free:
+            columns = np.delete(columns, len(point.a), axis=1)
         if not samples.complete:
             columns = columns[samples.known]
         if penalty is not None:
@@ -290,10 +289,8 @@ def fit(
 def _moved(point: Point, step: Array, gap_free: bool, top: float, v0: float) -> Point:
     count = len(point.a)
     a = point.a + step[:count]
-    if not gap_free:
-        return point._replace(a=a)
-    gap = min(max(point.gap + float(step[count]), 0.0), top)
-    start = min(max(point.start + float(step[count + 1]), v0), v0 + gap)
+    gap = min(max(point.gap + float(step[count]), 0.0), top) if gap_free else point.gap
+    start = min(max(point.start + float(step[-1]), v0), v0 + gap)
     return Point(a, gap, start)
 
 
