@@ -8,29 +8,36 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from backlash_ros import topics
-from backlash_ros.core.identification.identification import Identification, identify
+from backlash_ros.core.identification.identification import (
+    Identification,
+    Options,
+    identifying,
+)
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.configuration import write_config
 from backlash_ros.tools.errors import BrokenOffError, InputError
-from backlash_ros.tools.identify.measured_record import MeasuredRecord, by_topic, from_messages
+from backlash_ros.tools.identify.measured_record import MeasuredRecord, from_messages
 from backlash_ros.tools.identify.outcome import options_of
 from backlash_ros.tools.supervision import StopRequests
 
 NODE = 'backlash_ros.nodes.identification_drive'
-LOOK_S = 0.2  # between two looks at the record
+LOOK_S = 0.25  # between two looks at the record
+FEWEST = 3  # samples that are a record
 FIRST_LOOK_S = 3.0  # of motion before the first estimate
 SHARE_OF_TIME = 0.25  # of the time that estimates may take: the actuator needs the processor
 REPORTED = 0.9  # share of the samples that applied_control has to report to be believed
-KINDER = 5  # by which this process gives way to the driver and to what moves it
+KINDER = 5  # niceness by which estimates give way to the driver and to what moves it
 BAD_INPUT = 2
 
 
@@ -42,31 +49,30 @@ def drive(
     Raises InputError where it was refused, BrokenOffError where it was interrupted or nothing came.
     """
     with tempfile.TemporaryDirectory() as folder, StopRequests() as stop:
-        messages, config = Path(folder) / 'messages.csv', Path(folder) / 'parameters.yaml'
-        messages.touch()
+        path, config = Path(folder) / 'messages.csv', Path(folder) / 'parameters.yaml'
+        path.touch()
+        messages = _Messages(path)
+        period = given.get('sample_period')
+        period_s = period if isinstance(period, float) else None
         write_config(Parameters(dict(given)), config)
-        os.nice(KINDER)
         # A group of its own: a Ctrl-C reaches this process alone, which passes it on.
         child = subprocess.Popen(
-            [sys.executable, '-m', NODE, *_arguments(options, messages, config), *ros_arguments],
-            start_new_session=True, stdout=sys.stderr, preexec_fn=_as_before,
+            [sys.executable, '-m', NODE, *_arguments(options, path, config), *ros_arguments],
+            start_new_session=True, stdout=sys.stderr,
         )
         try:
-            _follow(child, messages, options, given, stop)
+            _follow(child, messages, options, period_s, stop)
         finally:
             _end(child, stop)
+            record = messages.record(period_s)
+            messages.close()
         if child.returncode == BAD_INPUT:
             raise InputError('the actuator was not moved, see above')
-        record = _record(messages, given)
         if stop.count:
             raise BrokenOffError('interrupted; v was brought to rest')
         if child.returncode or record is None:
             raise BrokenOffError('there is no record of a motion')
         return record
-
-
-def _as_before() -> None:
-    os.nice(-KINDER if os.geteuid() == 0 else 0)
 
 
 def _arguments(options: argparse.Namespace, messages: Path, config: Path) -> list[str]:
@@ -84,36 +90,70 @@ def _arguments(options: argparse.Namespace, messages: Path, config: Path) -> lis
 
 
 def _follow(
-    child: subprocess.Popen[bytes], messages: Path, options: argparse.Namespace,
-    given: Mapping[str, Value], stop: StopRequests,
+    child: subprocess.Popen[bytes], messages: _Messages, options: argparse.Namespace,
+    sample_period: float | None, stop: StopRequests,
 ) -> None:
     """Show progress until the motion ends, is precise enough, or is to be stopped."""
     next_look, told = FIRST_LOOK_S, ''
+    estimate: _Estimate | None = None
     with tqdm(
         total=options.duration, file=sys.stderr, disable=None, leave=False,
         bar_format='{desc} {percentage:3.0f} % |{bar:16}| {postfix}', desc='moving',
     ) as bar:
         while child.poll() is None and not stop.count:
             time.sleep(LOOK_S)
-            record = _record(messages, given)
+            record = messages.record(sample_period)
             if record is None:
                 continue
             moved = len(record.v) * record.sample_period
             bar.n = min(moved, options.duration)
             bar.set_postfix_str(told)
-            if moved < next_look:
+            if estimate is None and moved >= next_look:
+                estimate = _Estimate(record, options_of(options))
+            if estimate is None or estimate.found is None:
                 continue
-            started = time.monotonic()
-            found = identify(record.v, record.y, record.sample_period, options_of(options))
-            took = time.monotonic() - started
-            next_look = moved + max(took / SHARE_OF_TIME, 1.0)
-            told = _told(found)
+            found, told = estimate.found, _told(estimate.found)
+            next_look, estimate = moved + max(estimate.took_s / SHARE_OF_TIME, 1.0), None
             line = f'{moved:5.1f} s  {told}'
             if bar.disable:
                 print(line, file=sys.stderr, flush=True)
             else:
                 bar.write(line, file=sys.stderr)
             if _precise(found, options.precision):
+                break
+    if estimate is not None:
+        estimate.give_up()
+
+
+class _Estimate:
+    """What a record says, looked for beside the motion by a thread that gives way to it.
+
+    found: None until it is known. took_s: how long that was looked for.
+    """
+
+    def __init__(self, record: MeasuredRecord, options: Options) -> None:
+        self.found: Identification | None = None
+        self.took_s = 0.0
+        self._work = identifying(record.v, record.y, record.sample_period, options)
+        self._given_up = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def give_up(self) -> None:
+        """End the search without a result."""
+        self._given_up.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        if sys.platform == 'linux':
+            os.nice(KINDER)  # of this thread alone
+        started = time.monotonic()
+        while not self._given_up.is_set():
+            try:
+                next(self._work)
+            except StopIteration as done:
+                self.took_s = time.monotonic() - started
+                self.found = done.value
                 return
 
 
@@ -145,25 +185,38 @@ def _end(child: subprocess.Popen[bytes], stop: StopRequests) -> None:
             child.send_signal(signal.SIGINT)
 
 
-def _record(messages: Path, given: Mapping[str, Value]) -> MeasuredRecord | None:
-    """What was written so far, None while it is no record yet."""
-    rows = []
-    for line in messages.read_text(encoding='ascii').split('\n')[:-1]:
-        topic, stamp, value = line.split(',')
-        rows.append((topic, int(stamp), float(value)))
-    heard = by_topic(rows)
-    output = heard.get(topics.PLANT_OUTPUT)
-    commands = heard.get(topics.APPLIED_CONTROL)
-    if output is None or len(output[0]) < 3:
-        return None
-    if commands is None or len(commands[0]) < REPORTED * len(output[0]):
-        commands = heard.get(topics.CONTROL)
-    if commands is None:
-        return None
-    period = given.get('sample_period')
-    try:
-        return from_messages(
-            Path('the motion'), output, commands, period if isinstance(period, float) else None
-        )
-    except InputError:
-        return None
+class _Messages:
+    """What the node has written so far: topic, stamp [ns], value on each line."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open(encoding='ascii')
+        self._unfinished = ''
+        self._heard: dict[str, tuple[list[int], list[float]]] = {}
+
+    def close(self) -> None:
+        self._file.close()
+
+    def record(self, sample_period: float | None) -> MeasuredRecord | None:
+        """The record, None while it is none yet."""
+        *lines, self._unfinished = (self._unfinished + self._file.read()).split('\n')
+        for line in lines:
+            topic, stamp, value = line.split(',')
+            stamps, values = self._heard.setdefault(topic, ([], []))
+            stamps.append(int(stamp))
+            values.append(float(value))
+        heard = {
+            topic: (np.array(stamps, dtype=np.int64), np.array(values))
+            for topic, (stamps, values) in self._heard.items()
+        }
+        output = heard.get(topics.PLANT_OUTPUT)
+        commands = heard.get(topics.APPLIED_CONTROL)
+        if output is None or len(output[0]) < FEWEST:
+            return None
+        if commands is None or len(commands[0]) < REPORTED * len(output[0]):
+            commands = heard.get(topics.CONTROL)
+        if commands is None:
+            return None
+        try:
+            return from_messages(Path('the motion'), output, commands, sample_period)
+        except InputError:
+            return None

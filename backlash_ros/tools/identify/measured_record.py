@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite, nan
 from pathlib import Path
@@ -239,16 +239,3 @@ def _numbered(steps: Array) -> NDArray[np.int64]:
     place = np.arange(len(times))
     numbers = np.minimum.accumulate((times - place)[::-1])[::-1] + place
     return np.asarray(numbers - numbers[0], dtype=np.int64)
-
-
-def by_topic(rows: Sequence[tuple[str, int, float]]) -> Mapping[str, Messages]:
-    """Stamps [ns] and values of each topic from rows of (topic, stamp, value)."""
-    found: dict[str, tuple[list[int], list[float]]] = {}
-    for topic, stamp, value in rows:
-        stamps, values = found.setdefault(topic, ([], []))
-        stamps.append(stamp)
-        values.append(value)
-    return {
-        topic: (np.array(stamps, dtype=np.int64), np.array(values))
-        for topic, (stamps, values) in found.items()
-    }
