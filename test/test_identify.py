@@ -271,6 +271,35 @@ def test_what_the_controller_refuses_is_of_no_use(
     assert 'the controller does not take it: structure' in capsys.readouterr().out
 
 
+def test_an_axis_gets_a_file_of_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tmp_path / 'axes.yaml'
+    config.write_text(
+        "/bringup: {ros__parameters: {axes: ['x', 'z']}}\n"
+        '/**: {ros__parameters: {control: {min: -4.0, max: 4.0, rate_max: 40.0}}}\n'
+        '/z/**: {ros__parameters: {control: {max: 5.0}}}\n'
+    )
+    source = write_csv(tmp_path / 'a.csv', *record(800))
+    given = [str(source), *QUICK, '--config', str(config), '--out', str(tmp_path / 'out')]
+    assert main(given) == 2
+    assert 'choose one, like --axis x' in capsys.readouterr().err
+    assert main([*given, '--axis', 'z']) == 0
+    found = effective_parameters(tmp_path / 'out' / 'identified.yaml', axis='z')
+    assert found.real('control.max') == 5.0
+
+
+def test_a_longer_record_than_is_searched_is_fitted_as_a_whole(tmp_path: Path) -> None:
+    v, y = record(8000)
+    y[7000] = 40.0
+    source = write_csv(tmp_path / 'a.csv', v, y)
+    assert main([str(source), *QUICK, '--out', str(tmp_path / 'out')]) == 0
+    found = json.loads((tmp_path / 'out' / 'identified.json').read_text())
+    assert found['samples'] == 8000
+    assert found['outliers'] >= 1
+    assert abs(found['gap'] - 0.9) < 4.0 * found['std']['gap'] < 2e-3
+
+
 def test_shipped_limits_are_enough_for_a_drive() -> None:
     from backlash_ros.nodes.gentle_drive import drive_range
     from backlash_ros.tools.identify.command import given_values

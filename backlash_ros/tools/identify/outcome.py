@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from backlash_ros.core.errors import ParameterError
@@ -21,6 +22,7 @@ from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.files import write_atomically
 from backlash_ros.tools.command_line import format_table
+from backlash_ros.tools.errors import BrokenOffError
 from backlash_ros.tools.identify.command import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
 from backlash_ros.tools.identify.identified_file import (
     as_estimate,
@@ -52,6 +54,8 @@ def identified(record: MeasuredRecord, options: argparse.Namespace) -> Identific
             except StopIteration as done:
                 found: Identification = done.value
                 return found
+            except np.linalg.LinAlgError as error:
+                raise BrokenOffError(f'the record cannot be fitted: {error}') from error
 
 
 def write_outcome(
