@@ -206,6 +206,8 @@ def test_no_backlash_is_noted() -> None:
     (np.zeros(900), np.ones(900), 'v stood still'),
     (np.arange(900) % 100 / 10.0, np.ones(900), 'y stood still'),
     (np.arange(900) % 100 / 10.0, np.full(900, np.nan), 'too few'),
+    (np.arange(900) % 100 / 10.0, np.where(np.arange(900) < 700, np.nan, 1.0), 'too unevenly'),
+    (np.arange(900) % 100 / 10.0, np.where(np.arange(900) < 500, 1.0, np.nan), 'too unevenly'),
 ])
 def test_what_holds_no_motion_is_told_in_a_sentence(v: Array, y: Array, said: str) -> None:
     assert said in reasons(v, y)

@@ -43,7 +43,7 @@ from backlash_ros.core.identification.uncertainty import Covariance
 Array = NDArray[np.float64]
 T = TypeVar('T')
 
-GENERAL_ORDER = 3  # poles of the G with which the gap is searched first
+GENERAL = Structure(3, 0, False)  # G with which the gap is searched first, and a tap per delay
 FEWEST = 8  # samples per unknown below which nothing is fitted
 SEARCHED_AT_MOST = 6000  # samples, of a longer record the busiest ones, that searches look at
 CANDIDATES = 2  # gaps with which the structures are compared
@@ -163,9 +163,9 @@ def identifying(
     if nothing is not None:
         return nothing
     first = max(options.delays) + 1
-    part = _busiest(v)
+    part = _busiest(v, y)
     searched = Samples(v[part], y[part], first)
-    general = Structure(GENERAL_ORDER, 0, False, GENERAL_ORDER + max(options.delays))
+    general = GENERAL._replace(taps=GENERAL.order + max(options.delays))
     found = yield from _named('searching the gap', search(searched, general))
     wild = _outliers(searched, found[0])
     if wild.any():
@@ -216,13 +216,17 @@ def _check(v: Array, y: Array) -> None:
 def _nothing(v: Array, y: Array, sample_period: float, options: Options) -> Identification | None:
     """Where there is nothing to fit: why."""
     first = max(options.delays) + 1
-    known = int(np.isfinite(y[first:]).sum())
-    unknowns = Structure(max(options.orders), 0, False).unknowns
+    part = _busiest(v, y)
+    known = np.isfinite(y[part][first:])
+    # The first samples of them are fitted alone, to predict the others.
+    fitted = known[:len(known) - round(options.held_out * len(known))]
+    needed = FEWEST * max(Structure(max(options.orders), 0, False).unknowns, GENERAL.unknowns)
     reason = ''
-    if known < FEWEST * unknowns:
+    if fitted.sum() < needed or not known[len(fitted):].any():
         reason = (
-            f'{known} samples of y are too few for an order of up to {max(options.orders)}, '
-            f'{FEWEST * unknowns} are needed: record for longer, or limit --order'
+            f'{int(known.sum())} samples of y are too few, or lie too unevenly, for an order of up '
+            f'to {max(options.orders)}, about {round(needed / (1.0 - options.held_out))} are '
+            'needed: record for longer, or limit --order'
         )
     elif np.ptp(v) == 0.0:
         reason = 'v stood still: move it to and fro, past the gap'
@@ -242,11 +246,11 @@ def _named(stage: str, work: Generator[None, None, T]) -> Generator[str, None, T
         yield stage
 
 
-def _busiest(v: Array) -> slice:
-    """The stretch for the search in which v moves most."""
+def _busiest(v: Array, y: Array) -> slice:
+    """The stretch for the search in which v moves most while y is known."""
     if len(v) <= SEARCHED_AT_MOST:
         return slice(0, len(v))
-    path = np.append(0.0, np.cumsum(np.abs(np.diff(v))))
+    path = np.append(0.0, np.cumsum(np.abs(np.diff(v)) * np.isfinite(y[1:])))
     first = int(np.argmax(path[SEARCHED_AT_MOST - 1:] - path[:len(v) - SEARCHED_AT_MOST + 1]))
     return slice(first, first + SEARCHED_AT_MOST)
 
