@@ -48,7 +48,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = folder / 'mine.yaml'
     config.write_text(
         '/**: {ros__parameters: {control: {min: -4.0, max: 4.0, rate_max: 40.0},'
-        ' on_stop: zero, backlash: {m: 7.0}}}'
+        ' on_stop: zero, backlash: {m: 7.0}, input_disturbance: 2.0}}'
     )
     v, y = record()
     y[::50] = np.nan
@@ -86,6 +86,7 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
     assert parameters.real('control.rate_max') == 40.0
     assert parameters.word('on_stop') == 'zero'
     assert parameters.real('backlash.m') == 0.5
+    assert parameters.real('input_disturbance') == 0.0
     build_controller(parameters)
 
 
