@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import GATE
-from backlash_ros.core.estimation.record_fit import frequencies_of
+from backlash_ros.core.estimation.record_description import frequencies_of
 from backlash_ros.core.identification import judgement, uncertainty
 from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.order_selection import (
