@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,10 @@ from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.replay import parting, replay
 from backlash_ros.tools import simulate
+from backlash_ros.tools.identify.measured_record import read_measured
+from backlash_ros.tools.processes import child_environment, free_domain
 from backlash_ros.tools.replay import main
+from backlash_ros.tools.report import open_source
 
 NOISY = {'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
 # Losses, a structure that feeds y back, a learned G, a law of another kind, a limited v.
@@ -106,6 +111,25 @@ def test_several_runs_and_values_give_a_table(recorded: Path, tmp_path: Path) ->
         'plant.uncertainty=0', 'plant.uncertainty=0.1',
     ] * 2
     assert all(float(row['c_r']) == pytest.approx(3.0, rel=0.05) for row in rows)
+
+
+def test_the_bag_of_a_run_in_lockstep_is_replayed_and_read(tmp_path: Path) -> None:
+    with free_domain() as domain:
+        done = subprocess.run(
+            [sys.executable, '-m', 'backlash_ros.tools.bringup', '--duration', '2', '--lockstep',
+             '--set', 'output_loss=0.1', '--set', 'output_noise_std=1e-4',
+             '--out', str(tmp_path / 'run')],
+            env=child_environment(tmp_path, domain), capture_output=True, text=True, timeout=150.0,
+        )
+    assert done.returncode == 0, done.stderr
+    source = open_source(tmp_path / 'run' / 'bag')
+    assert source.parameters is not None
+    assert parting(source.run, replay(source.run, source.parameters)) is None
+    record = read_measured(tmp_path / 'run')
+    rows = np.round(source.run.column('t') / 0.01).astype(int)
+    assert record.v[rows].tolist() == source.run.column('v').tolist()
+    assert record.y[rows].tolist() == source.run.column('y').tolist()
+    assert record.lost == len(record.y) - len(rows)
 
 
 @pytest.mark.parametrize('arguments', [

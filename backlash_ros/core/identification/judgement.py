@@ -73,11 +73,15 @@ def reasons(e: Evidence) -> list[str]:
             f'v went past the gap and back {e.fit.play.reversals} times, {REVERSALS} are needed: '
             'move it to and fro more often, or record for longer'
         )
-    found += [
-        f'two gaps fit alike, {gap:.4g} and {rival:.4g}: move v at several speeds and amplitudes'
-        for rival, behind in e.rivals
+    alike = [
+        rival for rival, behind in e.rivals
         if behind < UNDECIDED and abs(rival - gap) > BEYOND * e.gap_std
     ]
+    if alike:
+        found.append(
+            f'two gaps fit alike, {gap:.4g} and {alike[0]:.4g}: move v at several speeds and '
+            'amplitudes'
+        )
     imprecise = e.gap_std > max(PRECISE_GAP * gap, NO_GAP * swing)
     if imprecise:
         found.append(_why_imprecise(e))

@@ -25,6 +25,7 @@ Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values
 COLUMNS = ('t', 'v', 'y')
 OFF_GRID = 0.25  # of a period that a row of a CSV may miss its time
 REPORTED = 0.9  # share of the samples that applied_control has to report to be believed
+SIMULATED_BEFORE_NS = 10**17  # stamps: the clock of a machine is far beyond
 LONGEST = 1_000_000  # samples, lost ones included: more is a t that jumps
 
 
@@ -176,7 +177,8 @@ def _from_bag(path: Path, sample_period: float | None, axis: str) -> MeasuredRec
             if topic == topics.PLANT_OUTPUT and note:
                 notes.append(note)
     output = chosen.get(topics.PLANT_OUTPUT)
-    if output is None or len(output[0]) < 2:
+    if output is None or len(output[0]) < 2 or output[0][0] < SIMULATED_BEFORE_NS:
+        # Stamps of a simulated time do not tell what came first within a sample.
         return _from_signals(path, sample_period, axis)
     of_axis = f' of axis {axis}' if axis else ''
     commands = chosen.get(topics.APPLIED_CONTROL)
