@@ -130,9 +130,8 @@ def test_frozen_estimates_stay_and_learning_goes_on_afterwards(tmp_path: Path) -
         asked = Asked(driver)
         driver.learn()
         assert asked.set('freeze_adaptation', True)
-        driver.run_until(
-            lambda: driver.estimates[-1].data[:3] == driver.estimates[-2].data[:3], 'a standstill'
-        )
+        # The estimates of outputs that were under way are not held yet.
+        driver.run(0.2)
         held = driver.estimate()
         driver.run(0.3)
         assert driver.estimate() == held

@@ -153,7 +153,7 @@ def test_page_tells_what_is_known_of_the_fit(run: RunRecord, tmp_path: Path) -> 
     assert '<td>unexplained motion of u</td><td>5.67 % of m times the gap</td>' in pages['known']
     assert '<td>unexplained motion of u</td><td>–</td>' in pages['unknown']
     for html in pages.values():
-        assert '<td>state at the end</td><td>tracking</td>' in html
+        assert '<td>state at the end</td><td>acquiring</td>' in html
 
 
 def test_summary_of_a_bag_tells_latency_losses_and_truth(page: Path) -> None:

@@ -23,12 +23,13 @@ from tqdm import tqdm
 from backlash_ros.core.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.parameter_table import BY_NAME, Value
 from backlash_ros.core.parameters import Parameters, check_names, check_value
-from backlash_ros.tools.command_line import number_of_samples
+from backlash_ros.tools.command_line import FAILED, number_of_samples
 from backlash_ros.tools.errors import BrokenOffError, InputError
 from backlash_ros.tools.results import BACKLASH, summarise
 from backlash_ros.tools.simulation import prepare, run_loop
 
 # The matrices are tiny: threads of the linear algebra would only disturb the other processes.
+PATIENCE_S = 5.0  # after an interruption, until the process ends whatever it waits for
 ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 Array = NDArray[np.float64]
 
@@ -199,9 +200,15 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
         yield pool
     except BrokenProcessPool:
         raise BrokenOffError('a worker process was killed: is there enough memory?') from None
-    except BaseException:
+    except BaseException as error:
         for worker in set(multiprocessing.active_children()) - others:
             worker.kill()
+        if isinstance(error, KeyboardInterrupt):
+            # The thread of the pool may wait for ever for a worker that was killed as it began.
+            pool.shutdown(wait=False, cancel_futures=True)
+            leave = threading.Timer(PATIENCE_S, os._exit, (FAILED,))
+            leave.daemon = True
+            leave.start()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
