@@ -16,6 +16,7 @@ from backlash_ros.core.estimation.constants import (
     RECOVERED,
     REPLACING,
     SEARCH_GROWTH,
+    SEARCHED,
 )
 from backlash_ros.core.estimation.learning import Learning, Task
 from backlash_ros.core.estimation.prior import Prior, contradicts
@@ -111,7 +112,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         return learning.go_on_from(whole, record.first)
     changes = []
     for first in (since, (since + end) // 2):
-        first = max(first, end - learning.searched)
+        first = max(first, end - SEARCHED)
         if end - first < RECOVERED:
             continue
         v, y = record.since(first)
@@ -132,7 +133,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         return learning.go_on_from(whole, record.first)
     if end - since >= RECOVERED:
         learning.reason = Status.INCONSISTENT
-    if end - since > learning.searched:
+    if end - since > SEARCHED:
         learning.begin_acquisition(estimate)
     return False
 
@@ -146,7 +147,7 @@ def _best_of_all(
     results = []
     for beginning in learning.beginnings(around):
         result: Fitted | None
-        if len(v) <= learning.searched:
+        if len(v) <= SEARCHED:
             result = yield from searched(v, y, beginning, learning.widest, pace)
         else:
             start = current.fit.start.with_gap(current.solution.gap, v)

@@ -98,7 +98,7 @@ class Learning:
 
     @property
     def searched(self) -> int:
-        """Newest samples that a search looks at: those whose beginning G has forgotten as well."""
+        """Newest samples that the first search looks at: G has forgotten what was before them."""
         return min(max(SEARCHED, MEMORIES_SEARCHED * self.around.model.memory), LONGEST)
 
     @property

@@ -16,6 +16,7 @@ from backlash_ros.core.estimation.constants import (
     LONGEST,
     MISFIT,
     OUTLIER_SHARE,
+    SEARCHED,
 )
 from backlash_ros.core.estimation.learning import Learning, Task
 from backlash_ros.core.estimation.observer import Observer
@@ -74,7 +75,7 @@ def refit(learning: Learning) -> Task:
             v, y, beginning, start, current.solution.m, learning.pace
         )))
     result = yield from with_walk(v, y, most_likely(results), learning.pace)
-    if len(v) <= learning.searched and around.prior is None:
+    if len(v) <= SEARCHED and around.prior is None:
         # The gap of a short record may be one of several.
         other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
         if other is not None and learning.usable(other) is not None:
