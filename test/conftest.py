@@ -1,5 +1,6 @@
 """For all tests: what examples property tests draw, the order of the tests, a fixture."""
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,6 +17,15 @@ settings.register_profile('search', deadline=None, max_examples=1000)
 settings.load_profile('repeatable')
 
 STARTS_PROCESSES = {'bringup_processes', 'paced_driver', 'ros_processes'}
+
+
+def pytest_configure() -> None:
+    """Hear Ctrl-C even where the tests run in the background of a script.
+
+    A shell lets its background jobs ignore SIGINT, and whatever they start would inherit that.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
