@@ -57,6 +57,27 @@ def test_sensor_that_comes_back_ends_the_freeze() -> None:
     assert errors(record, -1).max() < 0.01
 
 
+@pytest.mark.parametrize('seed', [3, 16])
+def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate(seed: int) -> None:
+    loop = build_closed_loop(Parameters({
+        'plant.uncertainty': 0.0, 'output_noise_std': NOISE, 'seed': seed,
+    }))
+    rng = np.random.default_rng(seed)
+    step, acting = loop.plant.step, 0.0
+
+    def loses_commands(v: float) -> None:
+        nonlocal acting
+        acting = acting if loop.plant.sample >= 300 and rng.random() < 0.3 else v
+        step(acting)
+
+    loop.plant.step = loses_commands  # type: ignore[method-assign]
+    record = loop.run(1500)
+    status = record.column('status')
+    assert np.mean(status[400:] == Status.INCONSISTENT) > 0.5
+    # A v that is held now and then looks like a wider gap for a while.
+    assert max(errors(record, k).max() for k in range(300, 1500)) < 0.2
+
+
 @pytest.mark.parametrize('seed', [303, 305])
 def test_samples_that_contradict_in_a_row_are_none_of_them_lost(seed: int) -> None:
     # An integrator that leaks contradicts the first estimate at once: what was refused as outliers

@@ -97,7 +97,5 @@ def _explain(learning: Learning, result: Fitted | None) -> None:
     if result is None:
         learning.reason = Status.NOT_EXCITED
         return
-    solution = result.solution
-    unexplained = solution.count * solution.correlation > 1.0
-    inconsistent = solution.m < 0.0 or unexplained
+    inconsistent = result.solution.m < 0.0 or result.solution.moved_otherwise
     learning.reason = Status.INCONSISTENT if inconsistent else Status.ACQUIRING

@@ -93,7 +93,7 @@ def halve(learning: Learning) -> Task:
             newer = yield from fitted(
                 v[half:], y[half:], around._replace(prior=prior), newer.fit.start, solution.m, pace
             )
-    return learning.go_on_from(newer, record.first + half)
+    return learning.go_on_from(newer, record.first + half, changed=True)
 
 
 def reconsider(learning: Learning, estimate: Estimate) -> Task:
@@ -106,12 +106,16 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     bound = AS_GOOD * current.solution.posterior.noise_std
     around, end = learning.free, record.end
     learning.next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
-    whole = yield from _best_of_all(learning, around)
+    # What is known from elsewhere still holds, unless the plant has changed.
+    whole = yield from _best_of_all(learning, learning.around._replace(walk=0.0))
     if whole is not None and whole.solution.rms <= bound \
             and whole.fit.misfit(whole.solution, since - record.first) <= MISFIT:
         return learning.go_on_from(whole, record.first)
+    # What is known from elsewhere may have changed before the record began.
+    earliest = [record.first] if around.prior is not learning.around.prior else []
+    before, learning.changed = learning.changed, None
     changes = []
-    for first in (since, (since + end) // 2):
+    for first in (*earliest, since, (since + end) // 2):
         first = max(first, end - SEARCHED)
         if end - first < RECOVERED:
             continue
@@ -120,8 +124,11 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         if found is not None:
             changes.append(found)
             if learning.usable(found, REPLACING) is not None and found.solution.rms <= bound \
-                    and _has_changed(current, found, whole):
-                return learning.go_on_from(found, first)
+                    and _has_changed(current, found, whole, first == record.first):
+                theta = learning.changed = found.solution.of_theta
+                # As a first estimate it has to be found twice.
+                if before is not None and not contradicts(theta, before):
+                    return learning.go_on_from(found, first, changed=True)
         # The same backlash, but something has moved the plant meanwhile.
         kept = yield from confirmed(learning, v, y, estimate, found)
         if kept is not None and kept.solution.rms <= bound \
@@ -159,17 +166,19 @@ def _best_of_all(
     return most_likely(results) if results else None
 
 
-def _has_changed(current: Fitted, newer: Fitted, whole: Fitted | None) -> bool:
+def _has_changed(
+    current: Fitted, newer: Fitted, whole: Fitted | None, before: bool = False,
+) -> bool:
     """Whether two plants, the present fit and one of the newer samples, are more likely.
 
-    Than one for the whole record. Every unknown of the newer one costs half the logarithm of its
-    samples (G. Schwarz, Estimating the dimension of a model, Annals of Statistics 6 (1978)
-    461-464).
+    Than one for the whole record. before: the newer one is of the whole record as well. Every
+    unknown of the newer one costs half the logarithm of its samples (G. Schwarz, Estimating the
+    dimension of a model, Annals of Statistics 6 (1978) 461-464).
     """
     if whole is None:
         return True
     fit = newer.fit
     unknowns = fit.layout.driven + newer.around.error.count
     told = newer.around.told_std / newer.solution.posterior.noise_std
-    both = current.evidence + newer.evidence + log(told)
+    both = newer.evidence + log(told) + (0.0 if before else current.evidence)
     return both - 0.5 * unknowns * log(fit.length) > whole.evidence

@@ -8,6 +8,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.protocol import Estimate
+
 
 @dataclass(frozen=True)
 class Crossings:
@@ -48,3 +50,8 @@ def crossings_of(theta: NDArray[np.float64], cov: NDArray[np.float64]) -> Crossi
         m, c_r, c_l, sqrt(max(var_m, 0.0)), sqrt(max(var_r, 0.0)), sqrt(max(var_l, 0.0)),
         sqrt(max(var_r + var_l - 2.0 * cov_rl, 0.0)), of_all,
     )
+
+
+def difference(found: Crossings, estimate: Estimate) -> NDArray[np.float64]:
+    """By how much (m, c_r, c_l) differ from those of an estimate, shape (3,)."""
+    return np.array([found.m - estimate.m, found.c_r - estimate.c_r, found.c_l - estimate.c_l])

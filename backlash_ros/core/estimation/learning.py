@@ -20,14 +20,14 @@ from backlash_ros.core.estimation.constants import (
     GROWTH,
     LONGEST,
     MEMORIES_SEARCHED,
+    RECOVERED,
     REPLACING,
     SEARCHED,
-    UNDECIDED,
 )
-from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.crossings import Crossings, difference
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.play import Start
-from backlash_ros.core.estimation.prior import Prior, drifted
+from backlash_ros.core.estimation.prior import Prior, beyond_chance, drifted
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.record import Record
 from backlash_ros.core.estimation.relabelling import Fitted
@@ -63,8 +63,9 @@ class Learning:
     refit_at: length of the record at which all of it is fitted anew; moved_at: from which a gap
     that moved is reason to do so. contradicted_from: sample from which the fit does not hold;
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
-    again. refitted: whether it was fitted anew since the record contradicts itself. unconfirmed:
-    what was learned before, as long as the samples merely do not deny it.
+    again. changed: what theta seems to have become. refitted: whether it was fitted anew since the
+    record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
+    do not deny it.
     """
 
     bounds: Bounds
@@ -83,6 +84,7 @@ class Learning:
     consistent: int = 0
     next_try: int = 0
     refitted: bool = False
+    changed: Prior | None = None
     unconfirmed: Prior | None = None
 
     @property
@@ -126,16 +128,29 @@ class Learning:
         """The crossings of a fit that is precise enough, see acceptance.py."""
         return usable(result, self.bounds, share)
 
-    def too_early(self, found: Crossings, held: Array | None) -> bool:
-        """Whether a short record, begun after a change of the plant, is still worse than nothing.
+    def believable(self, found: Crossings, estimate: Estimate, held: Array | None) -> bool:
+        """Whether a fit may take the place of the estimate that held so far.
 
-        found: what the fit says. held: covariance (3, 3) of the estimate so far. A rough estimate
-        is better than none, but not than one that held.
+        found: what the fit says. held: covariance (3, 3) of that estimate. Few samples can be
+        fitted by a backlash that never was, and so can many where y moves otherwise: after a
+        contradiction a fit has to foretell some, before it says something else or says it less
+        precisely.
         """
-        if self.fit.fit.length >= UNDECIDED or held is None:
-            return False
-        wider = np.any(np.diag(found.cov) > np.diag(held))
-        return bool(wider) and self.usable(self.fit, REPLACING) is None
+        if held is None:
+            return True
+        proven = self.consistent >= RECOVERED
+        otherwise = self.fit.solution.moved_otherwise
+        if beyond_chance(difference(found, estimate), found.cov + held):
+            return proven and not (otherwise and self.around.error.count == 0)
+        if otherwise and not self.drift.any():
+            return bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
+        return proven or not np.any(np.diag(found.cov) > np.diag(held))
+
+    def agrees(self, found: Crossings, estimate: Estimate, held: Array | None) -> bool:
+        """Whether a fit that has foretold some samples says what is known already; as above."""
+        return held is not None and self.consistent >= RECOVERED and not beyond_chance(
+            difference(found, estimate), found.cov + held
+        )
 
     @property
     def stands_alone(self) -> bool:
@@ -161,18 +176,24 @@ class Learning:
         self.acquisition = Acquisition(self.record.end + FIRST_SEARCH, inherited)
         self.refit_at, self.moved_at = 0.0, 0
         self.refitted = False
-        self.contradicted_from = self.unconfirmed = None
+        self.contradicted_from = self.changed = self.unconfirmed = None
 
-    def go_on_from(self, result: Fitted, first: int) -> bool:
-        """Go on from this fit of the record from sample `first` on; it is to be published."""
+    def go_on_from(self, result: Fitted, first: int, changed: bool = False) -> bool:
+        """Go on from this fit of the record from sample `first` on; it is to be published.
+
+        changed: whether it is of a plant that has changed.
+        """
         self.current, self.around = result, result.around
         if result.around.prior is not self.unconfirmed:
             self.unconfirmed = None
         self.record.forget_before(first)
         self.refit_at = min(GROWTH * result.fit.length, LONGEST)
         self.moved_at = result.fit.length + BLOCK[1]
-        self.contradicted_from = self.acquisition.rejected = None
+        self.contradicted_from = self.changed = self.acquisition.rejected = None
         self.reason = Status.TRACKING
+        if changed:
+            # A change that was announced need not foretell any samples first.
+            self.consistent = RECOVERED if self.drift.any() else 0
         return True
 
     def restart(self, start: Start) -> None:

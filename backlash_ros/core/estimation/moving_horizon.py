@@ -22,6 +22,7 @@ from backlash_ros.core.estimation.constants import (
     BLOCK,
     NO_DATA,
 )
+from backlash_ros.core.estimation.crossings import Crossings
 from backlash_ros.core.estimation.error_model import build_error_model
 from backlash_ros.core.estimation.learned_error import response_std
 from backlash_ros.core.estimation.learning import CAPACITY, Learning, Task
@@ -274,19 +275,23 @@ class MovingHorizon:
         learning = self._learning
         current = learning.fit
         found = learning.usable(current)
-        if found is None or learning.too_early(found, self.covariance):
+        if found is not None and learning.believable(found, self.estimate, self.covariance):
+            self._take_over(found)
+        elif found is None or not learning.agrees(found, self.estimate, self.covariance):
             learning.reason = Status.INCONSISTENT
             if not self._following.begun:
                 return
-        else:
-            if learning.contradicted_from is None:
-                learning.reason = Status.TRACKING
-            if learning.unconfirmed is not None and learning.stands_alone:
-                learning.unconfirmed = None
-            m, c_r, c_l = learning.bounds.project(found.m, found.c_r, found.c_l)
-            self.covariance = found.cov
-            self.estimate = Estimate(
-                m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
-                self.estimate.status,
-            )
         self._following.follow(current, self.estimate, learning.record)
+
+    def _take_over(self, found: Crossings) -> None:
+        learning = self._learning
+        if learning.contradicted_from is None:
+            learning.reason = Status.TRACKING
+        if learning.unconfirmed is not None and learning.stands_alone:
+            learning.unconfirmed = None
+        m, c_r, c_l = learning.bounds.project(found.m, found.c_r, found.c_l)
+        self.covariance = found.cov
+        self.estimate = Estimate(
+            m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
+            self.estimate.status,
+        )

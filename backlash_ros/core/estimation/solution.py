@@ -75,6 +75,11 @@ class Solution:
         return Prior(self.theta, self.theta_cov)
 
     @property
+    def moved_otherwise(self) -> bool:
+        """Whether y moves in a way that no backlash and no G explains, beyond chance."""
+        return self.count * self.correlation > 1.0
+
+    @property
     def std_gap(self) -> float:
         """Standard deviation of the gap; inf unless m > 0."""
         return self.crossings.std_gap if self.crossings is not None else inf
