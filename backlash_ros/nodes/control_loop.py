@@ -268,8 +268,10 @@ class ControlLoop:
             return core.step(y, y_m)
         if self._lockstep:
             return core.step(y, y_m, lost)
+        # Late commands are counted even where the driver says which ones it applied.
+        supposed = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
         reported = commands.reported_over(lost + 1, stamp_ns, unsent)
-        if reported:
-            return core.step(y, y_m, lost, reported)
-        return core.step(y, y_m, lost, *commands.over(lost + 1, stamp_ns, self.counter.due_ns))
+        return core.step(y, y_m, lost, reported) if reported else core.step(
+            y, y_m, lost, *supposed
+        )
 

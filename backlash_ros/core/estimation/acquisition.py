@@ -18,7 +18,7 @@ from backlash_ros.core.estimation.constants import (
 from backlash_ros.core.estimation.learned_error import plausible
 from backlash_ros.core.estimation.learning import Learning, Task
 from backlash_ros.core.estimation.play import Start
-from backlash_ros.core.estimation.prior import beyond_chance, contradicts, prior_of
+from backlash_ros.core.estimation.prior import contradicts, prior_of
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.relabelling import Fitted, fitted, motionless, searched
 
@@ -83,10 +83,8 @@ def confirmed(
         if usable and contradicts(free.solution.of_theta, prior):
             return None
         least = min(least, free.solution.rms)
-    solution = kept.solution
-    good = solution.rms <= AS_GOOD * least and plausible(kept.fit, solution)
-    same = not beyond_chance(solution.theta - prior.theta, prior.cov)
-    return kept if good and same else None
+    good = kept.solution.rms <= AS_GOOD * least and plausible(kept.fit, kept.solution)
+    return kept if good and kept.keeps_prior else None
 
 
 def _explain(learning: Learning, result: Fitted | None) -> None:

@@ -83,7 +83,7 @@ def halve(learning: Learning) -> Task:
     if not (contradicts(newer.solution.of_theta, whole)
             or learning.drifts_more(newer.solution, half)):
         return False
-    if learning.drift.any() and not around.error.count:
+    if learning.expects_changes and not around.error.count:
         # What the older half says holds as far as theta has not drifted since.
         older = yield from fitted(
             v[:half], y[:half], learning.around._replace(walk=0.0), fit.start, solution.m, pace
@@ -126,8 +126,9 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
             if learning.usable(found, REPLACING) is not None and found.solution.rms <= bound \
                     and _has_changed(current, found, whole, first == record.first):
                 theta = learning.changed = found.solution.of_theta
-                # As a first estimate it has to be found twice.
-                if before is not None and not contradicts(theta, before):
+                # As a first estimate, one that nobody expects has to be found twice.
+                again = before is not None and not contradicts(theta, before)
+                if again or learning.expects_changes:
                     return learning.go_on_from(found, first, changed=True)
         # The same backlash, but something has moved the plant meanwhile.
         kept = yield from confirmed(learning, v, y, estimate, found)
@@ -161,7 +162,7 @@ def _best_of_all(
             result = yield from fitted_with_model(
                 v, y, beginning, start, current.solution.m, pace
             )
-        if result is not None and learning.usable(result) is not None:
+        if result is not None and result.keeps_prior and learning.usable(result) is not None:
             results.append(result)
     return most_likely(results) if results else None
 

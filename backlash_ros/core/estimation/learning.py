@@ -88,6 +88,11 @@ class Learning:
     unconfirmed: Prior | None = None
 
     @property
+    def expects_changes(self) -> bool:
+        """Whether m, c_r, c_l drift as told: a change is believed at once."""
+        return bool(self.drift.any())
+
+    @property
     def fit(self) -> Fitted:
         """The fit, of tasks that begin once there is one."""
         assert self.current is not None
@@ -142,7 +147,7 @@ class Learning:
         otherwise = self.fit.solution.moved_otherwise
         if beyond_chance(difference(found, estimate), found.cov + held):
             return proven and not (otherwise and self.around.error.count == 0)
-        if otherwise and not self.drift.any():
+        if otherwise and not self.expects_changes:
             return bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
         return proven or not np.any(np.diag(found.cov) > np.diag(held))
 
@@ -162,7 +167,7 @@ class Learning:
     def drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""
         found = solution.crossings
-        if found is None or not self.drift.any() or samples < BLOCK[1]:
+        if found is None or not self.expects_changes or samples < BLOCK[1]:
             return False
         return bool(np.any(self.drift**2 * (samples / 3.0) > np.diag(found.cov)))
 
@@ -192,8 +197,7 @@ class Learning:
         self.contradicted_from = self.changed = self.acquisition.rejected = None
         self.reason = Status.TRACKING
         if changed:
-            # A change that was announced need not foretell any samples first.
-            self.consistent = RECOVERED if self.drift.any() else 0
+            self.consistent = RECOVERED if self.expects_changes else 0
         return True
 
     def restart(self, start: Start) -> None:

@@ -29,6 +29,7 @@ from backlash_ros.core.estimation.learned_error import wants_another_model
 from backlash_ros.core.estimation.low_order import OutputError, low_order
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.play import Start
+from backlash_ros.core.estimation.prior import beyond_chance
 from backlash_ros.core.estimation.search import Candidate, search
 from backlash_ros.core.estimation.solution import Around, Solution
 from backlash_ros.core.estimation.window_fit import WindowFit, weights_of
@@ -61,6 +62,12 @@ class Fitted(NamedTuple):
     def evidence(self) -> float:
         """Log-likelihood, comparable between fits of the same samples."""
         return self.solution.posterior.evidence
+
+    @property
+    def keeps_prior(self) -> bool:
+        """Whether the samples do not deny what was known from elsewhere."""
+        prior = self.around.prior
+        return prior is None or not beyond_chance(self.solution.theta - prior.theta, prior.cov)
 
     def beginning(self, v: Array) -> Start:
         """Where another fit of v (N,) is to begin."""
