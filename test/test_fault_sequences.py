@@ -29,6 +29,12 @@ def test_no_sequence_of_faults_breaks_a_limit_or_makes_v_jump(seed: int) -> None
     assert [found.outside, found.too_fast, found.jumps, found.unbounded] == [[], [], [], []]
 
 
+@pytest.mark.parametrize('seed', [113, 204, 206, 269])
+@pytest.mark.filterwarnings('ignore')
+def test_saved_estimates_of_another_plant_are_never_said_to_track(seed: int) -> None:
+    assert Sequence(seed).run().wrong_inherited == []
+
+
 class World:
     """A loop of the paper's example beside a driver."""
 

@@ -27,11 +27,10 @@ def usable(result: Fitted, bounds: Bounds, share: float = 1.0) -> Crossings | No
 
 
 def is_precise(found: Crossings, swing: float, share: float = 1.0) -> bool:
-    """Whether slope and crossings are known well enough where v swings by so much; share: above."""
+    """Whether slope and gap are known well enough where v swings by so much; share: as above."""
     return (
         found.std_m <= share * PRECISE_SLOPE * found.m
-        and max(found.std_gap, found.std_c_r, found.std_c_l)
-        <= share * largest_gap_std(found.gap, swing)
+        and found.std_gap <= share * largest_gap_std(found.gap, swing)
     )
 
 

@@ -46,7 +46,6 @@ def note_block(learning: Learning, fits: bool, number: int, count: int, changed:
             # Whatever it was, it is over: what was measured meanwhile says nothing.
             learning.record.lose(np.arange(since, number + count - learning.consistent))
             learning.contradicted_from = None
-            learning.reason = Status.TRACKING
         return
     learning.consistent = 0
     if learning.contradicted_from is None:
@@ -134,6 +133,8 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         kept = yield from confirmed(learning, v, y, estimate, found)
         if kept is not None and kept.solution.rms <= bound \
                 and _has_changed(current, kept, whole):
+            if learning.unconfirmed is not None:
+                learning.unconfirmed = kept.around.prior
             return learning.go_on_from(kept, first)
     if whole is not None and changes and not any(
         _has_changed(current, found, whole) for found in changes

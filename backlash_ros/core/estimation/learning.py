@@ -27,7 +27,7 @@ from backlash_ros.core.estimation.constants import (
 from backlash_ros.core.estimation.crossings import Crossings, difference
 from backlash_ros.core.estimation.pace import Pace
 from backlash_ros.core.estimation.play import Start
-from backlash_ros.core.estimation.prior import Prior, beyond_chance, drifted
+from backlash_ros.core.estimation.prior import Prior, beyond_chance, contradicts, drifted
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.record import Record
 from backlash_ros.core.estimation.relabelling import Fitted
@@ -157,12 +157,19 @@ class Learning:
             difference(found, estimate), found.cov + held
         )
 
-    @property
-    def stands_alone(self) -> bool:
-        """Whether the samples of the fit suffice for its estimate without a prior."""
-        fit = self.fit.fit
-        found = fit.solve(alone=True).crossings
-        return found is not None and is_precise(found, fit.swing, REPLACING)
+    def confirm(self) -> bool:
+        """Ask the samples alone about what was learned before; return whether they deny it."""
+        prior, fit = self.unconfirmed, self.fit.fit
+        if prior is None:
+            return False
+        alone = fit.solve(alone=True)
+        found = alone.crossings
+        if found is None:
+            return False
+        denied = is_precise(found, fit.swing) and contradicts(alone.of_theta, prior)
+        if denied or is_precise(found, fit.swing, REPLACING):
+            self.unconfirmed = None
+        return denied
 
     def drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""
@@ -195,7 +202,6 @@ class Learning:
         self.refit_at = min(GROWTH * result.fit.length, LONGEST)
         self.moved_at = result.fit.length + BLOCK[1]
         self.contradicted_from = self.changed = self.acquisition.rejected = None
-        self.reason = Status.TRACKING
         if changed:
             self.consistent = RECOVERED if self.expects_changes else 0
         return True

@@ -227,7 +227,9 @@ class MovingHorizon:
             return reason
         if self._following.since_motion > self.model.memory:
             return Status.NOT_EXCITED
-        return Status.ACQUIRING if self._learning.unconfirmed is not None else Status.TRACKING
+        learning = self._learning
+        known = learning.current is not None and learning.unconfirmed is None
+        return Status.TRACKING if known else Status.ACQUIRING
 
     # --- after the command -----------------------------------------------------------------------
 
@@ -275,21 +277,27 @@ class MovingHorizon:
         learning = self._learning
         current = learning.fit
         found = learning.usable(current)
-        if found is not None and learning.believable(found, self.estimate, self.covariance):
+        if learning.confirm():
+            # The estimate was that of another plant.
+            learning.begin_acquisition(None)
+            learning.reason, self.covariance = Status.INCONSISTENT, None
+            return
+        believed = found is not None and learning.believable(found, self.estimate, self.covariance)
+        if found is not None and believed:
             self._take_over(found)
-        elif found is None or not learning.agrees(found, self.estimate, self.covariance):
+        agrees = believed or (
+            found is not None and learning.agrees(found, self.estimate, self.covariance)
+        )
+        if agrees and learning.contradicted_from is None:
+            learning.reason = Status.TRACKING
+        elif not agrees:
             learning.reason = Status.INCONSISTENT
             if not self._following.begun:
                 return
         self._following.follow(current, self.estimate, learning.record)
 
     def _take_over(self, found: Crossings) -> None:
-        learning = self._learning
-        if learning.contradicted_from is None:
-            learning.reason = Status.TRACKING
-        if learning.unconfirmed is not None and learning.stands_alone:
-            learning.unconfirmed = None
-        m, c_r, c_l = learning.bounds.project(found.m, found.c_r, found.c_l)
+        m, c_r, c_l = self._learning.bounds.project(found.m, found.c_r, found.c_l)
         self.covariance = found.cov
         self.estimate = Estimate(
             m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
