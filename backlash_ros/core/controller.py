@@ -123,17 +123,13 @@ class AdaptiveController:
         really applied in each of the lost + 1 intervals since then, if it is known. instead: what
         may have been applied in each of them, nan where there is no doubt.
         """
-        if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST) or (
-            applied and not all(map(plausible, applied))
-        ):
-            raise ValueError(
-                f'y={y!r}, y_m={y_m!r} and applied={applied!r} must be finite and no larger than '
-                f'{LARGEST:g}'
-            )
-        if lost < 0 or any(len(each) != lost + 1 for each in (applied, instead) if each):
-            raise ValueError(
-                f'lost={lost!r} must be >= 0, applied and instead have lost + 1 values each'
-            )
+        if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST):
+            raise ValueError(f'y={y!r} and y_m={y_m!r} must be finite and no larger than '
+                             f'{LARGEST:g}')
+        if lost < 0:
+            raise ValueError(f'lost={lost!r} must be >= 0')
+        if applied or instead:
+            _check_intervals(lost + 1, applied, instead)
         if self._lesson is not None:
             self._learn()
         if self._interval is not None:
@@ -209,9 +205,20 @@ class AdaptiveController:
         lesson, self._lesson = self._lesson, None
         assert lesson is not None
         y, interval, lost, applied, instead = lesson
+        v, y_m, u_d, f, other = interval
         for i in range(lost + 1):
-            passed = interval._replace(v=applied[i]) if applied else interval
+            if applied:
+                v = applied[i]
             if instead:
-                passed = passed._replace(other=instead[i])
-            self.estimator.update(y if i == lost else None, passed)
+                other = instead[i]
+            self.estimator.update(y if i == lost else None, Interval(v, y_m, u_d, f, other))
         self.lost_samples += lost
+
+
+def _check_intervals(count: int, applied: Sequence[float], instead: Sequence[float]) -> None:
+    for values in (applied, instead):
+        if values and len(values) != count:
+            raise ValueError(f'applied and instead must have lost + 1 = {count!r} values each')
+    for v in applied:
+        if not -LARGEST <= v <= LARGEST:
+            raise ValueError(f'applied={applied!r} must be finite and no larger than {LARGEST:g}')

@@ -200,20 +200,26 @@ class MovingHorizon:
             self.estimate = replace(self.estimate, status=status)
 
     def _note(self, sample: Sample) -> None:
-        learning, following, memory = self._learning, self._following, self.model.memory
-        if not following.begun and following.since_motion > AT_REST * memory:
-            if not learning.around.error.integrates:
-                return  # all is at rest: the next motion goes on from here as if at once
-        elif following.begun and following.since_motion > memory:
-            self._paused = True
-            if learning.current is not None and following.since_motion % BLOCK[1] == 0:
-                following.settle(learning.current.solution.posterior.noise_std)
+        learning, following = self._learning, self._following
+        if following.since_motion > following.model.memory and self._rests():
             return
         if self._paused or len(learning.record) == CAPACITY:
             # The samples between are missing, or there was no time to take any in.
             self._paused = False
             self._restart_record()
         learning.record.append(sample.v, nan if sample.y is None else sample.y, sample.other)
+
+    def _rests(self) -> bool:
+        """Whether nothing has moved for so long that samples say no more."""
+        learning, following = self._learning, self._following
+        if not following.begun:
+            # The next motion goes on from here as if at once, unless G drifts away meanwhile.
+            still = following.since_motion > AT_REST * self.model.memory
+            return still and not learning.around.error.integrates
+        self._paused = True
+        if learning.current is not None and following.since_motion % BLOCK[1] == 0:
+            following.settle(learning.current.solution.posterior.noise_std)
+        return True
 
     def _restart_record(self) -> None:
         self._task = None

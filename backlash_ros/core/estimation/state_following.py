@@ -96,7 +96,7 @@ class StateFollowing:
 
         record: of the samples before, in which an older v may turn out to have been another one.
         """
-        v, other = interval.v, interval.other
+        v, _, _, _, other = interval
         observer = self._observer
         if observer is None:
             self.since_motion = self.since_motion + 1 if v == self._v else 0
@@ -134,26 +134,25 @@ class StateFollowing:
                         v, other = other, v
                         self._p, self.u = there, estimate.m * (there - estimate.c_r)
             self.innovation = innovation
-            if not self._accepts(y, innovation, observer, record):
-                accepted = None
+            if innovation * innovation > GATE**2 * observer.variance:
+                if self._refuses(y, record):
+                    accepted = None
+            elif self._refused:
+                self._refused.clear()
+            if accepted is not None:
+                observer.correct(innovation)
         self._v = v
         return Sample(v, accepted, other)
 
-    def _accepts(
-        self, y: float, innovation: float, observer: Observer, record: Record,
-    ) -> bool:
-        """Let the observer take in an innovation unless it is that of an outlier."""
-        if innovation * innovation <= GATE**2 * observer.variance:
-            self._refused.clear()
-        elif len(self._refused) < OUTLIERS:
+    def _refuses(self, y: float, record: Record) -> bool:
+        """Whether a y that is far from what was expected is an outlier."""
+        if len(self._refused) < OUTLIERS:
             self._refused[record.end] = y
             self.outliers += 1
-            return False
-        else:
-            # So many in a row were none: they are what the fit has to explain.
-            record.restore(self._refused)
-        observer.correct(innovation)
-        return True
+            return True
+        # So many in a row were none: they are what the fit has to explain.
+        record.restore(self._refused)
+        return False
 
     def follow(self, current: Fitted, estimate: Estimate, record: Record) -> None:
         """Let play operator and observer stand where the fit says that the plant stands.
