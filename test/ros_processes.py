@@ -23,7 +23,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from backlash_ros.loopback import prefer_loopback
-from backlash_ros.stale_ports import remove_stale_ports
 from backlash_ros.tools.processes import child_environment, free_domain
 
 prefer_loopback(os.environ)  # the nodes of the tests themselves
@@ -106,7 +105,6 @@ class Probe:
     """A node of the test: it publishes, and keeps what it hears."""
 
     def __init__(self, domain: int, name: str = 'probe') -> None:
-        remove_stale_ports()  # what tests that kill processes leave
         self._context = Context()
         rclpy.init(args=[], context=self._context, domain_id=domain)
         self.node = Node(name, context=self._context)

@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = 'backlash_ros'
 SHARED = {
     PACKAGE,
-    *(f'{PACKAGE}.{name}' for name in ('files', 'loopback', 'shipped', 'stale_ports', 'topics')),
+    *(f'{PACKAGE}.{name}' for name in ('files', 'loopback', 'shipped', 'topics')),
 }
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 NUMERIC = {'numpy', 'scipy'}

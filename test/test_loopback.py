@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,13 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.loopback import OF_THE_FOLDER, PROFILE, VARIABLE, prefer_loopback
+from backlash_ros.tools.processes import DOMAIN_0_PORT, PORTS_PER_DOMAIN
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 MAPS = Path('/proc/self/maps')  # Linux
+SHARED_MEMORY = Path('/dev/shm')  # Linux
+PORT_SIZE = 52400  # of the file that Fast DDS makes for a port, in bytes
+PORTS_OF_TEN_PROCESSES = 32
 
 
 def chosen(environment: dict[str, str]) -> str | None:
@@ -49,3 +54,18 @@ def test_nodes_share_no_port_that_a_killed_one_could_damage(tmp_path: Path) -> N
         assert 'fastrtps_port' not in Path(f'/proc/{reference.process.pid}/maps').read_text()
         assert reference.stop() == 0
     assert 'Error' not in reference.stderr
+
+
+@pytest.mark.skipif(not SHARED_MEMORY.is_dir(), reason='no shared memory as on Linux')
+def test_node_starts_where_a_killed_one_has_left_its_port_half_made(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world, ExitStack() as stack:
+        first = DOMAIN_0_PORT + PORTS_PER_DOMAIN * world.domain
+        for number in range(first, first + PORTS_OF_TEN_PROCESSES):
+            port = SHARED_MEMORY / f'fastrtps_port{number}'
+            if not port.exists():
+                # Without the profile Fast DDS waits for ever until somebody completes it.
+                port.write_bytes(bytes(PORT_SIZE))
+                stack.callback(port.unlink, missing_ok=True)
+        reference = world.start('reference', {'wait_for_subscribers': 0})
+        reference.wait_for('ready')
+        assert reference.stop() == 0

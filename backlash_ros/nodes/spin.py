@@ -32,7 +32,6 @@ from backlash_ros.nodes.declare import declare_parameters
 from backlash_ros.nodes.goodbye import exit_at_the_latest
 from backlash_ros.nodes.prompt_executor import PromptExecutor
 from backlash_ros.nodes.unused_sections import complaints
-from backlash_ros.stale_ports import remove_stale_ports
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 LOOK_S = 0.01  # between two looks at a condition of start-up
@@ -149,8 +148,6 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
         return _refuse(executable, reason)
     try:
         _parse_plain_arguments(executable, make_node, args)
-        for line in remove_stale_ports():
-            print(f'{executable}: {line}', file=sys.stderr)
         try:
             node = make_node()
         except (ParameterError, NameValidationException) as error:

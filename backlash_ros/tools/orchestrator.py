@@ -13,7 +13,6 @@ from backlash_ros.core.assembly import build_controller, build_plant, build_refe
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import BY_NAME, PLANT
 from backlash_ros.core.parameters import NOISE, Parameters
-from backlash_ros.stale_ports import remove_stale_ports
 from backlash_ros.tools import processes
 from backlash_ros.tools.command_line import (
     DEFAULT_DURATION_S,
@@ -156,9 +155,6 @@ def perform(plan: RunPlan) -> int:
             if managed:
                 print(f'waiting until somebody activates {", ".join(managed)} (autostart: false)',
                       flush=True)
-            # Nodes of this package do so themselves, drivers do not.
-            for line in remove_stale_ports():
-                complain(line)
             for process in (process for stage in stages for process in stage):
                 process.log.parent.mkdir(exist_ok=True)
             displays = {
