@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import compare
-from backlash_ros.tools.operation_count import array_operations, scalar_operations
 
 
 @pytest.fixture(scope='module')
@@ -58,44 +56,3 @@ def test_learned_backlash_costs_less_than_an_uncompensated_one(
 def test_a_loop_that_breaks_off_is_named_and_not_dropped() -> None:
     broken = compare.Result(compare.contenders(Parameters())[0], None, note='it broke off')
     assert compare.row(broken)[:2] == (broken.contender.name, 'broke off')
-
-
-class Subject:
-    """Stands in for a controller with known arithmetic."""
-
-    __module__ = 'backlash_ros.core.subject'
-
-    def __init__(self) -> None:
-        self.a, self.x = np.ones((3, 4)), np.ones(4)
-
-
-def test_operations_of_arrays_are_counted_element_by_element() -> None:
-    subject = Subject()
-    assert array_operations(subject, lambda s: s.a @ s.x) == 24
-    assert array_operations(subject, lambda s: s.x * 2.0 + s.x) == 8
-    assert array_operations(subject, lambda s: None) == 0
-
-
-def test_counting_changes_nothing() -> None:
-    subject = Subject()
-
-    def grow(s: Subject) -> None:
-        s.x += 1.0
-
-    array_operations(subject, grow)
-    scalar_operations(subject, grow)
-    assert subject.x.tolist() == [1.0] * 4
-    assert type(subject.x) is np.ndarray
-
-
-def test_operations_of_the_interpreter_are_counted_in_the_core() -> None:
-    p = Parameters({'estimator.law': 'printed'})
-    simple = scalar_operations(_controller(p), lambda c: c.step(0.1, 0.2))
-    assert simple > 5
-
-
-def _controller(p: Parameters) -> object:
-    from backlash_ros.core.assembly import build_controller
-    controller = build_controller(p)
-    controller.step(0.0, 0.1)
-    return controller

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite, nan
-from operator import methodcaller
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -32,20 +31,19 @@ from backlash_ros.tools import command_line
 from backlash_ros.tools.command_line import number_of_samples
 from backlash_ros.tools.configuration import effective_parameters
 from backlash_ros.tools.errors import BrokenOffError
-from backlash_ros.tools.operation_count import array_operations, scalar_operations
 from backlash_ros.tools.results import result_directory
 from backlash_ros.tools.simulation import run_loop
 
 Array = NDArray[np.float64]
 
 DOCUMENT, FIGURE = Path('comparison.md'), Path('images/comparison.png')
-TIMED, COUNTED = 100, 10  # samples at the end of a run
+TIMED = 100  # samples at the end of a run
 SETTLED_SHARE = 0.2  # of the run, left out of the figures of merit
 # Weights for which the four blocks, which feed y back unfiltered, bear a noisy sensor.
 FOUR_BLOCKS_WEIGHT = 1.0
 HEADER = (
-    'loop', 'control error', 'tracking error', 'backlash penalty', 'way of v',
-    'crossings per reversal', 'time per step', 'operations per step',
+    'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
+    'crossings per reversal', 'time per step',
 )
 
 
@@ -72,10 +70,9 @@ class Result:
     control_error: float = nan
     tracking_error: float = nan
     penalty: float = nan
-    way: float = nan
+    variation: float = nan
     crossings: float = nan
     step_us: float = nan
-    operations: float = nan
     note: str = ''
 
 
@@ -177,14 +174,14 @@ def _measure(contender: Contender, parameters: Parameters, samples: int) -> Resu
     delay = loop.controller.structure.delay
     try:
         run = run_loop(loop, samples)
-        times, operations = _costs(loop)
+        step_us = 1e6 * median(_step_times(loop))
     except BrokenOffError as broken:
         return Result(contender, None, delay, note=str(broken))
     result = Result(
         contender, run, delay, _number(control_error_rms(run)),
-        way=total_variation(_late(run, run.column('v'))),
+        variation=total_variation(_late(run, run.column('v'))),
         crossings=_number(gap_crossings_per_reversal(run, _since(run))),
-        step_us=1e6 * median(times), operations=operations,
+        step_us=step_us,
     )
     if not contender.follows:
         return result
@@ -209,23 +206,17 @@ def _number(value: float | None) -> float:
     return nan if value is None else value
 
 
-def _costs(loop: ClosedLoop) -> tuple[list[float], float]:
-    """Times [s] and mean operations of some further steps of the controller."""
-    times, operations = [], []
-    for k in range(TIMED + COUNTED):
+def _step_times(loop: ClosedLoop) -> list[float]:
+    """Times of some further steps of the controller [s]."""
+    times = []
+    for _ in range(TIMED):
         y, y_m = loop.plant.measure(), loop.reference(loop.plant.sample * loop.sample_period)
-        if k >= TIMED:
-            step_once = methodcaller('step', y, y_m)
-            operations.append(
-                scalar_operations(loop.controller, step_once)
-                + array_operations(loop.controller, step_once)
-            )
         begin = perf_counter()
         step = loop.controller.step(y, y_m)
         times.append(perf_counter() - begin)
         loop.controller.refine()
         loop.plant.step(step.v)
-    return times[:TIMED], sum(operations) / COUNTED
+    return times
 
 
 def row(result: Result) -> tuple[str, ...]:
@@ -234,8 +225,8 @@ def row(result: Result) -> tuple[str, ...]:
         return (result.contender.name, 'broke off', *['-'] * (len(HEADER) - 2))
     return (
         result.contender.name, _text(result.control_error), _text(result.tracking_error),
-        _text(result.penalty), _text(result.way), _text(result.crossings, '.2f'),
-        f'{result.step_us:.0f} us', _text(result.operations, ',.0f'),
+        _text(result.penalty), _text(result.variation), _text(result.crossings, '.2f'),
+        f'{result.step_us:.0f} us',
     )
 
 

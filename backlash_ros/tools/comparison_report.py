@@ -80,11 +80,9 @@ def comparison_document(
         'y - y_m with y_m delayed as the structure says, without the first fifth of the run. '
         'Backlash penalty: what is left of it when the error of the same structure on a plant '
         'without backlash is subtracted.',
-        '- Way of v: sum of |v(k) - v(k-1)| without the first fifth. Crossings: how often v '
-        'turns back by more than half of the gap, for each reversal of y_m.',
-        '- Time: median of one step of the controller on the machine that wrote this. '
-        'Operations: additions, multiplications and the like of one step, counted while it runs: '
-        'those of the interpreter in the core, and those of numpy element by element.',
+        '- Total variation of v: sum of |v(k) - v(k-1)| without the first fifth. Crossings: how '
+        'often v turns back by more than half of the gap, for each reversal of y_m.',
+        '- Time: median of one step of the controller on the machine that wrote this.',
         '- No compensation and wrong constants (the crossings 30 % too large) know the slope, '
         'and have an observer that allows for a disturbance of u.', '',
     ]
