@@ -77,3 +77,10 @@ def test_make_names_an_unreachable_package_index(bare_clone: Path) -> None:
     )
     assert 'connect to the network' in one_line_of_ours(done)
     assert not (bare_clone / '.venv' / 'backlash_ros.json').exists()
+
+
+def test_make_test_runs_the_linters_and_passes_arguments_on(bare_clone: Path) -> None:
+    done = make('--dry-run', 'test', 'ARGS=-x test/test_make.py', cwd=bare_clone)
+    modules = [line.split('-m ', 1)[1] for line in done.stdout.splitlines() if ' -m ' in line]
+    assert [module.split()[0] for module in modules] == ['ruff', 'mypy', 'pytest']
+    assert modules[-1].endswith(' -x test/test_make.py')

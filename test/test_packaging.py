@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import signal
@@ -17,6 +18,8 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64
+
+import backlash_ros
 
 ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
@@ -181,3 +184,12 @@ def test_package_xml_names_every_imported_ros_package() -> None:
     }
     assert 'rclpy' in ros
     assert ros <= declared
+
+
+def test_package_xml_setup_and_module_name_one_version() -> None:
+    package_xml = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+    (setup,) = (
+        ast.literal_eval(node.value) for node in ast.walk(ast.parse((ROOT / 'setup.py').read_text()))
+        if isinstance(node, ast.keyword) and node.arg == 'version'
+    )
+    assert package_xml == setup == backlash_ros.__version__
