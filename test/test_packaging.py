@@ -188,8 +188,9 @@ def test_package_xml_names_every_imported_ros_package() -> None:
 
 def test_package_xml_setup_and_module_name_one_version() -> None:
     package_xml = ElementTree.parse(ROOT / 'package.xml').findtext('version')
+    tree = ast.parse((ROOT / 'setup.py').read_text())
     (setup,) = (
-        ast.literal_eval(node.value) for node in ast.walk(ast.parse((ROOT / 'setup.py').read_text()))
+        ast.literal_eval(node.value) for node in ast.walk(tree)
         if isinstance(node, ast.keyword) and node.arg == 'version'
     )
     assert package_xml == setup == backlash_ros.__version__

@@ -42,7 +42,7 @@ from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, ta
 from backlash_ros.nodes.gentle_drive import Drive, GentleDrive, Range, drive_range
 from backlash_ros.nodes.messages import DEPTH
 from backlash_ros.nodes.presence import Presence
-from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.prompt_executor import NodeExecutor
 from backlash_ros.nodes.rivals import identity_made_by, names_of
 from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
 from backlash_ros.shipped import find_config
@@ -85,7 +85,7 @@ class CheckDriverNode(ProcessNode):
         }
         self.exit_code = UNFIT
 
-    def work(self, executor: PromptExecutor) -> None:
+    def work(self, executor: NodeExecutor) -> None:
         """Wait for the driver, listen, come to rest, tell."""
         if self._await_driver(executor):
             self._listen()
@@ -102,7 +102,7 @@ class CheckDriverNode(ProcessNode):
         else:
             self._tell()
 
-    def _await_driver(self, executor: PromptExecutor) -> bool:
+    def _await_driver(self, executor: NodeExecutor) -> bool:
         deadline = time.monotonic() + self._options.wait
         remind = time.monotonic() + REMIND_S
         while not self.stopping:
@@ -217,7 +217,7 @@ class CheckDriverNode(ProcessNode):
         self._control.publish(Float64(data=v))
         self._heard.controls.append(Message(v, now, now, 0))
 
-    def _follow(self, executor: PromptExecutor) -> None:
+    def _follow(self, executor: NodeExecutor) -> None:
         """Listen for the duration, and drive."""
         begin = looked = time.monotonic()
         end = begin + self._options.duration + (0.0 if self._limits is None else SETTLE_S)
@@ -245,7 +245,7 @@ class CheckDriverNode(ProcessNode):
             and self._control.get_subscription_count() > 0
         )
 
-    def _come_to_rest(self, executor: PromptExecutor) -> None:
+    def _come_to_rest(self, executor: NodeExecutor) -> None:
         drive = self._drive
         if drive is None:
             return

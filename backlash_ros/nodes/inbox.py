@@ -12,6 +12,10 @@ from rclpy.node import Node
 class Polled(MutuallyExclusiveCallbackGroup):
     """Of subscriptions that no executor serves."""
 
+    def can_execute(self, entity: Any) -> bool:
+        """Never: whoever wants a message takes it."""
+        return False
+
 
 class Inbox:
     """The newest messages of a topic, at most `depth`, until somebody looks.

@@ -27,7 +27,7 @@ from backlash_ros.nodes.messages import (
     arrival_ns,
     clock_message,
 )
-from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.prompt_executor import NodeExecutor
 from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
 
 DIAGNOSTICS_PERIOD_S = 1.0
@@ -93,7 +93,7 @@ class PlantNode(ProcessNode):
             self._has_listeners, self._start, f'subscribers of {topics.PLANT_OUTPUT}'
         )
 
-    def work(self, executor: PromptExecutor) -> None:
+    def work(self, executor: NodeExecutor) -> None:
         while not (self._started or self.stopping):
             executor.spin_once()
         if not self._lockstep:

@@ -1,10 +1,15 @@
-"""An executor for nodes whose messages come up to a thousand times a second."""
+"""An executor for nodes whose messages come up to a thousand times a second.
+
+All that looks inside of rclpy is in this file. It was tried with the versions of KNOWN_RCLPY; with
+any other one make_executor takes the executor of rclpy itself, which is several times slower.
+"""
 
 from __future__ import annotations
 
 import inspect
 import time
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from rclpy.exceptions import InvalidHandle
@@ -17,12 +22,48 @@ from rclpy.timer import Timer
 
 from backlash_ros.nodes.inbox import Polled
 
+KNOWN_RCLPY = ('7.1.',)  # begin of the versions: those of ROS 2 Jazzy
 # Services and events may wait so long.
 LOOK_NS = 50_000_000
 S_TO_NS = 1e9
 
 
-class PromptExecutor(SingleThreadedExecutor):
+class NodeExecutor(SingleThreadedExecutor):
+    """The executor of rclpy for one node, with what a node of this package asks of an executor."""
+
+    def __init__(self, node: Node) -> None:
+        super().__init__(context=node.context)
+        self._served_node = node
+        self.add_node(node)
+
+    def serve_urgent(self, wait_ns: int) -> None:
+        """Serve one message of each topic, and wait for the first one so long at most."""
+        self.spin_once(timeout_sec=wait_ns / S_TO_NS)
+        for _ in list(self._served_node.subscriptions)[1:]:
+            self.spin_once(timeout_sec=0.0)
+
+    def look_if_due(self) -> None:
+        """Serve what is not urgent, if it is time for that."""
+        self.spin_once(timeout_sec=0.0)
+
+
+def make_executor(node: Node, warn: Callable[[str], object]) -> NodeExecutor:
+    """The fastest executor that the installed rclpy is known to bear; warn() says if it is slow."""
+    try:
+        installed = version('rclpy')
+    except PackageNotFoundError:
+        installed = 'of unknown version'
+    if installed.startswith(KNOWN_RCLPY):
+        return PromptExecutor(node)
+    warn(
+        f'rclpy {installed} is not one that the fast executor is known to work with '
+        f'({", ".join(f"{known}*" for known in KNOWN_RCLPY)}): messages are served by the executor '
+        'of rclpy, which may be too slow for sample periods below 5 ms'
+    )
+    return NodeExecutor(node)
+
+
+class PromptExecutor(NodeExecutor):
     """Serves the subscriptions and guard conditions of one node at once, all else after them.
 
     The executor of rclpy makes a new wait set of every service, timer and event for each single
@@ -31,8 +72,7 @@ class PromptExecutor(SingleThreadedExecutor):
     """
 
     def __init__(self, node: Node) -> None:
-        super().__init__(context=node.context)
-        self._served_node = node
+        super().__init__(node)
         # Whether the callback wants to know time stamp and number as well.
         self._subscriptions: dict[Subscription, bool] = {}
         self._known: list[Subscription] = []  # the polled ones included
@@ -40,7 +80,6 @@ class PromptExecutor(SingleThreadedExecutor):
         self._wait_set: Any = None
         self._look_at_ns = 0  # after the messages
         self._rclpy_at_ns = 0  # leave the rest to rclpy
-        self.add_node(node)
 
     def can_execute(self, entity: Any) -> bool:
         """Whether rclpy is to serve it."""

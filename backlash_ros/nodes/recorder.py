@@ -31,7 +31,7 @@ from backlash_ros.nodes.causes import Finding, Level
 from backlash_ros.nodes.driver_io import STYLES, output_qos
 from backlash_ros.nodes.events import ENABLED, emit
 from backlash_ros.nodes.messages import KEPT, DiagnosticsPublisher, stamp_ns_of
-from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.prompt_executor import NodeExecutor
 from backlash_ros.nodes.sample_counter import UNNUMBERED
 from backlash_ros.nodes.spin import BAD_INPUT, FAILED, ProcessNode, run
 
@@ -159,7 +159,7 @@ class RecorderNode(ProcessNode):
             lambda: all(heard() for heard in needed), self._start, ', '.join(wanted)
         )
 
-    def work(self, executor: PromptExecutor) -> None:
+    def work(self, executor: NodeExecutor) -> None:
         super().work(executor)
         # What has arrived belongs into the bag.
         deadline = time.monotonic() + DRAIN_S

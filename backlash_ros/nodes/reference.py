@@ -17,7 +17,7 @@ from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.events import emit
 from backlash_ros.nodes.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
-from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.prompt_executor import NodeExecutor
 from backlash_ros.nodes.reference_pace import ReferencePace
 from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import ProcessNode, run
@@ -65,7 +65,7 @@ class ReferenceNode(ProcessNode):
             f'{listeners} subscribers of {topics.REFERENCE}',
         )
 
-    def work(self, executor: PromptExecutor) -> None:
+    def work(self, executor: NodeExecutor) -> None:
         while not (self._started or self.stopping):
             executor.spin_once()
         if self._lockstep:
@@ -73,7 +73,7 @@ class ReferenceNode(ProcessNode):
         else:
             self._follow(executor)
 
-    def _follow(self, executor: PromptExecutor) -> None:
+    def _follow(self, executor: NodeExecutor) -> None:
         """Publish y_m half a period after each output, by the own clock where none comes.
 
         In between the process sleeps: woken by each output it would take the processor from the

@@ -30,7 +30,7 @@ from backlash_ros.core.parameter_table import PARAMETERS, as_yaml
 from backlash_ros.loopback import prefer_loopback
 from backlash_ros.nodes.declare import declare_parameters
 from backlash_ros.nodes.goodbye import exit_at_the_latest
-from backlash_ros.nodes.prompt_executor import PromptExecutor
+from backlash_ros.nodes.prompt_executor import NodeExecutor, make_executor
 from backlash_ros.nodes.unused_sections import complaints
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
@@ -77,7 +77,7 @@ class ProcessNode(Node):
         plain = cast(Callable[[Any], None], callback)
         return self.create_subscription(message_type, topic, plain, qos, raw=raw)
 
-    def work(self, executor: PromptExecutor) -> None:
+    def work(self, executor: NodeExecutor) -> None:
         """Do what the node is for until `stopping`."""
         while not self.stopping:
             executor.spin_once()
@@ -107,7 +107,7 @@ class ProcessNode(Node):
 
 
 def spin_paced(
-    node: ProcessNode, executor: PromptExecutor, period_s: float,
+    node: ProcessNode, executor: NodeExecutor, period_s: float,
     tick: Callable[[int, int], bool], idle: Callable[[], bool],
 ) -> None:
     """Call tick(n, due_ns) n periods after the start, until it returns False or the node stops.
@@ -159,7 +159,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
         signals.stop_at_arrival(node)
         code = FAILED  # unless the work comes to its end
         try:
-            executor = PromptExecutor(node)
+            executor = make_executor(node, node.log.warning)
             # A full collection would look through all of numpy and scipy and cost many samples.
             gc.collect()
             gc.freeze()
