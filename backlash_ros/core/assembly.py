@@ -9,7 +9,6 @@ from math import inf
 
 import numpy as np
 
-from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.controller import AdaptiveController, Limits
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
@@ -25,15 +24,23 @@ from backlash_ros.core.model_check import check_model, model_warnings
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.pole_placement import FourBlocks, PolePlacement, place_poles
 from backlash_ros.core.proportional import Proportional
-from backlash_ros.core.reference_file import read_reference_file
-from backlash_ros.core.reference_signal import ReferenceSignal
-from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.scenario import (
+    build_model,
+    build_plant,
+    build_reference,
+    build_true_model,
+)
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.structure import Structure
 from backlash_ros.core.tracking import Tracking
 from backlash_ros.core.tracking_design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.core.true_plant import Alteration, altered_plant, delayed
+
+__all__ = [
+    'ESTIMATORS', 'STRUCTURES', 'build_controller', 'build_limits', 'build_model', 'build_plant',
+    'build_reference', 'build_state_model', 'build_structure', 'build_true_model', 'law_fits',
+    'warnings_of',
+]
 
 # Until the backlash is known, half of the motion of u may not be what the first guess says.
 DOUBT_OF_FIRST_GUESS = 0.5
@@ -45,32 +52,6 @@ WHY_ONLY = {
     'printed': 'the law solves u_d = y_m + f v (3.2), which no other structure has',
     'gradient': 'the law learns behind the filters of that loop',
 }
-
-
-def build_model(p: Parameters) -> TransferFunction:
-    """G(z), and the delay between control and its effect as poles at 0."""
-    delay = (0.0,) * p.integer('control.delay_samples')
-    return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator') + delay)
-
-
-def build_true_model(p: Parameters) -> TransferFunction:
-    """G(z) of the simulated plant, which truth.* may set apart from the one that is known.
-
-    Raises ParameterError where that G(z) cannot be altered as truth.* asks.
-    """
-    delay = p.integer('truth.delay_samples')
-    if delay < 0:
-        delay = p.integer('control.delay_samples')
-    numerator, denominator = p.reals('truth.numerator'), p.reals('truth.denominator')
-    base = TransferFunction(
-        numerator or p.reals('plant.numerator'), denominator or p.reals('plant.denominator'),
-        'truth' if numerator or denominator else 'plant',
-    )
-    altered = altered_plant(base, Alteration(
-        p.real('truth.scale_frequency'), p.real('truth.scale_damping'),
-        p.real('truth.extra_lag') / p.real('sample_period'),
-    ))
-    return delayed(altered, delay)
 
 
 def build_state_model(p: Parameters) -> StateModel:
@@ -144,32 +125,6 @@ def build_limits(p: Parameters) -> Limits:
     rate = p.real('control.rate_max')
     move = inf if rate == inf else rate * p.real('sample_period')
     return Limits(p.real('control.min'), p.real('control.max'), move)
-
-
-def build_plant(p: Parameters) -> SimulatedPlant:
-    """The simulated plant with its hidden backlash."""
-    backlash = Backlash(
-        p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l'),
-        p.real('backlash.initial_u'),
-    )
-    imperfections = Imperfections(
-        p.real('output_noise_std'), p.real('output_quantum'), p.real('input_disturbance'),
-        p.real('truth.walk_std'), p.triple('backlash.rate'), p.real('backlash.jump_time'),
-        p.triple('backlash.jump'),
-    )
-    rng = np.random.default_rng(p.integer('seed'))
-    return SimulatedPlant(
-        build_true_model(p), backlash, p.real('sample_period'), rng, imperfections
-    )
-
-
-def build_reference(p: Parameters) -> ReferenceSignal:
-    """y_m(t); reads the file for waveform: file."""
-    return ReferenceSignal(
-        p.word('waveform'), p.real('amplitude'), p.real('frequency'), p.real('bias'),
-        p.real('frequency_start'), p.real('sweep_time'), p.real('sample_period'),
-        read_reference_file(p),
-    )
 
 
 def _bounds(p: Parameters) -> Bounds:

@@ -18,7 +18,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.transfer_function import TransferFunction
@@ -83,17 +82,20 @@ class _Sampled:
     """
 
     def __init__(self, poles: Roots) -> None:
+        # Takes as long to load as all else that a plant needs, and few plants need it.
+        from scipy.linalg import expm, toeplitz
+        self._expm = expm
         n = len(poles)
         self._a = np.zeros((n, n))
         self._a[:, 0] = -np.real(np.poly(poles))[1:]
         self._a[:-1, 1:] = np.eye(n - 1)
         self.denominator: Array = np.real(np.poly(np.exp(poles)))
-        transition = linalg.expm(self._a)
+        transition = expm(self._a)
         rows = [np.eye(n)[0]]
         for _ in range(n - 1):
             rows.append(rows[-1] @ transition)
         # Impulse response times denominator is the numerator.
-        self._to_numerator = linalg.toeplitz(self.denominator[:n], np.eye(n)[0]) @ np.array(rows)
+        self._to_numerator = toeplitz(self.denominator[:n], np.eye(n)[0]) @ np.array(rows)
 
     def from_numerator(self, held: float = 1.0, after: float = 0.0) -> Array:
         """Matrix (n, n) from c to the numerator of G(z) for a u that acts over a share of a sample.
@@ -103,8 +105,8 @@ class _Sampled:
         n = len(self._a)
         block = np.zeros((2 * n, 2 * n))
         block[:n, :n], block[:n, n:] = self._a, np.eye(n)
-        effect = linalg.expm(block * held)[:n, n:]
-        return np.asarray(self._to_numerator @ linalg.expm(self._a * after) @ effect)
+        effect = self._expm(block * held)[:n, n:]
+        return np.asarray(self._to_numerator @ self._expm(self._a * after) @ effect)
 
 
 def _without_delay(model: TransferFunction) -> tuple[TransferFunction, int]:

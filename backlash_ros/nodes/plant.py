@@ -12,9 +12,9 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameter_table import PLANT
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.scenario import build_plant
 from backlash_ros.nodes.causes import TROUBLE, Finding, Level
 from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.events import emit

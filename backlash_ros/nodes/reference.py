@@ -9,10 +9,10 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.parameter_table import REFERENCE
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.reference_signal import PERIODIC
+from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.declare import LiveParameters
 from backlash_ros.nodes.driver_io import DriverIo, Output
 from backlash_ros.nodes.events import emit
