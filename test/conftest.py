@@ -1,4 +1,4 @@
-"""For all tests: what examples property tests draw, the order of the tests, a fixture."""
+"""For all tests: what examples property tests draw, the order of the tests, fixtures."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from bringup_processes import Session, bringup_sessions
 from hypothesis import HealthCheck, settings
+
+from backlash_ros.tools import report
 
 settings.register_profile(
     'repeatable', derandomize=True, database=None, deadline=None, max_examples=60,
@@ -17,6 +19,12 @@ settings.register_profile('search', deadline=None, max_examples=1000)
 settings.load_profile('repeatable')
 
 STARTS_PROCESSES = {'bringup_processes', 'paced_driver', 'ros_processes'}
+# Their tests look at the same runs, so one worker of pytest-xdist makes these for all of them.
+SHARE_RUNS = {
+    'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify', 'test_packaging',
+    'test_replay', 'test_report', 'test_report_sections',
+}
+NO_PICTURE = b'\x89PNG'
 
 
 def pytest_configure() -> None:
@@ -28,15 +36,25 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Put tests with processes at the end: beside each other, not beside those that compute."""
     items.sort(key=_starts_processes)
+    if config.pluginmanager.hasplugin('xdist'):
+        for item in items:
+            if item.path.stem in SHARE_RUNS:
+                item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 def _starts_processes(item: pytest.Item) -> bool:
     assert isinstance(item, pytest.Function)
     helpers = {getattr(each, '__module__', '') for each in vars(item.module).values()}
     return 'start' in item.fixturenames or bool(helpers & STARTS_PROCESSES)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports without what takes most of their time, for tests of all else that they hold."""
+    monkeypatch.setattr(report, 'png', lambda figure: NO_PICTURE)
 
 
 @pytest.fixture

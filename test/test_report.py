@@ -142,6 +142,7 @@ def test_page_tells_the_summary_and_the_parameters(page: Path) -> None:
     assert 'law: lms' in html
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_page_tells_what_is_known_of_the_fit(run: RunRecord, tmp_path: Path) -> None:
     believed_then = LearnedModel((0.1,), (1.0, -0.5), 0, (0.1,) * 5, 1.234, 0.0567)
     pages = {}

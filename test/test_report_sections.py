@@ -78,6 +78,7 @@ def same(found: RunRecord, run: RunRecord) -> bool:
     return all(np.array_equal(found.column(name), run.column(name)) for name in names)
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
     tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -90,6 +91,7 @@ def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
     assert (tmp_path / 'out' / 'report.html').is_file()
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_from_and_to_choose_the_other_part(
     tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -105,6 +107,7 @@ def test_from_and_to_choose_the_other_part(
     assert report.main([str(bag), '--from', '2', '--to', '1']) == 2
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_bag_of_a_renamed_controller_gives_a_report(tmp_path: Path, first: RunRecord) -> None:
     bag = write_pieces(tmp_path / 'bag', Piece(first, node='left'))
     assert same(read_bag(bag).run, first)
@@ -142,6 +145,7 @@ def test_topics_of_others_with_the_same_ending_are_left_alone(
     assert read_bag(path).notes == ()
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> None:
     report.report_run(first, tmp_path, PARAMETERS)
     part = report.open_source(tmp_path, span=Span(0.5, 0.8)).run
@@ -169,6 +173,7 @@ def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(
     assert np.array_equal(u, first.column('u'))
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_bag_of_two_axes_gives_a_report_of_either(
     tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -59,6 +59,7 @@ def test_sweep_over_true_plants_that_differ_from_the_known_one(tmp_path: Path) -
     assert len({row['tracking_error_rms'] for row in rows}) == 3
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_true_plant_of_a_file_is_simulated(tmp_path: Path) -> None:
     text = '/plant: {ros__parameters: {truth: {numerator: [0.5], denominator: [1.0, -0.5]}}}'
     (tmp_path / 'my.yaml').write_text(text)
