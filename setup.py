@@ -8,11 +8,11 @@ PACKAGE = 'backlash_ros'
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version='0.2.0',
     description='Adaptive backlash inverse control: learns an unknown backlash and cancels it',
     author='backlash_ros developers',
     maintainer='backlash_ros developers',
-    maintainer_email='maintainers@backlash-ros.org',
+    maintainer_email='maintainers@example.org',
     license='Apache-2.0',
     packages=find_packages(exclude=['test*']),
     package_data={PACKAGE: ['loopback.xml']},
