@@ -2,7 +2,9 @@
 
 Readers of whole files start from the index at the end, which a file that was never finished lacks.
 Before it stand records of opcode, length and content; chunks hold further records. The recorder
-finishes a chunk with every flush.
+finishes a chunk with every flush. rosbags writes chunks without a checksum, so that the
+StreamReader of the package mcap (1.6) takes a message whose end is lost to a page of zeros for
+sound, or gives up all that follows.
 """
 
 from __future__ import annotations
