@@ -89,6 +89,7 @@ def recorder(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('storage', STORAGE)
 def test_killed_recorder_loses_at_most_the_last_second(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], storage: str,

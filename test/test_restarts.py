@@ -152,10 +152,12 @@ def test_reconfiguration_under_load_keeps_the_loop_and_the_estimates(tmp_path: P
         assert controller.stop() == 0
 
 
-@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('action', ['hold', 'zero', 'ramp'])
+@pytest.mark.parametrize(('action', 'number'), [
+    ('hold', signal.SIGINT), ('zero', signal.SIGTERM), ('ramp', signal.SIGINT),
+    ('ramp', signal.SIGTERM),
+])
 def test_a_signal_ends_the_loop_with_the_configured_command(
-    tmp_path: Path, number: signal.Signals, action: str,
+    tmp_path: Path, action: str, number: signal.Signals,
 ) -> None:
     rate_max = 400.0
     with ros_world(tmp_path) as world:

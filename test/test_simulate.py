@@ -38,6 +38,12 @@ def noisy(changes: dict[str, object] | None = None) -> Parameters:
     return Parameters({'output_noise_std': 1e-3, 'estimator.law': 'lms', **(changes or {})})
 
 
+@pytest.fixture
+def one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No further processes, which take longer to start than these runs last."""
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0}, raising=False)
+
+
 def test_run_writes_its_results_and_prints_a_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -50,6 +56,7 @@ def test_run_writes_its_results_and_prints_a_table(
     assert lines[-1] == f'report: {tmp_path / "report.html"}'
 
 
+@pytest.mark.usefixtures('one_processor')
 def test_sweep_over_true_plants_that_differ_from_the_known_one(tmp_path: Path) -> None:
     sweep = ['--sweep', 'truth.scale_frequency=0.8,1,1.2', '--set', 'estimator.law=lms']
     arguments = ['--duration', '1', '--config', 'geared_motor.yaml', *sweep]
@@ -80,21 +87,20 @@ def test_seed_decides_every_sample() -> None:
     assert final(1).final != final(2).final
 
 
-def test_parallel_runs_equal_serial_ones() -> None:
+def test_parallel_runs_equal_serial_ones_and_leave_the_environment_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('OMP_NUM_THREADS', '7')
+    monkeypatch.delenv('MKL_NUM_THREADS', raising=False)
     jobs = batch.make_jobs(noisy({'output_loss': 0.1}), [{}], range(5, 9), 0.8)
     serial = batch.run_jobs(jobs, workers=1)
     assert repr(batch.run_jobs(jobs, workers=2)) == repr(serial)
     assert len({outcome.final for outcome in serial}) == len(jobs)
-
-
-def test_workers_leave_the_environment_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv('OMP_NUM_THREADS', '7')
-    monkeypatch.delenv('MKL_NUM_THREADS', raising=False)
-    batch.run_jobs(batch.make_jobs(noisy(), [{}], [1, 2], 0.02), workers=2)
     assert os.environ['OMP_NUM_THREADS'] == '7'
     assert 'MKL_NUM_THREADS' not in os.environ
 
 
+@pytest.mark.usefixtures('one_processor')
 def test_seeds_give_a_table_and_a_row_each(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
