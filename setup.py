@@ -20,7 +20,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}', ['README.md']),
-        (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
         (f'share/{PACKAGE}/examples', sorted(glob('examples/*.py'))),
         (f'share/{PACKAGE}/docs', sorted(glob('docs/*.md'))),
         (f'share/{PACKAGE}/docs/images', sorted(glob('docs/images/*.png'))),

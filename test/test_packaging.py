@@ -76,7 +76,7 @@ def test_installation_holds_what_ros2_run_and_the_tools_look_for(installation: P
     assert (share / 'backlash_ros' / 'package.xml').is_file()
     installed = {path.name: path.read_bytes() for path in share.glob('backlash_ros/config/*')}
     assert installed
-    assert installed == {path.name: path.read_bytes() for path in ROOT.glob('config/*.yaml')}
+    assert installed == {path.name: path.read_bytes() for path in ROOT.glob('config/*')}
     for folder, pattern in (('examples', '*.py'), ('docs', '*.md'), ('docs/images', '*.png')):
         beside = {path.name for path in (share / 'backlash_ros' / folder).glob(pattern)}
         assert beside == {path.name for path in (ROOT / folder).glob(pattern)} != set()
