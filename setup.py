@@ -28,7 +28,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
-    install_requires=['matplotlib', 'numpy', 'PyYAML', 'rosbags', 'scipy', 'tqdm'],
+    install_requires=['matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm'],
     extras_require={'test': ['hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout']},
     entry_points={
         'console_scripts': [
@@ -43,6 +43,7 @@ setup(
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
             f'identify = {PACKAGE}.tools.identify.command:main',
             f'replay = {PACKAGE}.tools.replay:main',
+            f'monitor = {PACKAGE}.nodes.monitor.command:main',
         ],
     },
 )

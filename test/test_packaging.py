@@ -21,7 +21,7 @@ from std_msgs.msg import Float64
 ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
     'controller', 'plant', 'reference', 'recorder', 'bringup', 'simulate', 'report', 'compare',
-    'check_driver', 'identify', 'replay',
+    'check_driver', 'identify', 'replay', 'monitor',
 }
 ROS_PREFIXES = ('rclpy', 'ament_')
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
