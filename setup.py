@@ -21,6 +21,7 @@ setup(
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}', ['README.md']),
         (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
+        (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
         (f'share/{PACKAGE}/examples', sorted(glob('examples/*.py'))),
         (f'share/{PACKAGE}/docs', sorted(glob('docs/*.md'))),
         (f'share/{PACKAGE}/docs/images', sorted(glob('docs/images/*.png'))),
