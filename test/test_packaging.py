@@ -198,8 +198,8 @@ def test_launch_file_starts_a_loop_that_records_and_ends_on_sigint(
     log = tmp_path / 'launch.log'
     with log.open('wb') as output:
         launch = subprocess.Popen(
-            [sys.executable, '-c', code, str(file), *arguments], cwd=tmp_path, env=sourced,
-            stdout=output, stderr=output,
+            [sys.executable, '-c', code, str(file), *arguments], cwd=tmp_path,
+            env={**sourced, 'ROS_LOG_DIR': str(tmp_path / 'log')}, stdout=output, stderr=output,
         )
     node = rclpy.create_node('listener', context=driver_context)
     executor = SingleThreadedExecutor(context=driver_context)
