@@ -12,7 +12,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.nodes.messages import without_events
 
-PERIOD_S = 0.02  # between two messages of a topic: more than 50 a second nobody sees
+PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
 LOOK_S = 0.5  # between two looks at who listens
 DEPTH = 10  # messages that may wait for a subscriber
 BAND = 2.0  # half width of the band around an estimate, in standard deviations

@@ -7,7 +7,6 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from math import nan
 from typing import Any, TextIO
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -33,7 +32,7 @@ LINE_S = 1.0  # between two plain lines
 CONFIRM_S = 3.0  # within which a second r resets
 ANSWER_S = 5.0  # longest wait for a service
 NOTICE_S = 3.0
-WATCH = '/' + topics.of_node(topics.watched('m'))[2:]  # behind the name of a controller
+MARK = topics.of_node(topics.watched(NAMES[0])).removeprefix('~')  # of a controller
 
 
 class Watched:
@@ -43,10 +42,9 @@ class Watched:
         self.state = ControllerState(name)
         # Messages are taken when the screen is drawn: nothing wakes up for each of them.
         self._inboxes = {
-            label: Inbox(node, Float64, f'{name}{WATCH[:-1]}{label}', 1)
-            for estimate in NAMES for label in (estimate, f'{estimate}_high')
+            estimate: Inbox(node, Float64, name + topics.of_node(topics.watched(estimate))[1:], 1)
+            for estimate in NAMES
         }
-        self._newest = dict.fromkeys(self._inboxes, nan)
         self.clients: dict[str, Client] = {
             service: node.create_client(kind, f'{name}/{service}') for service, kind in (
                 ('freeze_adaptation', SetBool), ('enable_compensation', SetBool),
@@ -56,16 +54,9 @@ class Watched:
 
     def refresh(self) -> None:
         """Take in the estimates that have come."""
-        for estimate in NAMES:
-            heard = False
-            for label in (estimate, f'{estimate}_high'):
-                for message, _ in self._inboxes[label].take_all():
-                    self._newest[label], heard = message.data, True
-            if heard:
-                value = self._newest[estimate]
-                self.state.take_estimate(
-                    estimate, value, self._newest[f'{estimate}_high'] - value
-                )
+        for estimate, inbox in self._inboxes.items():
+            for message, _ in inbox.take_all():
+                self.state.take_estimate(estimate, message.data)
 
 
 @dataclass
@@ -170,8 +161,8 @@ class MonitorNode(ProcessNode):
     def _look_for_controllers(self) -> None:
         """Whoever publishes what a controller publishes is one."""
         found = sorted(
-            topic.removesuffix(WATCH) for topic, _ in self.get_topic_names_and_types()
-            if topic.endswith(WATCH)
+            topic.removesuffix(MARK) for topic, _ in self.get_topic_names_and_types()
+            if topic.endswith(MARK)
         )
         for name in found:
             if name not in self._watched and self._is_wanted(name):

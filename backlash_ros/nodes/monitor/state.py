@@ -45,8 +45,10 @@ class ControllerState:
         for name in NAMES:
             self.take_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
 
-    def take_estimate(self, name: str, value: float, half_width: float) -> None:
-        """Take in m, c_r or c_l with the half width of its band."""
+    def take_estimate(self, name: str, value: float, half_width: float | None = None) -> None:
+        """Take in m, c_r or c_l; half_width: of its band, None where that is as before."""
+        if half_width is None:
+            _, half_width = self.estimates[name]
         self.estimates[name] = (value, half_width)
         if isfinite(value):
             self.scales[name] = max(self.scales[name], abs(value))
