@@ -151,7 +151,10 @@ class MonitorNode(ProcessNode):
 
     def _awaited(self) -> str:
         which = ' of ' + ', '.join(self._wanted) if self._wanted else ''
-        return f'waiting for a controller{which} in ROS_DOMAIN_ID={self.context.get_domain_id()}'
+        return (
+            f'waiting for a controller{which} in ROS_DOMAIN_ID={self.context.get_domain_id()}: '
+            'bringup prints which one it uses'
+        )
 
     def _is_wanted(self, name: str) -> bool:
         return not self._wanted or any(
