@@ -20,7 +20,8 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}', ['README.md']),
-        (f'share/{PACKAGE}/config', sorted(glob('config/*.yaml'))),
+        (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
+        (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
         (f'share/{PACKAGE}/examples', sorted(glob('examples/*.py'))),
         (f'share/{PACKAGE}/docs', sorted(glob('docs/*.md'))),
         (f'share/{PACKAGE}/docs/images', sorted(glob('docs/images/*.png'))),
@@ -28,7 +29,7 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
-    install_requires=['matplotlib', 'numpy', 'PyYAML', 'rosbags', 'scipy', 'tqdm'],
+    install_requires=['matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm'],
     extras_require={'test': ['hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout']},
     entry_points={
         'console_scripts': [
@@ -43,6 +44,7 @@ setup(
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
             f'identify = {PACKAGE}.tools.identify.command:main',
             f'replay = {PACKAGE}.tools.replay:main',
+            f'monitor = {PACKAGE}.nodes.monitor.command:main',
         ],
     },
 )

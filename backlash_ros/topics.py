@@ -10,6 +10,7 @@ JOINT_COMMANDS = 'forward_command_controller/commands'
 ESTIMATES = 'controller/estimates'
 SIGNALS = 'controller/signals'
 MODEL = 'controller/model'
+WATCH = 'controller/watch'
 TRUTH = 'plant/truth'
 CLOCK = '/clock'
 DIAGNOSTICS = '/diagnostics'
@@ -23,9 +24,19 @@ ESTIMATE_LABELS = ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l', 'std_f
 SIGNAL_LABELS = (
     'y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'sample', 'latency_s',
 )
+# A topic each below WATCH, for plots: an estimate with its band of two standard deviations.
+WATCH_LABELS = (
+    'm', 'm_low', 'm_high', 'c_r', 'c_r_low', 'c_r_high', 'c_l', 'c_l_low', 'c_l_high', 'gap',
+    *(label for label in SIGNAL_LABELS if label != 'sample'),
+)
 TRUTH_LABELS = ('u', 'm', 'c_r', 'c_l', 'v', 'sample')
 
 
 def of_node(topic: str) -> str:
     """The name under which its node publishes a topic, so that it follows the name of the node."""
-    return '~/' + topic.rpartition('/')[2]
+    return '~/' + topic.partition('/')[2]
+
+
+def watched(label: str) -> str:
+    """The topic of one of WATCH_LABELS."""
+    return f'{WATCH}/{label}'

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import yaml
 from rclpy.publisher import Publisher
@@ -28,6 +28,7 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.controller import plausible
 from backlash_ros.core.parameter_table import CONTROLLER, RECORDER
+from backlash_ros.nodes.arguments import OptionParser, ros_arguments
 from backlash_ros.nodes.driver_findings import (
     FLOAT64,
     WRONG,
@@ -340,13 +341,6 @@ def _misfit(offered: QoSProfile, asked: QoSProfile) -> str:
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
 
 
-class _Parser(argparse.ArgumentParser):
-    """Reports errors in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f'{self.prog}: {message} (--help lists the options)\n')
-
-
 def _positive(text: str) -> float:
     number = float(text)
     if not 0.0 < number < inf:
@@ -356,7 +350,7 @@ def _positive(text: str) -> float:
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     """Options besides those of ROS."""
-    parser = _Parser(
+    parser = OptionParser(
         prog=EXECUTABLE, description=__doc__,
         epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.',
     )
@@ -384,16 +378,6 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
         if getattr(options, name) is not None and not options.drive:
             parser.error(f'--{name} says how to drive: give --drive as well')
     return options
-
-
-def ros_arguments(arguments: Sequence[str]) -> list[str]:
-    """The part between --ros-args and --, all of them."""
-    found, inside = [], False
-    for argument in arguments:
-        inside = (inside or argument == '--ros-args') and argument != '--'
-        if inside:
-            found.append(argument)
-    return found
 
 
 def parameter_files(config: str, folder: Path) -> list[str]:

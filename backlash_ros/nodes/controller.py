@@ -46,6 +46,7 @@ from backlash_ros.nodes.model_publisher import ModelPublisher
 from backlash_ros.nodes.rivals import RivalWatch
 from backlash_ros.nodes.sample_counter import SampleCounter
 from backlash_ros.nodes.spin import run
+from backlash_ros.nodes.watch_publisher import WatchPublisher
 
 DIAGNOSTICS_PERIOD_S = 1.0
 # A controller that was held up for so long, or so many samples, still learns from them; after a
@@ -105,6 +106,7 @@ class ControllerNode(ManagedNode):
         self._estimates = LabelledArrayPublisher(
             self, topics.of_node(topics.ESTIMATES), topics.ESTIMATE_LABELS
         )
+        self._watch = WatchPublisher(self)
         self._model = ModelPublisher(self)
         self._diagnostics = DiagnosticsPublisher(
             self, p.word('io.joint') or self._io.publisher.topic_name
@@ -371,13 +373,14 @@ class ControllerNode(ManagedNode):
     def _publish_rows(self, loop: ControlLoop, step: ControlStep) -> None:
         e, sample = step.estimate, float(loop.counter.index)
         estimator = loop.core.estimator
-        self._signals.publish((
+        signals = (
             step.y_m, step.y, step.u_d, step.v, estimator.u_hat, estimator.innovation,
             float(e.status), sample, loop.statistics.latencies[-1],
-        ))
-        self._estimates.publish((
-            e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample,
-        ))
+        )
+        estimates = (e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample)
+        self._signals.publish(signals)
+        self._estimates.publish(estimates)
+        self._watch.follow(signals, estimates, time.monotonic())
 
     def _check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loop cannot take up."""

@@ -10,7 +10,8 @@ from pathlib import Path
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros import topics
-from backlash_ros.nodes.check_driver import CheckDriverNode, ros_arguments
+from backlash_ros.nodes.arguments import ros_arguments
+from backlash_ros.nodes.check_driver import CheckDriverNode
 from backlash_ros.nodes.driver_findings import Message
 from backlash_ros.nodes.gentle_drive import Drive, IdentificationDrive, Range
 from backlash_ros.nodes.spin import DONE, run

@@ -1,0 +1,1 @@
+"""`monitor`: running controllers in a terminal."""

@@ -1,0 +1,244 @@
+"""Node that follows controllers, shows them, and hands keys on to their services."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, TextIO
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.client import Client
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
+from rich.console import Console
+from rich.live import Live
+from std_msgs.msg import Float64
+from std_srvs.srv import SetBool, Trigger
+
+from backlash_ros import topics
+from backlash_ros.nodes.inbox import Inbox
+from backlash_ros.nodes.monitor.keys import pressed_keys
+from backlash_ros.nodes.monitor.state import NAMES, ControllerState
+from backlash_ros.nodes.monitor.view import ASCII_BLOCKS, BLOCKS, plain_line, screen
+from backlash_ros.nodes.spin import DONE, ProcessNode
+
+EXECUTABLE = 'monitor'
+LOOK_S = 1.0  # between two looks for further controllers
+REFRESH_S = 0.2  # of the screen
+LINE_S = 1.0  # between two plain lines
+CONFIRM_S = 3.0  # within which a second r resets
+ANSWER_S = 5.0  # longest wait for a service
+NOTICE_S = 3.0
+MARK = topics.of_node(topics.watched(NAMES[0])).removeprefix('~')  # of a controller
+
+
+class Watched:
+    """What the node has of one controller: state, newest estimates, clients of its services."""
+
+    def __init__(self, node: ProcessNode, name: str) -> None:
+        self.state = ControllerState(name)
+        # Messages are taken when the screen is drawn: nothing wakes up for each of them.
+        self._inboxes = {
+            estimate: Inbox(node, Float64, name + topics.of_node(topics.watched(estimate))[1:], 1)
+            for estimate in NAMES
+        }
+        self.clients: dict[str, Client] = {
+            service: node.create_client(kind, f'{name}/{service}') for service, kind in (
+                ('freeze_adaptation', SetBool), ('enable_compensation', SetBool),
+                ('reset_estimates', Trigger), ('save_estimates', Trigger),
+            )
+        }
+
+    def refresh(self) -> None:
+        """Take in the estimates that have come."""
+        for estimate, inbox in self._inboxes.items():
+            for message, _ in inbox.take_all():
+                self.state.take_estimate(estimate, message.data)
+
+
+@dataclass
+class Asked:
+    """A call of a service. until_s: when the wait for it ends. then: the switches afterwards."""
+
+    answer: Future
+    until_s: float
+    state: ControllerState
+    service: str
+    then: dict[str, str]
+
+
+class MonitorNode(ProcessNode):
+    """Follows every controller of the domain, or those of some namespaces.
+
+    wanted: names of controllers or namespaces, none for all.
+    """
+
+    def __init__(self, wanted: Sequence[str]) -> None:
+        super().__init__(EXECUTABLE)
+        self._wanted = ['/' + name.strip('/') for name in wanted]
+        self._watched: dict[str, Watched] = {}
+        self._selected = 0
+        self._notice, self._notice_ends_s = '', 0.0
+        self._confirmed_until_s = 0.0  # a second r resets
+        self._pending: list[Asked] = []
+        self.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, 10)
+        self.create_timer(LOOK_S, self._look_for_controllers, clock=self.steady_clock)
+        self._look_for_controllers()
+
+    def work(self, executor: SingleThreadedExecutor) -> None:
+        """Show controllers until a key or a signal ends it."""
+        # Whatever a terminal cannot show must not end this.
+        if hasattr(sys.stdout, 'reconfigure'):
+            sys.stdout.reconfigure(errors='replace')
+        console = Console()
+        with suppress(BrokenPipeError):
+            if console.is_terminal and not console.is_dumb_terminal:
+                self._show(executor, console)
+            else:
+                self._print_lines(executor, sys.stdout)
+            return
+        # Python would complain of the broken pipe once more when it flushes at its end.
+        sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
+
+    def _show(self, executor: SingleThreadedExecutor, console: Console) -> None:
+        blocks = BLOCKS if console.encoding.startswith('utf') else ASCII_BLOCKS
+        with pressed_keys(sys.stdin) as keys, Live(
+            console=console, screen=True, auto_refresh=False, redirect_stdout=False,
+            redirect_stderr=False,
+        ) as live:
+            due_s = 0.0
+            while not self.stopping:
+                executor.spin_once(timeout_sec=REFRESH_S / 4)
+                pressed = keys()
+                for key in pressed:
+                    self._on_key(key)
+                self._look_for_answers()
+                if pressed or time.monotonic() >= due_s:
+                    due_s = time.monotonic() + REFRESH_S
+                    self._refresh()
+                    live.update(screen(
+                        self._states(), self._selected, self._text_below(), time.monotonic(),
+                        console.width, console.height, blocks,
+                    ), refresh=True)
+
+    def _print_lines(self, executor: SingleThreadedExecutor, stream: TextIO) -> None:
+        due_s = time.monotonic() + LINE_S
+        while not self.stopping:
+            executor.spin_once(timeout_sec=REFRESH_S)
+            if time.monotonic() >= due_s:
+                due_s += LINE_S
+                self._refresh()
+                for state in self._states():
+                    print(plain_line(state, time.monotonic()), file=stream)
+                if not self._watched:
+                    print(self._awaited(), file=stream)
+                stream.flush()
+
+    def _refresh(self) -> None:
+        for watched in self._watched.values():
+            watched.refresh()
+
+    def _states(self) -> list[ControllerState]:
+        return [watched.state for watched in self._watched.values()]
+
+    def _text_below(self) -> str:
+        if time.monotonic() < self._notice_ends_s:
+            return self._notice
+        return '' if self._watched else self._awaited()
+
+    def _awaited(self) -> str:
+        which = ' of ' + ', '.join(self._wanted) if self._wanted else ''
+        return (
+            f'waiting for a controller{which} in ROS_DOMAIN_ID={self.context.get_domain_id()}: '
+            'bringup prints which one it uses'
+        )
+
+    def _is_wanted(self, name: str) -> bool:
+        return not self._wanted or any(
+            name == wanted or name.startswith(f'{wanted.rstrip("/")}/') for wanted in self._wanted
+        )
+
+    def _look_for_controllers(self) -> None:
+        """Whoever publishes what a controller publishes is one."""
+        found = sorted(
+            topic.removesuffix(MARK) for topic, _ in self.get_topic_names_and_types()
+            if topic.endswith(MARK)
+        )
+        for name in found:
+            if name not in self._watched and self._is_wanted(name):
+                self._watched[name] = Watched(self, name)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            watched = self._watched.get(f'/{status.name}')
+            if watched is not None:
+                watched.state.take_diagnostics(
+                    ord(status.level), status.message,
+                    {pair.key: pair.value for pair in status.values}, time.monotonic(), _clock(),
+                )
+
+    def _on_key(self, key: str) -> None:
+        if key == 'q':
+            self.exit_code, self.stopping = DONE, True
+        elif key == '\t' and self._watched:
+            self._selected = (self._selected + 1) % len(self._watched)
+            self._confirmed_until_s = 0.0
+        elif key in ACTIONS and self._watched:
+            self._act(key, list(self._watched.values())[self._selected])
+
+    def _act(self, key: str, watched: Watched) -> None:
+        """Call the service behind a key."""
+        service, switch = ACTIONS[key]
+        state = watched.state
+        if key == 'r' and time.monotonic() > self._confirmed_until_s:
+            self._confirmed_until_s = time.monotonic() + CONFIRM_S
+            self._say(f'press r once more to reset the estimates of {state.name}')
+            return
+        self._confirmed_until_s = 0.0
+        client = watched.clients[service]
+        if not client.service_is_ready():
+            self._say(f'{state.name}/{service} is not there')
+            return
+        request: Any = Trigger.Request()
+        then: dict[str, str] = {}
+        if switch:
+            on = not state.is_on(switch)
+            then = {switch: str(on)}
+            request = SetBool.Request(data=on if service == 'enable_compensation' else not on)
+        self._pending.append(Asked(
+            client.call_async(request), time.monotonic() + ANSWER_S, state, service, then
+        ))
+        self._say(f'{state.name}/{service} ...')
+
+    def _look_for_answers(self) -> None:
+        for asked in list(self._pending):
+            if asked.answer.done():
+                response = asked.answer.result()
+                text = response.message
+                if response.success:
+                    # The next diagnostics may be a second away.
+                    asked.state.values |= asked.then
+            elif time.monotonic() > asked.until_s:
+                text = f'no answer from {asked.service} within {ANSWER_S:g} s'
+            else:
+                continue
+            self._pending.remove(asked)
+            asked.state.note(_clock(), text)
+            self._say(f'{asked.state.name}: {text}')
+
+    def _say(self, text: str) -> None:
+        self._notice, self._notice_ends_s = text, time.monotonic() + NOTICE_S
+
+
+# What a key calls, and the switch of the diagnostics that it turns over.
+ACTIONS = {
+    'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
+    'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
+}
+
+
+def _clock() -> str:
+    return time.strftime('%H:%M:%S')

@@ -1,0 +1,143 @@
+"""How controllers look in a terminal of 80 columns, and as plain lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite, isnan
+from textwrap import wrap
+
+from rich.console import Group
+from rich.panel import Panel
+from rich.text import Text
+
+from backlash_ros.nodes.monitor.state import NAMES, ControllerState
+
+KEYS = 'f freeze/learn  c compensate  r reset  s save  q quit'
+COLOURS = ('green', 'yellow', 'red')  # of the levels of /diagnostics
+SHORT = 10  # lines of a controller without events, its frame included
+VALUES = 32  # columns before a bar
+# Sure, within the band, beyond it.
+BLOCKS, ASCII_BLOCKS = '█▒·', '#=.'
+
+
+def bar(value: float, half_width: float, scale: float, width: int, blocks: str = BLOCKS) -> str:
+    """A bar from 0 to |value| on an axis that ends at `scale`, its band in another shade.
+
+    Empty where value or scale is nothing to draw. A band that is there takes a column at least.
+    """
+    if not isfinite(value) or not scale > 0.0:
+        return ' ' * width
+    half = 0.0 if isnan(half_width) else half_width
+
+    def column(x: float) -> int:
+        return round(width * min(max(x / scale, 0.0), 1.0))
+
+    begins, ends = column(abs(value) - half), column(abs(value) + half)
+    if half > 0.0 and begins == ends:
+        begins = max(begins - 1, 0)
+        ends = begins + 1
+    return blocks[0] * begins + blocks[1] * (ends - begins) + blocks[2] * (width - ends)
+
+
+def axis_end(largest: float) -> float:
+    """The next of 1, 2, 5, 10, 20, ... above 1.1 times the largest magnitude; 0 without one."""
+    wanted = 1.1 * largest
+    if not wanted > 0.0:
+        return 0.0
+    power = 10.0 ** int(f'{wanted:e}'.partition('e')[2])
+    return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= wanted)
+
+
+def estimate_line(state: ControllerState, name: str, width: int, blocks: str) -> str:
+    """One estimate: value, half width of its band, bar, end of its axis."""
+    value, half = state.estimates[name]
+    end = axis_end(state.scales[name])
+    text = f'{name:<4}{value:>11.5g}'
+    if isfinite(half):
+        text += f' ± {half:.2g}'
+    axis = f' {"-" if name == "c_l" else ""}{end:g}'
+    drawn = bar(value, half, end, max(width - VALUES - len(axis), 0), blocks)
+    return f'{text:<{VALUES}}{drawn}{axis if end else ""}'
+
+
+def figures(state: ControllerState) -> list[str]:
+    """Excitation, times and counts, in two lines."""
+    values, number = state.values, state.number
+    if 'samples' not in values:
+        return ['', '']
+    switches = [
+        'learning' if state.is_on('learning') else 'frozen',
+        'compensating' if state.is_on('compensating') else 'not compensating',
+    ]
+    return [
+        f'excitation {number("excitation: swing of v / gap"):.3g} gaps   '
+        f'{number("rate [Hz]"):.4g} Hz   latency {number("latency p50 [ms]"):.3g} ms, '
+        f'p99 {number("latency p99 [ms]"):.3g} ms',
+        f'samples {values["samples"]}   lost {values.get("lost", "?")}   '
+        f'late {values.get("late", "?")}   {", ".join(switches)}',
+    ]
+
+
+def panel(
+    state: ControllerState, now_s: float, width: int, events: int, selected: bool, blocks: str,
+) -> Panel:
+    """One controller in a frame. events: how many of the newest ones."""
+    inner = width - 4
+    silent = state.silent_s(now_s) > 0.0
+    colour = 'red' if silent else COLOURS[min(state.level, 2)]
+    text = Text(no_wrap=True, overflow='crop')
+    text.append(state.word(now_s), style=f'bold {colour}')
+    # Often the cure stands in the second line.
+    for line in [*wrap(state.message, inner), '', ''][:2]:
+        text.append('\n' + line)
+    for name in NAMES:
+        text.append('\n' + estimate_line(state, name, inner, blocks))
+    for line in figures(state):
+        text.append('\n' + line)
+    for clock, event in list(state.events)[max(len(state.events) - events, 0):]:
+        text.append(f'\n{clock} {event}'[:inner + 1], style='dim')
+    return Panel(
+        text, title=f'> {state.name}' if selected else state.name, title_align='left', width=width,
+        border_style='bold' if selected else 'dim',
+    )
+
+
+def screen(
+    states: Sequence[ControllerState], selected: int, notice: str, now_s: float,
+    width: int, height: int, blocks: str = BLOCKS,
+) -> Group:
+    """All controllers; where there is no room, all but the selected one in a line each."""
+    several = 'Tab next  ' if len(states) > 1 else ''
+    below = wrap(notice or several + KEYS, width)
+    room = height - len(below)
+    every = len(states) * SHORT <= room
+    long = room // max(len(states), 1) if every else room - (len(states) - 1)
+    parts: list[Panel | Text] = []
+    for i, state in enumerate(states):
+        if every or i == selected:
+            parts.append(panel(
+                state, now_s, width, long - SHORT, len(states) > 1 and i == selected, blocks
+            ))
+        else:
+            parts.append(_cropped(plain_line(state, now_s)[:width]))
+    parts += [_cropped(line, style='bold' if notice else 'dim') for line in below]
+    return Group(*parts)
+
+
+def _cropped(line: str, style: str = '') -> Text:
+    return Text(line, no_wrap=True, overflow='crop', style=style)
+
+
+def plain_line(state: ControllerState, now_s: float) -> str:
+    """One controller in a line."""
+    estimates = ', '.join(
+        f'{name} {value:.5g}' + (f' ± {half:.2g}' if isfinite(half) else '')
+        for name, (value, half) in state.estimates.items() if isfinite(value)
+    )
+    parts = [f'{state.name}: {state.word(now_s)}', estimates]
+    if 'samples' in state.values:
+        parts.append(
+            f'excitation {state.number("excitation: swing of v / gap"):.3g}, '
+            f'latency {state.number("latency p50 [ms]"):.3g} ms, lost {state.values.get("lost")}'
+        )
+    return '; '.join(part for part in parts if part)

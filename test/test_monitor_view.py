@@ -1,0 +1,130 @@
+"""What `monitor` shows of a controller, without ROS and without a terminal."""
+
+from __future__ import annotations
+
+from io import StringIO
+from math import inf, nan
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from backlash_ros.nodes.monitor.state import ControllerState
+from backlash_ros.nodes.monitor.view import BLOCKS, axis_end, bar, plain_line, screen
+
+VALUES = {
+    'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',
+    'std_c_l': 'nan', 'samples': '1234', 'lost': '5', 'late': '6', 'learning': 'True',
+    'compensating': 'False', 'excitation: swing of v / gap': '4.25', 'rate [Hz]': '99.97',
+    'latency p50 [ms]': '0.912', 'latency p99 [ms]': '9.63',
+}
+LONG = 'plant_output moves against v: reverse it, or the sign of plant.numerator, and so on ' * 2
+
+
+def controller(
+    name: str = '/controller', message: str = 'learned', level: int = 0,
+) -> ControllerState:
+    state = ControllerState(name)
+    state.take_diagnostics(level, message, VALUES, 100.0, '12:00:00')
+    return state
+
+
+def shown(states: list[ControllerState], **changes: object) -> list[str]:
+    """The lines on a terminal of 80 columns and 24 lines."""
+    console = Console(file=StringIO(), width=80, height=24, force_terminal=False)
+    arguments = {'selected': 0, 'notice': '', 'now_s': 100.5, 'width': 80, 'height': 24, **changes}
+    console.print(screen(states, **arguments))  # type: ignore[arg-type]
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue().rstrip('\n').split('\n')
+
+
+@given(
+    st.floats(-10.0, 10.0), st.floats(0.0, 10.0) | st.just(nan), st.floats(0.1, 10.0),
+    st.integers(1, 60),
+)
+def test_a_bar_fills_its_columns_in_order(
+    value: float, half_width: float, scale: float, width: int,
+) -> None:
+    drawn = bar(value, half_width, scale, width)
+    assert len(drawn) == width
+    assert drawn == ''.join(sorted(drawn, key=BLOCKS.index))
+    assert (BLOCKS[1] in drawn) >= (half_width > 0.0)
+
+
+def test_a_bar_ends_at_the_value_and_shades_the_band() -> None:
+    assert bar(5.0, 1.0, 10.0, 10) == '████▒▒····'
+    assert bar(-5.0, nan, 10.0, 10) == '█████·····'
+    assert bar(5.0, 1e-9, 10.0, 10) == '████▒·····'
+    assert bar(0.0, 1e-9, 10.0, 10) == '▒·········'
+    assert bar(nan, 1.0, 10.0, 10) == ' ' * 10
+
+
+@pytest.mark.parametrize(('largest', 'end'), [
+    (0.0, 0.0), (1.3, 2.0), (0.95, 2.0), (3.0, 5.0), (0.017, 0.02), (80.0, 100.0), (9.5, 20.0),
+])
+def test_an_axis_ends_at_a_round_number_beyond_the_largest_value(
+    largest: float, end: float,
+) -> None:
+    assert axis_end(largest) == pytest.approx(end)
+
+
+def test_state_estimates_and_figures_are_shown() -> None:
+    text = '\n'.join(shown([controller()]))
+    for piece in (
+        '/controller', 'tracking', '1.3 ± 0.2', '3 ± 0.4', '-3 ', '4.25 gaps', '99.97 Hz',
+        'latency 0.912 ms, p99 9.63 ms', 'samples 1234', 'lost 5', 'late 6', 'learning',
+        'not compensating', '12:00:00 learned', 'q quit',
+    ):
+        assert piece in text, piece
+    assert 'Tab' not in text
+
+
+@pytest.mark.parametrize('count', range(1, 9))
+def test_any_number_of_controllers_fits_into_a_terminal(count: int) -> None:
+    states = [controller(f'/axis_{i}/controller', LONG, level=2) for i in range(count)]
+    for state in states:
+        for i in range(30):
+            state.note('12:00:01', f'event {"x" * i}')
+    for selected in (0, count - 1):
+        lines = shown(states, selected=selected, notice=LONG[:100])
+        assert len(lines) <= 24
+        assert all(len(line) <= 80 for line in lines)
+        text = '\n'.join(lines)
+        assert all(state.name in text for state in states)
+        assert (f'> {states[selected].name}' in text) == (count > 1)
+
+
+def test_what_is_too_long_for_a_line_goes_on_in_the_next() -> None:
+    message = 'plant_output is silent for longer than timeout.plant_output: is the driver there?'
+    text = ' '.join(' '.join(shown([controller(message=message)])).replace('│', ' ').split())
+    assert message in text
+
+
+def test_a_text_in_which_only_figures_change_is_one_event() -> None:
+    state = controller(message='9.38 % was lost')
+    state.take_diagnostics(1, '8.1 % was lost', VALUES, 101.0, '12:00:01')
+    state.take_diagnostics(0, 'learned', VALUES, 102.0, '12:00:02')
+    assert [text for _, text in state.events] == ['9.38 % was lost', 'learned']
+    assert state.message == 'learned'
+
+
+def test_who_says_nothing_any_more_is_silent() -> None:
+    state = controller()
+    assert state.word(102.0) == 'tracking'
+    assert state.word(107.2) == 'silent for 7 s'
+    assert ControllerState('/controller').word(inf) == 'no diagnostics yet'
+
+
+def test_an_inactive_controller_is_told_by_its_message() -> None:
+    state = ControllerState('/controller')
+    state.take_diagnostics(0, 'unconfigured', {}, 100.0, '12:00:00')
+    assert state.word(100.0) == 'unconfigured'
+    assert any('unconfigured' in line for line in shown([state]))
+
+
+def test_a_plain_line_says_the_same_in_short() -> None:
+    assert plain_line(controller(), 100.0) == (
+        '/controller: tracking; m 1.3 ± 0.2, c_r 3 ± 0.4, c_l -3; '
+        'excitation 4.25, latency 0.912 ms, lost 5'
+    )
