@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import build_controller, build_model
-from backlash_ros.core.controller import plausible
+from backlash_ros.core.controller import LONGEST_GAP, plausible
 from backlash_ros.core.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord, stated_deviations
@@ -22,7 +22,6 @@ Array = NDArray[np.float64]
 
 COMPARED = ('m', 'c_r', 'c_l')
 KEPT = ('u', 'true_m', 'true_c_r', 'true_c_l')  # what no controller can say, taken over
-LONGEST_GAP = 1000  # lost samples that are stepped over; after more the controller begins anew
 
 
 class Parting(NamedTuple):
