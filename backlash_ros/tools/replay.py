@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +13,19 @@ from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.tools.command_line import (
     OptionParser,
+    add_out_option,
+    add_span_options,
     format_table,
     print_warnings,
     run_tool,
+    span_of,
 )
 from backlash_ros.tools.errors import InputError
 
 if TYPE_CHECKING:
     from backlash_ros.core.parameters import Parameters
     from backlash_ros.core.run_record import RunRecord
+    from backlash_ros.tools.bag_sections import Span
 
 EXECUTABLE = 'replay'
 FIGURE, TABLE = 'replay.png', 'replays.csv'
@@ -41,13 +45,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--sweep', action='append', default=[], metavar='KEY=V1,V2,...',
                         help='once for each value; several sweeps: for each combination')
     parser.add_argument('--axis', default='', metavar='NAME', help='of a bag with several')
-    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
-                        help='leave out what was before this time [s]')
-    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
-                        help='leave out what was from this time [s] on')
-    parser.add_argument('--out', type=Path, metavar='DIR',
-                        help='folder of the results (default: results/<UTC time>, and '
-                             'results/latest points at it)')
+    add_span_options(parser)
+    add_out_option(parser)
     return parser
 
 
@@ -59,11 +58,10 @@ def main(args: Sequence[str] | None = None) -> int:
 def _replay(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
-    if not options.from_s < options.to_s:
-        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+    span = span_of(parser, options)
     from backlash_ros.tools.batch import combinations, parse_sweep, value_text
     changes = combinations([parse_sweep(text) for text in options.sweep])
-    runs = [(path, *_opened(path, options)) for path in options.runs]
+    runs = [(path, *_opened(path, options, span)) for path in options.runs]
     jobs = []
     for path, recorded, parameters in runs:
         for change in changes:
@@ -76,13 +74,12 @@ def _replay(args: Sequence[str] | None) -> None:
         _one(jobs[0], options.out)
 
 
-def _opened(path: Path, options: argparse.Namespace) -> tuple[RunRecord, Parameters]:
+def _opened(
+    path: Path, options: argparse.Namespace, span: Span,
+) -> tuple[RunRecord, Parameters]:
     """The run, and the parameters with which it is to be replayed."""
-    from backlash_ros.tools.bag_sections import Span
     from backlash_ros.tools.report import open_source
-    source = open_source(
-        path.resolve(), options.config, Span(options.from_s, options.to_s), options.axis
-    )
+    source = open_source(path.resolve(), options.config, span, options.axis)
     for text in (source.damage, *source.notes):
         if text:
             print(f'{EXECUTABLE}: warning: {text}', file=sys.stderr)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, isfinite, nan
 from pathlib import Path
@@ -181,13 +181,19 @@ def _from_bag(path: Path, sample_period: float | None, axis: str) -> MeasuredRec
         # Stamps of a simulated time do not tell what came first within a sample.
         return _from_signals(path, sample_period, axis)
     of_axis = f' of axis {axis}' if axis else ''
-    commands = chosen.get(topics.APPLIED_CONTROL)
-    if commands is None or len(commands[0]) < REPORTED * len(output[0]):
-        commands = chosen.get(topics.CONTROL)
+    commands = acting(chosen, output)
     if commands is None or not len(commands[0]):
         raise InputError(f'{path}: holds no {topics.CONTROL}{of_axis}: record it as well')
     record = from_messages(path, output, commands, sample_period)
     return replace(record, notes=(*record.notes, *notes))
+
+
+def acting(heard: Mapping[str, Messages], output: Messages) -> Messages | None:
+    """The commands to learn from: the applied ones where they are reported, else those sent."""
+    applied = heard.get(topics.APPLIED_CONTROL)
+    if applied is not None and len(applied[0]) >= REPORTED * len(output[0]):
+        return applied
+    return heard.get(topics.CONTROL)
 
 
 def _from_signals(path: Path, sample_period: float | None, axis: str) -> MeasuredRecord:
