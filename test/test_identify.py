@@ -22,6 +22,7 @@ from backlash_ros.tools.configuration import effective_parameters
 from backlash_ros.tools.errors import InputError
 from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.identify.measured_record import from_messages, read_measured
+from backlash_ros.tools.parameter_file import read_parameter_file
 
 QUICK = ('--order', '1-2', '--delay', '0-1')
 FILES = {
@@ -88,6 +89,13 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
     assert parameters.real('backlash.m') == 0.5
     assert parameters.real('input_disturbance') == 0.0
     build_controller(parameters)
+
+
+def test_what_describes_the_simulated_plant_stands_in_its_own_section(result: Path) -> None:
+    file = read_parameter_file(result / 'identified.yaml')
+    simulated = {'backlash.m', 'output_quantum', 'input_disturbance', 'seed'}
+    assert simulated <= set(file.values(''))
+    assert not simulated & set(file.values('', without='plant'))
 
 
 def test_every_value_that_was_found_has_its_deviation_beside_it(result: Path) -> None:
