@@ -248,13 +248,17 @@ def test_results_of_a_simulation_are_a_record(tmp_path: Path) -> None:
 def test_late_samples_are_numbered_by_the_last_of_their_heap() -> None:
     # The third and fourth sample come with the fifth.
     at = (np.array([0.0, 1.0, 3.9, 3.95, 4.0, 5.0]) * PERIOD_S * 1e9).astype(np.int64)
-    late = from_messages(Path('a'), (at, np.arange(6.0)), (at + 1, np.arange(6.0)), PERIOD_S)
+    late = from_messages(Path('a'), {
+        topics.PLANT_OUTPUT: (at, np.arange(6.0)), topics.CONTROL: (at + 1, np.arange(6.0)),
+    }, PERIOD_S)
     assert late.y.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
 def test_a_lost_sample_leaves_its_place_empty() -> None:
     at = (np.array([0.0, 1.0, 3.0, 4.0]) * PERIOD_S * 1e9).astype(np.int64)
-    found = from_messages(Path('a'), (at, np.arange(4.0)), (at + 1, np.arange(4.0)), PERIOD_S)
+    found = from_messages(Path('a'), {
+        topics.PLANT_OUTPUT: (at, np.arange(4.0)), topics.CONTROL: (at + 1, np.arange(4.0)),
+    }, PERIOD_S)
     assert np.isnan(found.y).tolist() == [False, False, True, False, False]
     assert found.v.tolist() == [0.0, 1.0, 1.0, 2.0, 3.0]
 

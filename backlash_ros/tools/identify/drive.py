@@ -28,7 +28,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.command_line import BAD_INPUT
 from backlash_ros.tools.configuration import write_config
 from backlash_ros.tools.errors import BrokenOffError, InputError
-from backlash_ros.tools.identify.measured_record import MeasuredRecord, acting, from_messages
+from backlash_ros.tools.identify.measured_record import MeasuredRecord, from_messages
 from backlash_ros.tools.identify.outcome import options_of
 from backlash_ros.tools.supervision import StopRequests
 
@@ -210,10 +210,7 @@ class _Messages:
         output = heard.get(topics.PLANT_OUTPUT)
         if output is None or len(output[0]) < FEWEST:
             return None
-        commands = acting(heard, output)
-        if commands is None:
-            return None
         try:
-            return from_messages(Path('the motion'), output, commands, sample_period)
+            return from_messages(Path('the motion'), heard, sample_period)
         except InputError:
             return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, isfinite, nan
+from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.bags.content import is_bag
+from backlash_ros.core.identification.intervals import v_of_intervals
 from backlash_ros.tools.bag_reading import read_plain_numbers
 from backlash_ros.tools.bag_sections import WHOLE, Span, choose_namespace
 from backlash_ros.tools.errors import InputError
@@ -181,19 +182,8 @@ def _from_bag(path: Path, sample_period: float | None, axis: str) -> MeasuredRec
         # Stamps of a simulated time do not tell what came first within a sample.
         return _from_signals(path, sample_period, axis)
     of_axis = f' of axis {axis}' if axis else ''
-    commands = acting(chosen, output)
-    if commands is None or not len(commands[0]):
-        raise InputError(f'{path}: holds no {topics.CONTROL}{of_axis}: record it as well')
-    record = from_messages(path, output, commands, sample_period)
+    record = from_messages(path, chosen, sample_period, of_axis)
     return replace(record, notes=(*record.notes, *notes))
-
-
-def acting(heard: Mapping[str, Messages], output: Messages) -> Messages | None:
-    """The commands to learn from: the applied ones where they are reported, else those sent."""
-    applied = heard.get(topics.APPLIED_CONTROL)
-    if applied is not None and len(applied[0]) >= REPORTED * len(output[0]):
-        return applied
-    return heard.get(topics.CONTROL)
 
 
 def _from_signals(path: Path, sample_period: float | None, axis: str) -> MeasuredRecord:
@@ -208,15 +198,20 @@ def _from_signals(path: Path, sample_period: float | None, axis: str) -> Measure
 
 
 def from_messages(
-    path: Path, output: Messages, commands: Messages,
-    sample_period: float | None,
+    path: Path, heard: Mapping[str, Messages], sample_period: float | None, of_axis: str = '',
 ) -> MeasuredRecord:
-    """From stamps [ns] and values of y, and of v (or its reports just before each y).
+    """From stamps [ns] and values by topic, plant_output among them.
 
-    v over an interval is the newest one when the next y comes.
+    v is that of applied_control where it is reported, else that of control. Raises InputError.
     """
-    begin = output[0][0]
-    stamps, values = (output[0] - begin).astype(float), output[1]
+    output = heard[topics.PLANT_OUTPUT]
+    commands = heard.get(topics.APPLIED_CONTROL)
+    reported = commands is not None and len(commands[0]) >= REPORTED * len(output[0])
+    if not reported:
+        commands = heard.get(topics.CONTROL)
+    if commands is None or not len(commands[0]):
+        raise InputError(f'{path}: holds no {topics.CONTROL}{of_axis}: record it as well')
+    stamps = (output[0] - output[0][0]).astype(float)
     steps = np.diff(stamps) * 1e-9
     period = float(np.median(steps)) if sample_period is None else sample_period
     if not period > 0.0:
@@ -229,11 +224,8 @@ def from_messages(
         period = float(f'{stamps[-1] * 1e-9 / index[-1]:.5g}')
     count = int(index[-1]) + 1
     y = np.full(count, nan)
-    y[index] = values
-    times = np.interp(np.arange(1, count + 1), index, stamps)
-    times[-1] = inf
-    newest = np.searchsorted((commands[0] - begin).astype(float), times, side='right') - 1
-    v = np.append(commands[1], nan)[newest]
+    y[index] = output[1]
+    v = v_of_intervals(index, output[0], *commands, reported)
     return _usable(path, v, y, period)
 
 
