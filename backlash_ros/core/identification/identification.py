@@ -22,6 +22,7 @@ from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
     Compared,
+    cancelled_pole,
     compare,
     effective_rows,
     equal_delays,
@@ -170,6 +171,11 @@ def identifying(
     ))
     chosen = selected(compared)
     best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
+    if cancelled_pole(best) is not None and cancelled_pole(chosen.fit) is None:
+        # Only the best fit of all shows that this pole is none.
+        compared = [one for one in compared if one is not chosen]
+        chosen = selected(compared)
+        best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
     delays = equal_delays(compared, chosen)
     rows = effective_rows(searched, best)
     # With as many poles, some of them may fit worse.
