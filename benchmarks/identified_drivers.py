@@ -33,7 +33,7 @@ MARKS = re.compile(
 HEADER = ('driver', 'gap found', 'true gap', 'uncompensated', 'compensated', 'without a gap',
           'penalty left', 'bound')
 BOUND = 0.05
-DRIVE_S, RUN_S = '12', '10'
+DRIVE_S, RUN_S = '12', '20'
 ATTEMPTS = 3
 MOST_LOST = 0.01  # of the samples: of a run that the machine held up more, the error says nothing
 # Nothing is compensated, and nothing learned, where the gap is told to be 0.
