@@ -124,3 +124,22 @@ def test_progress_names_the_axis_and_an_endless_run_has_no_total() -> None:
     first, second = stream.getvalue().splitlines()
     assert first.startswith('x:    1.50 s  150/200  m 1')
     assert second.startswith('   1.50 s  150  m 1')
+
+
+def test_a_section_of_the_plant_is_no_mistake_where_there_is_a_driver(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tmp_path / 'mine.yaml'
+    common = '/**: {ros__parameters: {control: {min: -1.0, max: 1.0, rate_max: 9.0}'
+    noise = 'estimator: {output_noise_std: 1.0e-4}'
+    of_plant = '/**/plant: {ros__parameters: {output_quantum: 0.1, seed: 3}}'
+    for number, (text, said) in enumerate((
+        (f'{common}, {noise}}}}}\n{of_plant}', False),
+        (f'{common}, {noise}, seed: 3}}}}', True),
+        (f'{common}}}}}\n{of_plant}', True),  # the noise of the estimator follows the quantum
+    )):
+        config.write_text(text)
+        prepare(bringup.parse_options([
+            '--config', str(config), '--driver', 'none', '--out', str(tmp_path / str(number)),
+        ]))
+        assert ('no use for' in capsys.readouterr().err) is said

@@ -14,7 +14,8 @@ from scipy.special import chdtri
 from backlash_ros.core.estimation.prior import Prior
 from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.record_description import RecordFit, frequencies_of
-from backlash_ros.core.estimation.record_fit import SEARCHED_AT_MOST, fit_record
+from backlash_ros.core.estimation.record_fit import fit_record
+from backlash_ros.core.estimation.record_samples import SEARCHED_AT_MOST
 from backlash_ros.core.state_model import StateModel
 from backlash_ros.core.transfer_function import TransferFunction
 

@@ -33,6 +33,7 @@ from backlash_ros.core.identification.play_record import PlayRecord
 from backlash_ros.core.identification.uncertainty import response
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
+import identification_cases
 from identification_cases import random_case
 
 Array = NDArray[np.float64]
@@ -75,6 +76,17 @@ def test_random_actuators_are_found_to_within_their_deviations(seed: int) -> Non
     w = found.frequencies
     ratio = response(found.details.fit, w) * np.exp(-1j * w * found.delay) / case.response(w)
     assert np.abs(ratio - 1.0).max() < 0.03
+
+
+@pytest.mark.parametrize('seed', [1, 8])
+def test_rounding_alone_is_no_reason_for_a_further_pole(
+    monkeypatch: pytest.MonkeyPatch, seed: int,
+) -> None:
+    monkeypatch.setattr(identification_cases, 'NOISE', (1e-300, 1e-300))
+    case = random_case(seed)
+    found = identify(case.v, case.y, case.period)
+    assert len(found.denominator) == len(case.denominator)
+    assert found.denominator == pytest.approx(case.denominator, abs=1e-9)
 
 
 def test_lost_samples_and_outliers_do_not_matter() -> None:

@@ -22,6 +22,7 @@ from backlash_ros.tools.configuration import effective_parameters
 from backlash_ros.tools.errors import InputError
 from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.identify.measured_record import from_messages, read_measured
+from backlash_ros.tools.parameter_file import read_parameter_file
 
 QUICK = ('--order', '1-2', '--delay', '0-1')
 FILES = {
@@ -88,6 +89,13 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
     assert parameters.real('backlash.m') == 0.5
     assert parameters.real('input_disturbance') == 0.0
     build_controller(parameters)
+
+
+def test_what_describes_the_simulated_plant_stands_in_its_own_section(result: Path) -> None:
+    file = read_parameter_file(result / 'identified.yaml')
+    simulated = {'backlash.m', 'output_quantum', 'input_disturbance', 'seed'}
+    assert simulated <= set(file.values(''))
+    assert not simulated & set(file.values('', without='plant'))
 
 
 def test_every_value_that_was_found_has_its_deviation_beside_it(result: Path) -> None:
@@ -240,15 +248,43 @@ def test_results_of_a_simulation_are_a_record(tmp_path: Path) -> None:
 def test_late_samples_are_numbered_by_the_last_of_their_heap() -> None:
     # The third and fourth sample come with the fifth.
     at = (np.array([0.0, 1.0, 3.9, 3.95, 4.0, 5.0]) * PERIOD_S * 1e9).astype(np.int64)
-    late = from_messages(Path('a'), (at, np.arange(6.0)), (at + 1, np.arange(6.0)), PERIOD_S)
+    late = from_messages(Path('a'), {
+        topics.PLANT_OUTPUT: (at, np.arange(6.0)), topics.CONTROL: (at + 1, np.arange(6.0)),
+    }, PERIOD_S)
     assert late.y.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
 
 
 def test_a_lost_sample_leaves_its_place_empty() -> None:
     at = (np.array([0.0, 1.0, 3.0, 4.0]) * PERIOD_S * 1e9).astype(np.int64)
-    found = from_messages(Path('a'), (at, np.arange(4.0)), (at + 1, np.arange(4.0)), PERIOD_S)
+    found = from_messages(Path('a'), {
+        topics.PLANT_OUTPUT: (at, np.arange(4.0)), topics.CONTROL: (at + 1, np.arange(4.0)),
+    }, PERIOD_S)
     assert np.isnan(found.y).tolist() == [False, False, True, False, False]
     assert found.v.tolist() == [0.0, 1.0, 1.0, 2.0, 3.0]
+
+
+def test_delays_of_single_samples_do_not_add_up_to_a_lost_one() -> None:
+    # A driver that keeps its time, and is late by up to 0.6 of a period: steps of 1.6, 0.7, 0.7.
+    late = np.tile([0.0, 0.6, 0.3], 40)
+    at = ((np.arange(120) + late) * PERIOD_S * 1e9).astype(np.int64)
+    found = from_messages(Path('a'), {
+        topics.PLANT_OUTPUT: (at, np.arange(120.0)), topics.CONTROL: (at + 1, np.arange(120.0)),
+    }, PERIOD_S)
+    assert found.y.tolist() == list(range(120))
+
+
+@pytest.mark.parametrize(('true', 'jitter', 'told'), [
+    (0.01, 0.2, 0.01), (0.0099992, 0.01, 0.0099992), (0.0099992, 0.3, 0.01),
+])
+def test_the_sample_period_has_the_digits_that_the_stamps_tell(
+    true: float, jitter: float, told: float,
+) -> None:
+    late = jitter * np.random.default_rng(1).random(1200)
+    at = ((np.arange(1200) + late) * true * 1e9).astype(np.int64)
+    found = from_messages(Path('a'), {
+        topics.PLANT_OUTPUT: (at, np.arange(1200.0)), topics.CONTROL: (at, np.arange(1200.0)),
+    }, None)
+    assert found.sample_period == pytest.approx(told, rel=1e-5 if jitter < 0.1 else 1e-12)
 
 
 def test_a_span_is_cut_out(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ import pytest
 from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.replay import parting, replay
+from backlash_ros.core.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import simulate
 from backlash_ros.tools.identify.measured_record import read_measured
 from backlash_ros.tools.processes import child_environment, free_domain
@@ -64,6 +65,20 @@ def test_a_controller_that_would_have_moved_otherwise_learns_from_what_was_moved
     }))
     assert again.column('m')[-1] == pytest.approx(1.3, rel=0.01)
     assert again.column('c_l')[-1] == pytest.approx(-3.0, rel=0.01)
+
+
+def test_what_the_driver_reports_is_learned_from() -> None:
+    """A driver that applies half of each command, and says so."""
+    parameters = Parameters({'plant.uncertainty': 0.0, **NOISY})
+    run = build_closed_loop(parameters).run(300)
+    rows = run.rows.copy()
+    rows[:, COLUMNS.index('v')] *= 2.0
+    commanded = RunRecord(rows, run.sample_period, 0)
+    reports = [[], *([float(v)] for v in run.column('v')[:-1])]
+    assert parting(run, replay(run, parameters, reports=reports)) is None
+    again = replay(commanded, parameters, reports=reports)
+    assert again.column('c_r')[-1] == pytest.approx(3.0, rel=0.01)
+    assert replay(commanded, parameters).column('c_r')[-1] > 4.0
 
 
 def test_a_row_without_numbers_is_refused() -> None:

@@ -17,6 +17,8 @@ from backlash_ros.core.structure import Adoption, Situation, Structure
 # Samples after which a better design takes over though v crosses the gap: an unstable loop never
 # stops to.
 LONGEST_WAIT = 200
+# Lost outputs in a row that are stepped over; after more nothing is left to predict from them.
+LONGEST_GAP = 1000
 LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 
 

@@ -1,19 +1,20 @@
 """A recorded run through a controller once more, with its own parameters or with others.
 
 The controller is the one of the loop and is stepped as there: it computes its command from every
-recorded y and y_m. What it learns from is the v that was recorded.
+recorded y and y_m. What it learns from is the v that was recorded: the reported one where there is
+one report for each interval, else the command.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import build_controller, build_model
-from backlash_ros.core.controller import plausible
+from backlash_ros.core.controller import LONGEST_GAP, plausible
 from backlash_ros.core.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.run_record import COLUMNS, RunRecord, stated_deviations
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 
 COMPARED = ('m', 'c_r', 'c_l')
 KEPT = ('u', 'true_m', 'true_c_r', 'true_c_l')  # what no controller can say, taken over
-LONGEST_GAP = 1000  # lost samples that are stepped over; after more the controller begins anew
 
 
 class Parting(NamedTuple):
@@ -43,11 +43,13 @@ class Parting(NamedTuple):
 
 def replay(
     recorded: RunRecord, p: Parameters, on_sample: Callable[[int], None] | None = None,
+    reports: Sequence[Sequence[float]] = (),
 ) -> RunRecord:
     """Feed y, y_m, v and losses of a record to a controller with these parameters.
 
     The rows are those of the record, with the recorded y, y_m and v, and what this controller makes
-    of them: u_d, estimates, status, innovation. Raises ValueError for rows without numbers and
+    of them: u_d, estimates, status, innovation. reports: for each row what the driver said to have
+    applied since the row before it. Raises ValueError for rows without numbers and
     ParameterError for parameters that contradict each other.
     """
     t = recorded.column('t')
@@ -70,6 +72,8 @@ def replay(
         if k and v_made != v_before:
             applied = [v_before] * (missing + 1)
             controller.start_from(v_before)
+        if k and reports and len(reports[k]) == missing + 1:
+            applied = list(reports[k])
         step = controller.step(y, y_m, missing, applied)
         controller.refine()
         estimator, e = controller.estimator, step.estimate

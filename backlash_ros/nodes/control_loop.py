@@ -14,7 +14,7 @@ from backlash_ros.core.assembly import (
     build_model,
     build_structure,
 )
-from backlash_ros.core.controller import ControlStep, plausible
+from backlash_ros.core.controller import LONGEST_GAP, ControlStep, plausible
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Estimate
@@ -31,8 +31,6 @@ OF_THE_STRUCTURE = (
     'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution',
     'estimator.output_noise_std',
 )
-# Longer gaps are not stepped over: nothing is left to predict from them.
-LONGEST_GAP = 1000
 
 
 class ControlLoop:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.controller import plausible
 from backlash_ros.core.estimation.record_description import RecordFit
 from backlash_ros.core.estimation.record_fit import fit_record
+from backlash_ros.core.identification.intervals import v_of_intervals
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.transfer_function import TransferFunction
 from backlash_ros.nodes.command_history import ReportUse, report_use
@@ -92,12 +93,9 @@ def applied_findings(heard: Heard, timing: Timing, p: Parameters) -> list[Findin
 
 def record_of(heard: Heard, timing: Timing) -> Record | None:
     """v and y sample by sample, from the first known v on; None where no v was heard."""
-    commands = heard.applied or heard.controls
-    v = _on_grid(commands, timing)
+    v = _on_grid(heard.applied or heard.controls, timing, reported=bool(heard.applied))
     if v is None:
         return None
-    if heard.applied:
-        _put_reports(v, heard.applied, timing)
     y = np.full(len(v), nan)
     values = np.array([m.value if plausible(m.value) else nan for m in timing.outputs])
     y[timing.index] = values
@@ -109,32 +107,20 @@ def record_of(heard: Heard, timing: Timing) -> Record | None:
     return Record(v[known:], y[known:], lag)
 
 
-def _on_grid(commands: list[Message], timing: Timing) -> Array | None:
-    """v over each sample interval, shape (N,): the newest one when it ends; nan before any."""
-    usable = [message for message in commands if plausible(message.value)]
+def _on_grid(messages: list[Message], timing: Timing, reported: bool = False) -> Array | None:
+    """v over each sample interval, shape (N,); nan before any. reported: it is that which acted."""
+    usable = [message for message in messages if plausible(message.value)]
     if not usable:
         return None
-    count = int(timing.index[-1]) + 1
-    stamps = np.array([message.stamp_ns for message in timing.outputs], dtype=np.int64)
-    begin = stamps[0]
-    ends = np.interp(np.arange(1, count + 1), timing.index, (stamps - begin).astype(float))
-    left = np.array([message.stamp_ns - begin for message in usable], dtype=float)
-    newest = np.searchsorted(left, ends, side='right') - 1
-    values = np.append([message.value for message in usable], nan)
-    v = values[newest]
+    v = v_of_intervals(
+        timing.index.astype(np.int64), _stamps(timing.outputs), _stamps(usable),
+        np.array([message.value for message in usable]), reported,
+    )
     return v if np.isfinite(v).any() else None
 
 
-def _put_reports(v: Array, reports: list[Message], timing: Timing) -> None:
-    """Where there is one report per interval, take them in order: a late one may come in a heap."""
-    stamps = [message.stamp_ns for message in timing.outputs]
-    left = np.array([message.stamp_ns for message in reports], dtype=np.int64)
-    until = np.searchsorted(left, np.array(stamps, dtype=np.int64), side='right')
-    for i in range(1, len(stamps)):
-        first, last = int(timing.index[i - 1]), int(timing.index[i])
-        between = reports[until[i - 1]:until[i]]
-        if len(between) == last - first and all(plausible(m.value) for m in between):
-            v[first:last] = [message.value for message in between]
+def _stamps(messages: list[Message]) -> NDArray[np.int64]:
+    return np.array([message.stamp_ns for message in messages], dtype=np.int64)
 
 
 def _lag(applied: Array, control: Array) -> int:

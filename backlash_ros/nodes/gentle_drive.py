@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from math import inf, pi, sin
 
@@ -53,17 +54,17 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
     return Range(low, high, speed)
 
 
-class Drive:
-    """v(k) from one sample to the next within limits; `step` is for subclasses."""
+class Drive(ABC):
+    """v(k) from one sample to the next within limits."""
 
     def __init__(self, limits: Range, sample_period: float, v: float) -> None:
         self.limits, self.v = limits, v
         self._sample_period = sample_period
         self._move = limits.rate * sample_period
 
+    @abstractmethod
     def step(self) -> float:
         """The next v."""
-        raise NotImplementedError
 
     def step_to_rest(self) -> bool:
         """Move v towards rest; return whether it has got there."""

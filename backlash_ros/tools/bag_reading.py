@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +188,34 @@ def read_plain_numbers(
         stamps = np.array([stamp for stamp, _ in messages], dtype=np.int64)
         found[name] = stamps, np.array([value for _, value in messages])
     return found, content.damage
+
+
+def read_reports(path: Path, y: NDArray[np.float64], axis: str = '') -> list[list[float]]:
+    """What applied_control said between each output of a run and the one before it.
+
+    y (N,): outputs of the run, by whose values they are found among the messages. Empty where the
+    bag holds no applied_control, or the outputs are not all there. Raises InputError.
+    """
+    numbers, _ = read_plain_numbers(path, (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL))
+    chosen = []
+    for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL):
+        names = sorted(name for name in numbers if f'/{name}'.endswith(f'/{topic}'))
+        name = choose_namespace(names, axis)[0] if names else ''
+        if not name:
+            return []
+        chosen.append(numbers[name])
+    (output_ns, outputs), (report_ns, values) = chosen
+    stamps, place = [], 0
+    heard = outputs.tolist()
+    for value in y.tolist():
+        while place < len(heard) and heard[place] != value:
+            place += 1
+        if place == len(heard):
+            return []
+        stamps.append(output_ns[place])
+        place += 1
+    until = np.searchsorted(report_ns, stamps, side='right')
+    return [[], *(values[a:b].tolist() for a, b in pairwise(until.tolist()))]
 
 
 def _read_content(path: Path, wanted_topic: Wanted) -> _Content:

@@ -6,12 +6,16 @@ import argparse
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from math import inf
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.errors import BrokenOffError, InputError
+
+if TYPE_CHECKING:
+    from backlash_ros.tools.bag_sections import Span
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2
 DEFAULT_DURATION_S = 10.0
@@ -42,10 +46,32 @@ def add_common_options(parser: argparse.ArgumentParser) -> None:
         help='take this axis alone from a file with several axes',
     )
     parser.add_argument('--seed', type=int, metavar='N', help='seed of the simulated noise')
+    add_out_option(parser)
+
+
+def add_out_option(parser: argparse.ArgumentParser) -> None:
+    """Add --out, for `results.result_directory`."""
     parser.add_argument(
         '--out', type=Path, metavar='DIR',
         help='folder of the results (default: results/<UTC time>, and results/latest points at it)',
     )
+
+
+def add_span_options(parser: argparse.ArgumentParser) -> None:
+    """Add --from and --to, for `span_of`."""
+    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
+                        help='leave out what was before this time [s]')
+    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
+                        help='leave out what was from this time [s] on')
+
+
+def span_of(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Span:
+    """The part of a record between --from and --to; raises InputError where there is none."""
+    if not options.from_s < options.to_s:
+        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+    # numpy is loaded once the options are known to be right.
+    from backlash_ros.tools.bag_sections import Span
+    return Span(options.from_s, options.to_s)
 
 
 def whole_samples(duration: float, sample_period: float) -> int:

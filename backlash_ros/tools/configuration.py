@@ -78,11 +78,14 @@ class Configuration:
         values.pop(AXES, None)
         return Parameters(values)
 
-    def given(self, axis: str = '') -> set[str]:
-        """Names of the parameters that the user gives a value."""
+    def given(self, axis: str = '', without: str = '') -> set[str]:
+        """Names of the parameters that the user gives a value.
+
+        without: a node whose own sections of the file are left out.
+        """
         names = {s.name for s in self.settings if s.axis in ('', axis)}
         if self.own_file:
-            names |= set(self.file.values(axis))
+            names |= set(self.file.values(axis, without))
         return names if self.seed is None else names | {'seed'}
 
 

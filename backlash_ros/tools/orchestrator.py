@@ -135,14 +135,17 @@ def _say_unused(configuration: Configuration, parameters: Mapping[str, Parameter
     for axis, values in parameters.items():
         if values.word(DRIVER):
             given = configuration.given(axis)
-            unused |= {name for name in given if BY_NAME[name].used_by == (PLANT,)}
-            noisy = noisy or (NOISE not in given and values.real(NOISE) != BY_NAME[NOISE].default)
+            follows = NOISE not in given and values.real(NOISE) != BY_NAME[NOISE].default
+            noisy = noisy or follows
+            # What stands in a section of the plant was never meant for a run without one.
+            meant = given if follows else configuration.given(axis, without=PLANT)
+            unused |= {name for name in meant if BY_NAME[name].used_by == (PLANT,)}
     unused.discard('samples')  # tells the length of any run
     if unused:
         groups = {f'{name.split(".")[0]}.*' if '.' in name else name for name in unused}
-        follows = f'; {NOISE}, which is not given, still follows its noise' if noisy else ''
+        noise = f'; {NOISE}, which is not given, still follows its noise' if noisy else ''
         complain('with a driver there is no use for what describes the simulated plant: '
-                 f'{", ".join(sorted(groups))}{follows}')
+                 f'{", ".join(sorted(groups))}{noise}')
 
 
 def perform(plan: RunPlan) -> int:

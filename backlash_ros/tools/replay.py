@@ -5,28 +5,42 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from math import inf, isfinite
+from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.tools.command_line import (
     OptionParser,
+    add_out_option,
+    add_span_options,
     format_table,
     print_warnings,
     run_tool,
+    span_of,
 )
 from backlash_ros.tools.errors import InputError
 
 if TYPE_CHECKING:
     from backlash_ros.core.parameters import Parameters
     from backlash_ros.core.run_record import RunRecord
+    from backlash_ros.tools.bag_sections import Span
 
 EXECUTABLE = 'replay'
 FIGURE, TABLE = 'replay.png', 'replays.csv'
 HEADER = ('run', 'changed', 'm', 'c_r', 'c_l', 'std_m', 'std_c_r', 'std_c_l', 'tracking from [s]',
           'innovation RMS')
+
+
+class _Job(NamedTuple):
+    """One replay. words: what of the parameters was changed. reports: as for core/replay.py."""
+
+    path: Path
+    recorded: RunRecord
+    parameters: Parameters
+    words: str
+    reports: Sequence[Sequence[float]]
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -41,13 +55,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--sweep', action='append', default=[], metavar='KEY=V1,V2,...',
                         help='once for each value; several sweeps: for each combination')
     parser.add_argument('--axis', default='', metavar='NAME', help='of a bag with several')
-    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
-                        help='leave out what was before this time [s]')
-    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
-                        help='leave out what was from this time [s] on')
-    parser.add_argument('--out', type=Path, metavar='DIR',
-                        help='folder of the results (default: results/<UTC time>, and '
-                             'results/latest points at it)')
+    add_span_options(parser)
+    add_out_option(parser)
     return parser
 
 
@@ -59,30 +68,28 @@ def main(args: Sequence[str] | None = None) -> int:
 def _replay(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
-    if not options.from_s < options.to_s:
-        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+    span = span_of(parser, options)
     from backlash_ros.tools.batch import combinations, parse_sweep, value_text
     changes = combinations([parse_sweep(text) for text in options.sweep])
-    runs = [(path, *_opened(path, options)) for path in options.runs]
+    runs = [(path, *_opened(path, options, span)) for path in options.runs]
     jobs = []
-    for path, recorded, parameters in runs:
+    for path, recorded, parameters, reports in runs:
         for change in changes:
             changed = parameters.replaced(change) if change else parameters
             words = ' '.join(f'{name}={value_text(value)}' for name, value in change.items())
-            jobs.append((path, recorded, changed, words))
+            jobs.append(_Job(path, recorded, changed, words, reports))
     if len(jobs) > 1:
         _several(jobs, options.out)
     else:
         _one(jobs[0], options.out)
 
 
-def _opened(path: Path, options: argparse.Namespace) -> tuple[RunRecord, Parameters]:
-    """The run, and the parameters with which it is to be replayed."""
-    from backlash_ros.tools.bag_sections import Span
+def _opened(
+    path: Path, options: argparse.Namespace, span: Span,
+) -> tuple[RunRecord, Parameters, Sequence[Sequence[float]]]:
+    """The run, the parameters with which it is to be replayed, and what its driver reported."""
     from backlash_ros.tools.report import open_source
-    source = open_source(
-        path.resolve(), options.config, Span(options.from_s, options.to_s), options.axis
-    )
+    source = open_source(path.resolve(), options.config, span, options.axis)
     for text in (source.damage, *source.notes):
         if text:
             print(f'{EXECUTABLE}: warning: {text}', file=sys.stderr)
@@ -90,7 +97,27 @@ def _opened(path: Path, options: argparse.Namespace) -> tuple[RunRecord, Paramet
         raise InputError(f'{path}: holds no sample')
     if source.parameters is None:
         raise InputError(f'{path}: no parameters.yaml stands beside it: give --config')
-    return source.run, _with_settings(source.parameters, options.settings)
+    parameters = _with_settings(source.parameters, options.settings)
+    return source.run, parameters, _reports(path, source.run, parameters, options.axis)
+
+
+def _reports(
+    path: Path, run: RunRecord, parameters: Parameters, axis: str,
+) -> Sequence[Sequence[float]]:
+    """What the driver said to have applied before each row, where the controller uses it."""
+    from backlash_ros.bags.content import is_bag
+    from backlash_ros.tools.bag_reading import read_reports
+    from backlash_ros.tools.report import BAG
+    use = parameters.word('estimator.use_applied_control')
+    delayed = use == 'auto' and parameters.integer('control.delay_samples') > 0
+    if use == 'false' or delayed or parameters.flag('lockstep'):
+        return ()
+    bag = next((folder for folder in (path, path / BAG) if is_bag(folder)), None)
+    reports = [] if bag is None else read_reports(bag, run.column('y'), axis)
+    if not reports and use == 'true':
+        print(f'{EXECUTABLE}: warning: {path}: holds no applied_control: v is that of control',
+              file=sys.stderr)
+    return reports
 
 
 def _with_settings(parameters: Parameters, settings: Sequence[str]) -> Parameters:
@@ -104,26 +131,26 @@ def _with_settings(parameters: Parameters, settings: Sequence[str]) -> Parameter
     return parameters.replaced(changes) if changes else parameters
 
 
-def _run(recorded: RunRecord, parameters: Parameters, title: str) -> RunRecord:
+def _run(job: _Job, title: str) -> RunRecord:
     from tqdm import tqdm
 
     from backlash_ros.core.replay import replay
     from backlash_ros.tools.errors import BrokenOffError
-    with tqdm(total=recorded.samples, file=sys.stderr, disable=None, leave=False, desc=title) \
+    with tqdm(total=job.recorded.samples, file=sys.stderr, disable=None, leave=False, desc=title) \
             as bar:
         try:
-            return replay(recorded, parameters, lambda _: bar.update())
+            return replay(job.recorded, job.parameters, lambda _: bar.update(), job.reports)
         except ParameterError:
             raise
         except ValueError as error:
             raise BrokenOffError(f'the replay broke off: {error}') from error
 
 
-def _one(job: tuple[Path, RunRecord, Parameters, str], out: Path | None) -> None:
+def _one(job: _Job, out: Path | None) -> None:
     """What `simulate` writes, a figure beside it, and where the replay parts from the run."""
-    path, recorded, parameters, _ = job
+    recorded, parameters = job.recorded, job.parameters
     print_warnings(EXECUTABLE, parameters)
-    replayed = _run(recorded, parameters, path.name)
+    replayed = _run(job, job.path.name)
     from backlash_ros.files import write_atomically
     from backlash_ros.tools.drawing import png
     from backlash_ros.tools.replay_figure import draw_replay
@@ -158,13 +185,13 @@ def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
     )
 
 
-def _several(jobs: Sequence[tuple[Path, RunRecord, Parameters, str]], out: Path | None) -> None:
+def _several(jobs: Sequence[_Job], out: Path | None) -> None:
     """A table with a row for each run and each value."""
     from backlash_ros.tools.results import result_directory, write_table
     rows: list[tuple[object, ...]] = []
-    for path, recorded, parameters, words in jobs:
-        replayed = _run(recorded, parameters, f'{path.name} {words}')
-        rows.append((str(path), words, *_figures(replayed)))
+    for job in jobs:
+        replayed = _run(job, f'{job.path.name} {job.words}')
+        rows.append((str(job.path), job.words, *_figures(replayed)))
     directory = result_directory(out)
     write_table(directory / TABLE, HEADER, rows)
     print(format_table(HEADER, [

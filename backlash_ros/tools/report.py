@@ -6,7 +6,6 @@ import json
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,13 @@ from backlash_ros.tools.analysis import (
 )
 from backlash_ros.tools.bag_reading import read_bag
 from backlash_ros.tools.bag_sections import WHOLE, Span
-from backlash_ros.tools.command_line import OptionParser, run_tool
+from backlash_ros.tools.command_line import (
+    OptionParser,
+    add_out_option,
+    add_span_options,
+    run_tool,
+    span_of,
+)
 from backlash_ros.tools.configuration import effective_parameters, load_config, write_config
 from backlash_ros.tools.drawing import png
 from backlash_ros.tools.errors import InputError
@@ -263,22 +268,13 @@ def _report(args: Sequence[str] | None) -> None:
         '--config', type=Path, metavar='FILE',
         help='parameters of the run (default: parameters.yaml beside it)',
     )
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR',
-        help='folder of the results (default: results/<UTC time>, and results/latest points at it)',
-    )
-    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
-                        help='leave out what was before this time [s]')
-    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
-                        help='leave out what was from this time [s] on')
+    add_out_option(parser)
+    add_span_options(parser)
     parser.add_argument('--axis', default='', metavar='NAME',
                         help='of a bag with several: the one to report (default: the first)')
     options = parser.parse_args(args)
-    if not options.from_s < options.to_s:
-        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
-    source = open_source(
-        options.path.resolve(), options.config, Span(options.from_s, options.to_s), options.axis
-    )
+    span = span_of(parser, options)
+    source = open_source(options.path.resolve(), options.config, span, options.axis)
     if source.run.samples == 0:
         raise InputError(f'{options.path}: holds no sample')
     _tell_damage(source)

@@ -30,7 +30,7 @@ class Pace:
         return max(self.size // max(samples, 1), 1)
 
 
-def drained(work: Generator[None, None, T]) -> T:
+def drained(work: Generator[object, None, T]) -> T:
     """What a generator returns once all of its pieces are done."""
     while True:
         try:

@@ -12,10 +12,6 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import (
-    GATE,
-    OUTLIER_SHARE,
-)
 from backlash_ros.core.estimation.error_model import build_error_model
 from backlash_ros.core.estimation.pace import Pace, drained
 from backlash_ros.core.estimation.play import Start
@@ -27,6 +23,12 @@ from backlash_ros.core.estimation.record_description import (
     described,
     nothing,
     with_sign,
+)
+from backlash_ros.core.estimation.record_samples import (
+    SEARCHED_AT_MOST,
+    busiest,
+    check_record,
+    outliers,
 )
 from backlash_ros.core.estimation.relabelling import (
     Fitted,
@@ -44,8 +46,6 @@ from backlash_ros.core.transfer_function import TransferFunction
 Array = NDArray[np.float64]
 
 FEWEST = 10  # samples per unknown of G and u below which nothing is said
-SEARCHED_AT_MOST = 6000  # samples of a record that the search for the gap looks at
-NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
 
 
 def fit_record(
@@ -62,7 +62,9 @@ def fit_record(
     do not fit together or hold no numbers, and for delays that are none.
     """
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
-    _check(v, y, delays)
+    check_record(v, y)
+    if not delays or min(delays) < 0:
+        raise ValueError(f'delays={delays!r} must name at least one, none of them negative')
     state = model if isinstance(model, StateModel) else StateModel(model)
     around = Around(
         state, build_error_model(state, uncertainty), max(noise_std, SMALLEST_NOISE), prior
@@ -94,17 +96,6 @@ def fit_record(
     return described(results[best], state, best, margins, bounds, before, after)
 
 
-def _check(v: Array, y: Array, delays: Sequence[int]) -> None:
-    if v.ndim != 1 or v.shape != y.shape:
-        raise ValueError(f'v {v.shape} and y {y.shape} must be of one length')
-    if not np.isfinite(v).all():
-        raise ValueError('v must be finite in every sample')
-    if np.isinf(y).any():
-        raise ValueError('y must be finite, or nan where it was lost')
-    if not delays or min(delays) < 0:
-        raise ValueError(f'delays={delays!r} must name at least one, none of them negative')
-
-
 def _fit(v: Array, y: Array, around: Around, widest: float) -> BestFit | None:
     """Fit v (N,) and y (N,) after it; None where a constant u explains y as well."""
     found = _found(v, y, around, widest)
@@ -126,7 +117,7 @@ def _fit(v: Array, y: Array, around: Around, widest: float) -> BestFit | None:
 def _found(v: Array, y: Array, around: Around, widest: float) -> Fitted | None:
     if len(v) <= SEARCHED_AT_MOST:
         return drained(searched(v, y, around, widest, Pace()))
-    part = _busiest(v)
+    part = busiest(v, y)
     found = drained(searched(v[part], y[part], around, widest, Pace()))
     if found is None:
         return None
@@ -138,13 +129,6 @@ def _found(v: Array, y: Array, around: Around, widest: float) -> Fitted | None:
         drained(fitted(v, y, found.around, start, solution.m, Pace())) for start in starts
     ]
     return drained(with_better_model(v, y, most_likely(fits), Pace()))
-
-
-def _busiest(v: Array) -> slice:
-    """The stretch for the search in which v moves most."""
-    path = np.append(0.0, np.cumsum(np.abs(np.diff(v))))
-    first = int(np.argmax(path[SEARCHED_AT_MOST - 1:] - path[:len(v) - SEARCHED_AT_MOST + 1]))
-    return slice(first, first + SEARCHED_AT_MOST)
 
 
 def _again(v: Array, y: Array, found: Fitted) -> Fitted:
@@ -159,9 +143,6 @@ def _negated(around: Around) -> Around:
 
 
 def _outliers(result: Fitted) -> NDArray[np.bool_]:
-    """Readings that are none, by the bulk of the residuals; none at all where they are many."""
-    residual = np.abs(result.fit.residual(result.solution.posterior))
-    known = residual[residual > 0.0]
-    typical = NORMAL_MAD * float(np.median(known)) if len(known) else 0.0
-    wild = residual > GATE * max(typical, result.around.told_std)
-    return wild if np.count_nonzero(wild) <= OUTLIER_SHARE * len(known) else np.zeros_like(wild)
+    residual = result.fit.residual(result.solution.posterior)
+    # It is 0 where y was lost.
+    return outliers(np.where(residual == 0.0, nan, residual), result.around.told_std)

@@ -14,13 +14,15 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import GATE
+from backlash_ros.core.estimation.pace import drained
 from backlash_ros.core.estimation.record_description import frequencies_of
+from backlash_ros.core.estimation.record_samples import busiest, check_record, outliers
 from backlash_ros.core.identification import judgement, uncertainty
 from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
     Compared,
+    cancelled_pole,
     compare,
     effective_rows,
     equal_delays,
@@ -45,13 +47,10 @@ T = TypeVar('T')
 
 GENERAL = Structure(3, 0, False)  # G with which the gap is searched first, and a tap per delay
 FEWEST = 8  # samples per unknown below which nothing is fitted
-SEARCHED_AT_MOST = 6000  # samples, of a longer record the busiest ones, that searches look at
 CANDIDATES = 2  # gaps with which the structures are compared
 SAME = 0.005  # relative distance of two gaps that are one
 PROFILE_GAPS = 40  # gaps of the profile over the swing of v
 NEAR = np.linspace(0.8, 1.2, 17)  # gaps around the best one, relative
-OUTLYING = 0.2  # share of the samples that may be outliers
-NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
 FEW_VALUES = 0.8  # distinct values of y per sample, more of which are not quantised
 LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
 TINY = float(np.finfo(float).tiny)
@@ -144,13 +143,7 @@ def identify(v: Array, y: Array, sample_period: float, options: Options | None =
 
     Raises ValueError for arrays that do not fit together or hold what is no number.
     """
-    work = identifying(v, y, sample_period, options or Options())
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            result: Identification = done.value
-            return result
+    return drained(identifying(v, y, sample_period, options or Options()))
 
 
 def identifying(
@@ -158,12 +151,12 @@ def identifying(
 ) -> Generator[str, None, Identification]:
     """The same in pieces of some ten milliseconds; yields what is being done."""
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
-    _check(v, y)
+    check_record(v, y)
     nothing = _nothing(v, y, sample_period, options)
     if nothing is not None:
         return nothing
     first = max(options.delays) + 1
-    part = _busiest(v, y)
+    part = busiest(v, y)
     searched = Samples(v[part], y[part], first)
     general = GENERAL._replace(taps=GENERAL.order + max(options.delays))
     found = yield from _named('searching the gap', search(searched, general))
@@ -178,6 +171,11 @@ def identifying(
     ))
     chosen = selected(compared)
     best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
+    if cancelled_pole(best) is not None and cancelled_pole(chosen.fit) is None:
+        # Only the best fit of all shows that this pole is none.
+        compared = [one for one in compared if one is not chosen]
+        chosen = selected(compared)
+        best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
     delays = equal_delays(compared, chosen)
     rows = effective_rows(searched, best)
     # With as many poles, some of them may fit worse.
@@ -188,35 +186,26 @@ def identifying(
     best = yield from _named('choosing the delay', least_response(
         searched, best, others, best.squares / rows,
     ))
-    samples, outliers = searched, int(wild.sum())
+    samples, left_out = searched, int(wild.sum())
     if len(v) > len(searched.v):
         samples = Samples(v, y, first)
         best = _on_all(samples, best)
         wild = _outliers(samples, best)
-        outliers = int(wild.sum())
-        if outliers:
+        left_out = int(wild.sum())
+        if left_out:
             samples = samples.without(wild)
             best = fit(samples, best.structure, best.point)
     yield 'judging'
     return _described(
-        samples, searched, best, compared, chosen, rivals, curve, outliers,
+        samples, searched, best, compared, chosen, rivals, curve, left_out,
         Identification(sample_period, v, y), options, part.start,
     )
-
-
-def _check(v: Array, y: Array) -> None:
-    if v.ndim != 1 or v.shape != y.shape:
-        raise ValueError(f'v {v.shape} and y {y.shape} must be of one length')
-    if not np.isfinite(v).all():
-        raise ValueError('v must be finite in every sample')
-    if np.isinf(y).any():
-        raise ValueError('y must be finite, or nan where it was lost')
 
 
 def _nothing(v: Array, y: Array, sample_period: float, options: Options) -> Identification | None:
     """Where there is nothing to fit: why."""
     first = max(options.delays) + 1
-    part = _busiest(v, y)
+    part = busiest(v, y)
     known = np.isfinite(y[part][first:])
     # The first samples of them are fitted alone, to predict the others.
     fitted = known[:len(known) - round(options.held_out * len(known))]
@@ -246,21 +235,9 @@ def _named(stage: str, work: Generator[None, None, T]) -> Generator[str, None, T
         yield stage
 
 
-def _busiest(v: Array, y: Array) -> slice:
-    """The stretch for the search in which v moves most while y is known."""
-    if len(v) <= SEARCHED_AT_MOST:
-        return slice(0, len(v))
-    path = np.append(0.0, np.cumsum(np.abs(np.diff(v)) * np.isfinite(y[1:])))
-    first = int(np.argmax(path[SEARCHED_AT_MOST - 1:] - path[:len(v) - SEARCHED_AT_MOST + 1]))
-    return slice(first, first + SEARCHED_AT_MOST)
-
-
 def _outliers(samples: Samples, found: Fit) -> NDArray[np.bool_]:
-    """Readings that are none, by the bulk of the residuals; none at all where they are many."""
-    residual = np.abs(samples.y - found.simulated)
-    known = residual[np.isfinite(residual)]
-    wild = residual > GATE * max(NORMAL_MAD * float(np.median(known)), _quantum(samples.y))
-    return wild if np.count_nonzero(wild) <= OUTLYING * len(known) else np.zeros_like(wild)
+    """Readings that are none; rounding makes none."""
+    return outliers(samples.y - found.simulated, _quantum(samples.y))
 
 
 def _distinct(found: Sequence[Fit]) -> list[Fit]:
@@ -323,7 +300,7 @@ def _with_delays(samples: Samples, best: Fit, delays: Sequence[int]) -> list[Fit
 
 def _described(
     samples: Samples, searched: Samples, best: Fit, compared: Sequence[Compared],
-    chosen: Compared, rivals: list[tuple[float, float]], curve: Profile, outliers: int,
+    chosen: Compared, rivals: list[tuple[float, float]], curve: Profile, left_out: int,
     given: Identification, options: Options, searched_from: int,
 ) -> Identification:
     """Everything there is to say of the best fit."""
@@ -365,7 +342,7 @@ def _described(
         integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
         quantum=evidence.quantum, correlation=correlation,
         ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
-        uncertainty=_as_parameter(float(spread.max())), outliers=outliers,
+        uncertainty=_as_parameter(float(spread.max())), outliers=left_out,
         reasons=tuple(judgement.reasons(evidence)), remarks=tuple(judgement.remarks(evidence)),
         details=Details(
             samples, searched, searched_from, best, covariance, tuple(compared), chosen, curve,

@@ -7,6 +7,9 @@ least are equally good predictors. Among them the least
 
 over all samples is taken (BIC), with N' = N (1 - r) / (1 + r) for the lag-1 correlation r of the
 residual: what repeats itself from sample to sample, as the error of a quantised y, speaks less.
+
+Without any noise the residual is what the arithmetic of the simulation rounds, and says nothing of
+the structure. Of the structures that explain y to within their own rounding, the smallest is taken.
 """
 
 from __future__ import annotations
@@ -36,6 +39,8 @@ STARTS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # places in the gap at which p may begi
 EXTRA_POLES = (0.3, 0.85)  # where one more pole than in the order below may begin
 CANCELS = 0.02  # distance of a pole and a zero that cancel, relative to that of the pole from 1
 SLOWEST = 0.01  # ... which counts as this much at least: a zero at 1 cancels an integrator
+EPS = float(np.finfo(float).eps)
+ROUNDED = 2.0  # the simulated y, and the measured one, which may be a simulation as well
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
 
 
@@ -43,7 +48,8 @@ class Compared(NamedTuple):
     """One structure.
 
     trained: fitted to the first part, with which held_out, the rms of the error on the last part,
-    is made. fit: to all samples. criterion: as above, the smaller the better.
+    is made. fit: to all samples. criterion: as above, the smaller the better. exact: whether the
+    residual is no more than the rounding of the simulation.
     """
 
     structure: Structure
@@ -51,6 +57,7 @@ class Compared(NamedTuple):
     trained: Fit
     fit: Fit
     criterion: float
+    exact: bool
 
 
 def compare(
@@ -81,6 +88,7 @@ def compare(
             whole.structure, rms, trained, whole,
             rows * float(np.log(max(whole.squares, smallest)))
             + whole.structure.unknowns * float(np.log(len(samples.known))),
+            whole.rms <= rounding(samples, whole),
         )
         for rms, trained, whole in found
     ]
@@ -88,10 +96,27 @@ def compare(
 
 def selected(compared: Sequence[Compared]) -> Compared:
     """The structure that is taken."""
+    exact = [one for one in compared if one.exact]
+    if exact:
+        return min(exact, key=lambda one: (one.structure.unknowns, one.fit.squares))
     least = min(one.held_out for one in compared)
     good = [one for one in compared if one.held_out <= WITHIN * least]
     plain = [one for one in good if cancelled_pole(one.fit) is None]
     return min(plain or good, key=lambda one: one.criterion)
+
+
+def rounding(samples: Samples, found: Fit) -> float:
+    """Deviation of the simulated y by rounding alone.
+
+    A step of the recursion A y = ... rounds by |A|_1 |y| eps at most, and 1/A hands that on.
+    """
+    impulse = np.zeros(samples.count)
+    impulse[0] = 1.0
+    answer = lfilter([1.0], found.denominator, impulse)
+    y = float(np.sqrt(np.mean(samples.target**2)))
+    return ROUNDED * EPS * float(np.abs(found.denominator).sum()) * y * float(
+        np.linalg.norm(answer)
+    )
 
 
 def cancelled_pole(found: Fit) -> complex | None:

@@ -261,14 +261,16 @@ def fit(
         if penalty is not None:
             columns = np.vstack([columns, np.zeros((len(penalty), columns.shape[1]))])
         free = columns - linear.basis @ (linear.basis.T @ columns)
-        gram, downhill = free.T @ free, free.T @ linear.residual
-        diagonal = np.diag(gram).copy()
-        diagonal[diagonal <= 0.0] = 1.0
+        # The normal equations would square a condition that is bad already near z = 1.
+        scale = np.sqrt(np.einsum('ij,ij->j', free, free))
+        scale[scale == 0.0] = 1.0
+        basis, upper = np.linalg.qr(free / scale)
+        downhill = np.append(basis.T @ linear.residual, np.zeros(len(scale)))
         before = linear.squares
         while damping < MOST_DAMPING:
-            damped = gram + damping * np.diag(diagonal)
-            step = np.asarray(np.linalg.lstsq(damped, downhill, rcond=None)[0], dtype=np.float64)
-            new = _moved(point, step, gap_free, top, v0)
+            damped = np.vstack([upper, np.sqrt(damping) * np.eye(len(scale))])
+            step = np.linalg.lstsq(damped, downhill, rcond=None)[0] / scale
+            new = _moved(point, np.asarray(step, dtype=np.float64), gap_free, top, v0)
             if largest_pole(new.a) <= 1.0:
                 new_play, new_linear = evaluate(new)
                 if new_linear.squares < linear.squares:

@@ -10,10 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from backlash_ros.core.parameter_table import Value
-from backlash_ros.tools.command_line import FAILED, OptionParser, run_tool
+from backlash_ros.tools.command_line import (
+    FAILED,
+    OptionParser,
+    add_out_option,
+    add_span_options,
+    run_tool,
+    span_of,
+)
 from backlash_ros.tools.errors import InputError
 
 if TYPE_CHECKING:
+    from backlash_ros.tools.bag_sections import Span
     from backlash_ros.tools.identify.measured_record import MeasuredRecord
 
 EXECUTABLE = 'identify'
@@ -21,7 +29,6 @@ YAML, JSON, PAGE = 'identified.yaml', 'identified.json', 'identify.html'
 ESTIMATES = 'estimates.json'
 INTEGRATORS = {'auto': (False, True), 'yes': (True,), 'no': (False,)}
 HIGHEST_ORDER, LONGEST_DELAY = 6, 20
-
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -49,13 +56,8 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--held-out', type=_share, default=1.0 / 3.0, metavar='SHARE',
                         help='share at the end of the record on which structures are compared '
                              '(default: 0.33)')
-    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
-                        help='leave out what was before this time [s]')
-    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
-                        help='leave out what was from this time [s] on')
-    parser.add_argument('--out', type=Path, metavar='DIR',
-                        help='folder of the results (default: results/<UTC time>, and '
-                             'results/latest points at it)')
+    add_span_options(parser)
+    add_out_option(parser)
     drive = parser.add_argument_group('with --drive')
     drive.add_argument('--drive', action='store_true',
                        help='move the actuator within control.min, control.max and '
@@ -131,12 +133,11 @@ def _identify(args: Sequence[str] | None) -> bool:
     options = parser.parse_args(arguments[:of_ros])
     if options.drive == (options.record is not None):
         parser.error('give a RECORD, or --drive')
-    if not options.from_s < options.to_s:
-        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
     if arguments[of_ros:] and not options.drive:
         parser.error('--ros-args are for --drive')
+    span = span_of(parser, options)
     given = given_values(options.config, options.axis)
-    record = _recorded(options, given, arguments[of_ros:])
+    record = _recorded(options, span, given, arguments[of_ros:])
     for note in record.notes:
         print(f'{EXECUTABLE}: warning: {note}', file=sys.stderr)
     from backlash_ros.tools.identify.outcome import identified, write_outcome
@@ -145,7 +146,8 @@ def _identify(args: Sequence[str] | None) -> bool:
 
 
 def _recorded(
-    options: argparse.Namespace, given: Mapping[str, Value], ros_arguments: Sequence[str],
+    options: argparse.Namespace, span: Span, given: Mapping[str, Value],
+    ros_arguments: Sequence[str],
 ) -> MeasuredRecord:
     # numpy, scipy and matplotlib are loaded once the options are known to be right.
     if options.drive:
@@ -153,12 +155,10 @@ def _recorded(
         if options.axis:
             ros_arguments = [*(ros_arguments or ['--ros-args']), '-r', f'__ns:=/{options.axis}']
         return drive(options, given, ros_arguments)
-    from backlash_ros.tools.bag_sections import Span
     from backlash_ros.tools.identify.measured_record import read_measured
     period = given.get('sample_period')
     return read_measured(
-        options.record, float(period) if isinstance(period, float) else None,
-        Span(options.from_s, options.to_s), options.axis,
+        options.record, float(period) if isinstance(period, float) else None, span, options.axis,
     )
 
 
@@ -178,7 +178,6 @@ def given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
     if axes and axis not in axes:
         raise InputError(no_such_axis(axis, axes))
     return file.values(axis)
-
 
 
 if __name__ == '__main__':

@@ -25,6 +25,7 @@ from backlash_ros.core.identification.identification import (
 )
 from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools.command_line import BAD_INPUT
 from backlash_ros.tools.configuration import write_config
 from backlash_ros.tools.errors import BrokenOffError, InputError
 from backlash_ros.tools.identify.measured_record import MeasuredRecord, from_messages
@@ -36,9 +37,7 @@ LOOK_S = 0.25  # between two looks at the record
 FEWEST = 3  # samples that are a record
 FIRST_LOOK_S = 3.0  # of motion before the first estimate
 SHARE_OF_TIME = 0.25  # of the time that estimates may take: the actuator needs the processor
-REPORTED = 0.9  # share of the samples that applied_control has to report to be believed
 KINDER = 5  # niceness by which estimates give way to the driver and to what moves it
-BAD_INPUT = 2
 
 
 def drive(
@@ -209,14 +208,9 @@ class _Messages:
             for topic, (stamps, values) in self._heard.items()
         }
         output = heard.get(topics.PLANT_OUTPUT)
-        commands = heard.get(topics.APPLIED_CONTROL)
         if output is None or len(output[0]) < FEWEST:
             return None
-        if commands is None or len(commands[0]) < REPORTED * len(output[0]):
-            commands = heard.get(topics.CONTROL)
-        if commands is None:
-            return None
         try:
-            return from_messages(Path('the motion'), output, commands, sample_period)
+            return from_messages(Path('the motion'), heard, sample_period)
         except InputError:
             return None

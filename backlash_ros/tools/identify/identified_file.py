@@ -19,12 +19,14 @@ from backlash_ros.core.parameter_table import (
     BRINGUP,
     BY_NAME,
     PARAMETERS,
+    PLANT,
     RECORDER,
     Parameter,
     Value,
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.configuration import yaml_value
+from backlash_ros.tools.parameter_file import ANY, EVERY_NODE
 
 LEAST_DEVIATION = 1e-6  # relative: a deviation of 0 would say that a constant was given
 WIDER = 3.0  # bounds of the estimates, in times of what was found
@@ -186,14 +188,26 @@ def commented_yaml(
         f'# {"; ".join(found.remarks)}.' if found.remarks else '# Nothing spoke against it.',
         '# Values with ± were found, the others are as they were given, or defaults.',
     ]
-    lines: list[tuple[str, str]] = []
-    section = f'/{axis}/**' if axis else '/**'
-    lines += [(f'{section}:', ''), ('  ros__parameters:', '')]
     written = [
         p for p in PARAMETERS
         if p.used_by not in ((BRINGUP,), (RECORDER,)) and parameters[p.name] != ()
         and not p.name.startswith('truth.')
     ]
+    of_plant = [p for p in written if p.used_by == (PLANT,)]
+    common = [p for p in written if p not in of_plant]
+    lines = _section(f'/{axis}/{ANY}' if axis else EVERY_NODE, parameters, common, comments)
+    lines.append(('# For simulations alone: the simulated plant is the one that was found.', ''))
+    lines += _section(f'/{axis or ANY}/{PLANT}', parameters, of_plant, {})
+    if axis:
+        lines += [('/bringup:', ''), ('  ros__parameters:', ''), (f"    axes: ['{axis}']", '')]
+    return '\n'.join([*head, *(_aligned(text, comment) for text, comment in lines), ''])
+
+
+def _section(
+    name: str, parameters: Parameters, written: list[Parameter], comments: Mapping[str, str],
+) -> list[tuple[str, str]]:
+    """The lines of one section, with a comment each or none."""
+    lines = [(f'{name}:', ''), ('  ros__parameters:', '')]
     groups: list[str] = []
     for parameter in _grouped(written):
         *path, leaf = parameter.name.split('.')
@@ -207,9 +221,7 @@ def commented_yaml(
             f'{"  " * (len(path) + 2)}{leaf}: {yaml_value(parameters[parameter.name])}',
             comments.get(parameter.name) or _described(parameter),
         ))
-    if axis:
-        lines += [('/bringup:', ''), ('  ros__parameters:', ''), (f"    axes: ['{axis}']", '')]
-    return '\n'.join([*head, *(_aligned(text, comment) for text, comment in lines), ''])
+    return lines
 
 
 def _grouped(parameters: list[Parameter]) -> list[Parameter]:
@@ -255,6 +267,5 @@ def _found(found: Identification) -> dict[str, str]:
         'estimator.initial.c_l': f'± {std["c_l"]:.2g} [v]',
         'estimator.output_noise_std': 'deviation of y from the simulation [y]',
         'estimates.file': 'm, c_r, c_l as found, with which the controller begins',
-        'backlash.m': 'the simulated plant is the one that was found',
     }
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf, isfinite, nan
+from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.bags.content import is_bag
+from backlash_ros.core.identification.intervals import v_of_intervals
 from backlash_ros.tools.bag_reading import read_plain_numbers
 from backlash_ros.tools.bag_sections import WHOLE, Span, choose_namespace
 from backlash_ros.tools.errors import InputError
@@ -25,6 +26,10 @@ Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values
 COLUMNS = ('t', 'v', 'y')
 OFF_GRID = 0.25  # of a period that a row of a CSV may miss its time
 REPORTED = 0.9  # share of the samples that applied_control has to report to be believed
+# Of a sample period: a stamp that is later is that of the next sample, and the clock of the driver
+# is slower by this per sample at most.
+LATEST, CLOCK_SLACK = 0.85, 0.01
+ENDS, MOST_DIGITS = 2.0**0.5, 9  # independent latenesses of two stamps; digits of a period
 SIMULATED_BEFORE_NS = 10**17  # stamps: the clock of a machine is far beyond
 LONGEST = 1_000_000  # samples, lost ones included: more is a t that jumps
 
@@ -181,12 +186,7 @@ def _from_bag(path: Path, sample_period: float | None, axis: str) -> MeasuredRec
         # Stamps of a simulated time do not tell what came first within a sample.
         return _from_signals(path, sample_period, axis)
     of_axis = f' of axis {axis}' if axis else ''
-    commands = chosen.get(topics.APPLIED_CONTROL)
-    if commands is None or len(commands[0]) < REPORTED * len(output[0]):
-        commands = chosen.get(topics.CONTROL)
-    if commands is None or not len(commands[0]):
-        raise InputError(f'{path}: holds no {topics.CONTROL}{of_axis}: record it as well')
-    record = from_messages(path, output, commands, sample_period)
+    record = from_messages(path, chosen, sample_period, of_axis)
     return replace(record, notes=(*record.notes, *notes))
 
 
@@ -202,42 +202,60 @@ def _from_signals(path: Path, sample_period: float | None, axis: str) -> Measure
 
 
 def from_messages(
-    path: Path, output: Messages, commands: Messages,
-    sample_period: float | None,
+    path: Path, heard: Mapping[str, Messages], sample_period: float | None, of_axis: str = '',
 ) -> MeasuredRecord:
-    """From stamps [ns] and values of y, and of v (or its reports just before each y).
+    """From stamps [ns] and values by topic, plant_output among them.
 
-    v over an interval is the newest one when the next y comes.
+    v is that of applied_control where it is reported, else that of control. Raises InputError.
     """
-    begin = output[0][0]
-    stamps, values = (output[0] - begin).astype(float), output[1]
-    steps = np.diff(stamps) * 1e-9
-    period = float(np.median(steps)) if sample_period is None else sample_period
+    output = heard[topics.PLANT_OUTPUT]
+    commands = heard.get(topics.APPLIED_CONTROL)
+    reported = commands is not None and len(commands[0]) >= REPORTED * len(output[0])
+    if not reported:
+        commands = heard.get(topics.CONTROL)
+    if commands is None or not len(commands[0]):
+        raise InputError(f'{path}: holds no {topics.CONTROL}{of_axis}: record it as well')
+    stamps = (output[0] - output[0][0]).astype(float)
+    period = float(np.median(np.diff(stamps))) * 1e-9 if sample_period is None else sample_period
     if not period > 0.0:
         raise InputError(f'{path}: its stamps do not tell the sample period: give --config')
-    index = _numbered(steps / period)
+    index = _numbered(stamps * 1e-9 / period)
     if index[-1] >= LONGEST:
         raise InputError(f'{path}: spans {index[-1]:.3g} sample periods of {period:g} s')
     if sample_period is None:
-        # All steps together tell it better than one does.
-        period = float(f'{stamps[-1] * 1e-9 / index[-1]:.5g}')
+        # All stamps together tell it better than one step does, but for how late the ends were.
+        period, offset = np.polyfit(index, stamps * 1e-9, 1).tolist()
+        late = float(np.std(stamps * 1e-9 - period * index - offset))
+        period = _rounded(period, ENDS * late / float(index[-1]))
     count = int(index[-1]) + 1
     y = np.full(count, nan)
-    y[index] = values
-    times = np.interp(np.arange(1, count + 1), index, stamps)
-    times[-1] = inf
-    newest = np.searchsorted((commands[0] - begin).astype(float), times, side='right') - 1
-    v = np.append(commands[1], nan)[newest]
+    y[index] = output[1]
+    v = v_of_intervals(index, output[0], *commands, reported)
     return _usable(path, v, y, period)
 
 
-def _numbered(steps: Array) -> NDArray[np.int64]:
-    """Number of each sample from the steps of time between them, in sample periods.
+def _numbered(times: Array) -> NDArray[np.int64]:
+    """Number of each sample from its time [sample periods], rising from 0.
 
-    Samples are late, never early: those that come in a heap belong before the last of it.
+    Samples are late, never early: what comes before the next one is due is still the sample before,
+    and of those that come in a heap the last one is the newest.
     """
-    times = np.append(0.0, np.cumsum(np.round(steps))).astype(np.int64)
+    begin, number = float(times[0]), 0
+    passed = np.zeros(len(times), dtype=np.int64)
+    for i, time in enumerate(times.tolist()):
+        newest = max(int(time - begin + 1.0 - LATEST), number)
+        begin = min(begin + CLOCK_SLACK * (newest - number), time - newest)
+        passed[i] = number = newest
     # Strictly rising, the last of a heap keeping its place.
     place = np.arange(len(times))
-    numbers = np.minimum.accumulate((times - place)[::-1])[::-1] + place
+    numbers = np.minimum.accumulate((passed - place)[::-1])[::-1] + place
     return np.asarray(numbers - numbers[0], dtype=np.int64)
+
+
+def _rounded(period: float, deviation: float) -> float:
+    """The period with the fewest digits that is within its deviation."""
+    for digits in range(1, MOST_DIGITS):
+        text = f'{period:.{digits}g}'
+        if abs(float(text) - period) <= deviation:
+            return float(text)
+    return period
