@@ -101,7 +101,7 @@ PRESETS = {
         motor_inertia=1.0, stiffness=9000.0, damping=150.0, torque_limit=150.0,
         load_inertia=0.5, friction=5.0, viscous=0.5,
         motor_resolution=2.0 * pi / 2**17 / 100.0, load_resolution=2.0 * pi / 2**17,
-        reach=0.2, rate=0.3, swing=0.05, frequency=0.5, sample_period=0.005,
+        reach=0.06, rate=0.12, swing=0.02, frequency=0.5, sample_period=0.005,
         source='8 arcmin and 12 Nm/arcmin of a standard planetary gear for robot joints '
                '(https://gearboxplanetary.com/application/'
                'inline-planetary-gearbox-in-industrial-robot-joint-servo-reducer-applications/)',
@@ -133,9 +133,9 @@ PRESETS = {
         'axis of a telescope with little friction and much inertia', gap=2.0 * ARCMIN,
         contact_stiffness=2e4, contact_damping=80.0,
         motor_inertia=20.0, stiffness=8e4, damping=1800.0, torque_limit=400.0,
-        load_inertia=8.0, friction=0.5, viscous=0.2,
+        load_inertia=8.0, friction=0.2, viscous=0.2,
         motor_resolution=2.0 * pi / 2**22, load_resolution=2.0 * pi / 2**20,
-        reach=0.05, rate=0.02, swing=0.01, frequency=0.2, sample_period=0.01,
+        reach=0.006, rate=0.01, swing=0.003, frequency=0.3, sample_period=0.01,
         source='about 2 arcmin of a worm gear (https://www.celestron.com/blogs/knowledgebase/'
                'i-m-experiencing-motion-in-ra-east-after-slews-with-my-celestron-german-goto-mount-'
                'is-this-backlash-and-how-do-i-correct-it)',

@@ -1,0 +1,279 @@
+"""Gears made of physics in one process: identified from limits alone, then in the closed loop."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import islice
+from math import asin, inf, pi, sin
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
+
+from gear_physics import Gear, GearPhysics
+
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.controller import AdaptiveController
+from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.identification.identification import (
+    Identification,
+    Options,
+    identify,
+)
+from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.parameter_table import Value
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.tools.identify.identified_file import (
+    as_estimate,
+    identified_parameters,
+)
+
+Array = NDArray[np.float64]
+Motion = Callable[[float], float]  # of the phase [rad], between -1 and 1
+
+STROKES_S = 20.0  # of the motion for identification, at most 4000 samples
+SETTLING_S = 0.5  # at rest before a record
+PERIODS, FIRST = 4, 2  # of a motion, and those of them that do not count
+CONSTANT_PERIODS, CONSTANT_FIRST = 2, 1  # ... where nothing is learned
+SWINGS = 4.0  # of the lost motion either way, in which it is measured
+QUASI_STATIC_S = 40.0  # for a period of that
+ORACLE_RUNS = 24
+JUMP = 30.0  # second derivative of a shape by its phase, that no smooth one has
+ORACLE_SPREAD = (0.02, 0.15, 0.15)  # of the first simplex: m relative, crossings in lost motions
+DOUBT = 0.5  # without compensation: the observer allows for what that gets wrong
+
+
+def _triangle(phase: float) -> float:
+    return 2.0 / pi * asin(max(-1.0, min(1.0, sin(phase))))
+
+
+def _trapezoid(phase: float) -> float:
+    """Moves in half of the time, rests in the other."""
+    return max(-1.0, min(1.0, 2.0 * _triangle(phase)))
+
+
+def _multisine(phase: float) -> float:
+    parts = ((0.6, 1.0, 0.0), (0.3, 2.0, 1.0), (0.2, 3.0, 4.0))
+    return sum(size * sin(times * phase + shift) for size, times, shift in parts) / 0.95
+
+
+# Shape, and frequency in units of that of the preset.
+MOTIONS: dict[str, tuple[Motion, float]] = {
+    'sine': (sin, 1.0),
+    'slow sine': (sin, 0.3),
+    'multisine': (_multisine, 0.7),
+    'triangle': (_triangle, 0.7),
+    'moves and rests': (_trapezoid, 0.5),
+}
+
+
+@dataclass(frozen=True)
+class Run:
+    """A closed loop. y: true load (N,), y_m: as it is to be followed (N,), v, estimates, status."""
+
+    y: Array
+    y_m: Array
+    v: Array
+    gap: Array
+    std_gap: Array
+    status: NDArray[np.int64]
+    first: int  # sample from which it counts
+
+    @property
+    def error(self) -> float:
+        """RMS of y - y_m [y]."""
+        return float(np.sqrt(np.mean((self.y - self.y_m)[self.first:]**2)))
+
+    def said_tracking_off_by(self, lost_motion: float) -> float:
+        """Largest relative error of the gap while the state was tracking; 0 where it never was."""
+        rows = self.status[self.first:] == Status.TRACKING
+        if not rows.any():
+            return 0.0
+        return float(np.abs(self.gap[self.first:][rows] / lost_motion - 1.0).max())
+
+
+def quasi_static(gear: Gear) -> tuple[Array, Array, Array]:
+    """One period of a slow motion to and fro: v, motor and load, (N,) each."""
+    gap, interval = gear.lost_motion, 0.05
+    physics = GearPhysics(gear)
+    rows = []
+    for k in range(round(1.25 * QUASI_STATIC_S / interval)):
+        v = SWINGS * gap * _triangle(2.0 * pi * k * interval / QUASI_STATIC_S)
+        physics.move_to(v)
+        physics.advance(interval)
+        rows.append((v, physics.motor, physics.load))
+    v, motor, load = np.array(rows[round(0.25 * QUASI_STATIC_S / interval):]).T
+    return v, motor, load
+
+
+def lost_motion(v: Array, load: Array) -> float:
+    """Distance along v of the two branches of a hysteresis loop, in its middle half."""
+    middle = np.abs(load) < 0.5 * np.abs(load).max()
+    speed = np.gradient(load)
+    apart = [np.median((v - load)[middle & (sign * speed > 0.0)]) for sign in (1.0, -1.0)]
+    return float(apart[0] - apart[1])
+
+
+def record(gear: Gear, seconds: float = STROKES_S) -> tuple[Array, Array, Array]:
+    """The motion of `identify --drive` within the limits: v, motor and load encoder, (N,) each.
+
+    motor: that at the end of the interval in which v acts, as a driver reports it.
+    """
+    physics, period = GearPhysics(gear), gear.sample_period
+    reach, rate = gear.scale * gear.reach, gear.scale * gear.rate
+    physics.advance(SETTLING_S)
+    rows = []
+    for v in islice(strokes(-reach, reach, rate, period, seconds, 0.0), round(seconds / period)):
+        y = physics.load_encoder()
+        physics.move_to(v)
+        physics.advance(period)
+        rows.append((v, physics.motor_encoder(), y))
+    v, motor, y = np.array(rows).T
+    return v, motor, y
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What `identify --drive` finds within the limits, and the file that it writes.
+
+    option: what it had to be told because nothing of use was found without. parameters: None where
+    no controller takes them, refused: why.
+    """
+
+    found: Identification
+    option: str
+    parameters: Parameters | None
+    refused: str = ''
+
+    @property
+    def said(self) -> str:
+        """What a user reads."""
+        if self.refused:
+            return f'refused: {self.refused}'
+        return '; '.join(self.found.reasons) or 'of use'
+
+
+def identified(gear: Gear, encoder: bool) -> Identified:
+    """Identify from v, or from the motor encoder; if it is not of use, once more as told to."""
+    v, motor, y = record(gear)
+    reach, rate = gear.scale * gear.reach, gear.scale * gear.rate
+    given: dict[str, Value] = {
+        'sample_period': gear.sample_period, 'control.min': -reach, 'control.max': reach,
+        'control.rate_max': rate, 'estimator.use_applied_control': 'true' if encoder else 'false',
+    }
+    results = []
+    for option, integrators in (('', (False, True)), ('--integrator no', (False,))):
+        found = identify(
+            motor if encoder else v, y, gear.sample_period, Options(integrators=integrators)
+        )
+        try:
+            results.append(Identified(found, option, identified_parameters(found, given)))
+        except ParameterError as error:
+            results.append(Identified(found, option, None, str(error)))
+        if found.usable and not results[-1].refused:
+            return results[-1]
+    return next((one for one in results if one.parameters is not None), results[0])
+
+
+def learning(found: Identification, parameters: Parameters) -> AdaptiveController:
+    """The controller that begins with the identified file."""
+    return build_controller(parameters, as_estimate(found, parameters))
+
+
+def constant(
+    parameters: Parameters, m: float, c_r: float, c_l: float, doubt: float = 0.0,
+) -> AdaptiveController:
+    """The same with these constants for good."""
+    return build_controller(parameters.replaced({
+        'estimator.law': 'fixed', 'fixed.doubt': doubt,
+        'estimator.bounds.m': (0.1 * m, 10.0 * m), 'estimator.initial.m': m,
+        'estimator.bounds.c_r': (0.0, max(2.0 * c_r, 1e-9)), 'estimator.initial.c_r': c_r,
+        'estimator.bounds.c_l': (min(2.0 * c_l, -1e-9), 0.0), 'estimator.initial.c_l': c_l,
+    }))
+
+
+def close_loop(
+    gear: Gear, controller: AdaptiveController, motion: str, encoder: bool = False,
+    periods: int = PERIODS, first: int = FIRST,
+) -> Run:
+    """Run one motion. encoder: the motor encoder is reported. first: period that counts."""
+    shape, times = MOTIONS[motion]
+    period, frequency = gear.sample_period, times * gear.frequency
+    samples = round(periods / frequency / period)
+    size = gear.scale * gear.swing
+    reference = size * np.array(
+        [shape(2.0 * pi * frequency * period * k) for k in range(samples)]
+    )
+    physics = GearPhysics(gear)
+    rows = np.zeros((samples, 5))
+    applied: tuple[float, ...] = ()
+    for k in range(samples):
+        y = physics.load
+        step = controller.step(physics.load_encoder(), float(reference[k]), applied=applied)
+        controller.refine()
+        e = step.estimate
+        rows[k] = y, step.v, e.c_r - e.c_l, np.hypot(e.std_c_r, e.std_c_l), e.status
+        physics.move_to(step.v)
+        physics.advance(period)
+        applied = (physics.motor_encoder(),) if encoder else ()
+    y, v, gap, std, status = rows.T
+    delay = controller.structure.delay
+    due = np.concatenate([np.full(delay, reference[0]), reference])[:samples]
+    return Run(y, due, v, gap, std, status.astype(int), round(first / frequency / period))
+
+
+def uncompensated(gear: Gear, parameters: Parameters, motion: str) -> Run:
+    """The loop that takes the gap for 0."""
+    m = parameters.real('estimator.initial.m')
+    controller = constant(parameters, m, 0.0, 0.0, DOUBT)
+    return close_loop(gear, controller, motion, False, CONSTANT_PERIODS, CONSTANT_FIRST)
+
+
+def oracle(
+    gear: Gear, parameters: Parameters, motion: str, lost: float,
+) -> tuple[float, tuple[float, float, float]]:
+    """Least error with constants, by Nelder and Mead, and these constants (m, c_r, c_l)."""
+    known = parameters.real('estimator.initial.m')
+    begin = np.array([1.0, 0.5, 0.5])
+
+    def error(x: Array) -> float:
+        if x.min() <= 0.0:
+            return inf
+        controller = constant(parameters, known * x[0], lost * x[1], -lost * x[2])
+        with np.errstate(all='ignore'):
+            return close_loop(
+                gear, controller, motion, False, CONSTANT_PERIODS, CONSTANT_FIRST
+            ).error
+
+    simplex = np.vstack([begin, begin + np.diag(ORACLE_SPREAD)])
+    best = minimize(error, begin, method='Nelder-Mead', options={
+        'maxfev': ORACLE_RUNS, 'initial_simplex': simplex, 'xatol': 1e-3, 'fatol': 0.0,
+    })
+    m, right, left = best.x
+    return float(best.fun), (float(known * m), float(right * lost), float(-left * lost))
+
+
+def inertia_ratio(gear: Gear, motion: str) -> float:
+    """Largest J |a| / friction of the load on a motion; inf where its speed jumps."""
+    shape, times = MOTIONS[motion]
+    phase = np.linspace(0.0, 2.0 * pi, 2001)
+    a = np.gradient(np.gradient([shape(float(x)) for x in phase], phase), phase)
+    if np.abs(a).max() > JUMP:
+        return inf
+    w = 2.0 * pi * times * gear.frequency
+    return float(gear.total_inertia * np.abs(a).max() * w**2 * gear.swing / gear.friction)
+
+
+def coasting_way(gear: Gear, motion: str) -> float:
+    """Way that the load would coast at the largest speed of a motion, over the gap."""
+    shape, times = MOTIONS[motion]
+    phase = np.linspace(0.0, 2.0 * pi, 2001)
+    speed = np.abs(np.gradient([shape(float(x)) for x in phase], phase)).max()
+    speed *= 2.0 * pi * times * gear.frequency * gear.swing
+    return float(0.5 * gear.total_inertia * speed**2 / gear.friction / gear.gap)

@@ -1,0 +1,245 @@
+"""Gears made of physics: how much of the error that backlash makes is removed, from limits alone.
+
+`python benchmarks/physics.py` identifies each preset of examples/gear_physics.py, closes the loop
+with what was found for five motions, and prints tables; `--write` puts them and a figure into
+docs/physics.md. `--preset robot --motion triangle`: one case.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import sys
+from dataclasses import dataclass
+from math import isinf, nan
+
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+
+import matplotlib as mpl
+import numpy as np
+from gear_runs import (
+    MOTIONS,
+    Identified,
+    Run,
+    close_loop,
+    coasting_way,
+    identified,
+    inertia_ratio,
+    learning,
+    lost_motion,
+    oracle,
+    quasi_static,
+    uncompensated,
+)
+from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
+
+from backlash_ros.core.estimation.protocol import Status
+
+sys.path.append(str(ROOT / 'examples'))
+from gear_physics import PRESETS
+
+mpl.use('Agg')
+import matplotlib.pyplot as plt
+
+DOCUMENT = ROOT / 'docs' / 'physics.md'
+FIGURE = ROOT / 'docs' / 'images' / 'physics.png'
+MARKS = re.compile(r'(<!-- physics: made by benchmarks -->\n).*?(<!-- end -->)', re.DOTALL)
+REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
+
+
+@dataclass(frozen=True)
+class Source:
+    """One way to know v: the command, or the motor encoder. lost: motion lost behind it."""
+
+    preset: str
+    encoder: bool
+    lost: float
+    identified: Identified
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A loop that learns: its error, gap over lost motion, worst of it under *tracking*, states."""
+
+    error: float
+    gap: float
+    tracking_off: float
+    states: str
+    problem: str = ''
+
+
+@dataclass(frozen=True)
+class Case:
+    """One motion of one preset. none, best: errors without compensation and with constants."""
+
+    preset: str
+    motion: str
+    lost: float
+    none: float
+    best: float
+    loops: tuple[Loop, Loop]  # from the command, from the motor encoder
+
+    def removed(self, loop: Loop) -> float:
+        """Share of the avoidable error that is removed."""
+        return (self.none - loop.error) / (self.none - self.best)
+
+
+def find(job: tuple[str, bool]) -> Source:
+    """Identify one preset."""
+    preset, encoder = job
+    v, motor, load = quasi_static(PRESETS[preset])
+    return Source(
+        preset, encoder, lost_motion(motor if encoder else v, load),
+        identified(PRESETS[preset], encoder),
+    )
+
+
+def judge(job: tuple[str, Source, Source]) -> Case:
+    """All loops of one motion."""
+    motion, command, encoder = job
+    gear, parameters = PRESETS[command.preset], command.identified.parameters
+    none = best = nan
+    if parameters is not None:
+        none = uncompensated(gear, parameters, motion).error
+        best, _ = oracle(gear, parameters, motion, command.lost)
+    return Case(
+        command.preset, motion, command.lost, none, best,
+        (_loop(command, motion), _loop(encoder, motion)),
+    )
+
+
+def _loop(source: Source, motion: str) -> Loop:
+    parameters, gear = source.identified.parameters, PRESETS[source.preset]
+    if parameters is None:
+        return Loop(nan, nan, nan, '', source.identified.refused)
+    try:
+        run = close_loop(
+            gear, learning(source.identified.found, parameters), motion, source.encoder
+        )
+    except (ArithmeticError, ValueError) as error:
+        return Loop(nan, nan, nan, '', str(error))
+    return Loop(
+        run.error, float(run.gap[-1]) / source.lost, run.said_tracking_off_by(source.lost),
+        _states(run),
+    )
+
+
+def _states(run: Run) -> str:
+    states, counts = np.unique(run.status[run.first:], return_counts=True)
+    return ', '.join(
+        f'{Status(state).word} {count / counts.sum():.0%}'
+        for state, count in sorted(zip(states, counts, strict=True), key=lambda one: -one[1])
+    )
+
+
+FOUND_HEADER = ('preset', 'v from', 'gap', 'lost motion, measured', 'gap found / lost motion',
+                'identify says')
+
+
+def found_rows(sources: list[Source]) -> list[list[str]]:
+    """What identification finds."""
+    rows = []
+    for one in sources:
+        gear, found = PRESETS[one.preset], one.identified.found
+        said = f'{one.identified.said} {one.identified.option and f"({one.identified.option})"}'
+        rows.append([
+            one.preset, 'motor encoder' if one.encoder else 'command',
+            f'{gear.scale * gear.gap:.4g}', f'{one.lost:.4g}',
+            f'{found.gap / one.lost:.3f} ± {found.std.get("gap", nan) / one.lost:.2g}',
+            said.strip(),
+        ])
+    return rows
+
+
+HEADER = ('preset', 'motion', 'J\\|a\\|/τ_c', 'coasts', 'none', 'best', 'command: error', 'removed',
+          'gap', 'states', 'encoder: error', 'removed', 'gap', 'states')
+
+
+def rows_of(cases: list[Case]) -> list[list[str]]:
+    """Errors in % of the lost motion; gaps over the lost motion."""
+    rows = []
+    for one in cases:
+        gear = PRESETS[one.preset]
+        ratio = inertia_ratio(gear, one.motion)
+        row = [one.preset, one.motion, 'jumps' if isinf(ratio) else f'{ratio:.2g}',
+               f'{coasting_way(gear, one.motion):.2g}', f'{one.none / one.lost:.1%}',
+               f'{one.best / one.lost:.1%}']
+        for loop in one.loops:
+            row += [f'{loop.error / one.lost:.1%}', f'{one.removed(loop):.0%}', f'{loop.gap:.3f}',
+                    loop.problem or loop.states]
+        rows.append(row)
+    return rows
+
+
+def wrong(cases: list[Case]) -> list[list[str]]:
+    """Where a bound is missed, with the command that shows it."""
+    rows = []
+    for one in cases:
+        for name, loop in zip(('command', 'motor encoder'), one.loops, strict=True):
+            what = []
+            if not one.removed(loop) >= REMOVED:
+                what.append(f'removes {one.removed(loop):.0%}')
+            if loop.tracking_off > OFF:
+                what.append(f'says tracking with the gap off by {loop.tracking_off:.0%}')
+            if what:
+                rows.append([
+                    f"`benchmarks/physics.py --preset {one.preset} --motion '{one.motion}'`",
+                    name, '; '.join(what),
+                ])
+    return rows
+
+
+def draw() -> None:
+    """Hysteresis loops of all presets, behind the command and behind the motor."""
+    figure, axes = plt.subplots(2, len(PRESETS), figsize=(15, 6), constrained_layout=True)
+    for (above, below), (name, gear) in zip(axes.T, PRESETS.items(), strict=True):
+        v, motor, load = quasi_static(gear)
+        for x, label in ((v, 'command'), (motor, 'motor')):
+            above.plot(x, load, label=label)
+            below.plot(x, x - load)
+        half = 0.5 * gear.scale * gear.gap
+        for y in (-half, half):
+            below.axhline(y, color='0.6', linestyle=':', zorder=0)
+        above.set_title(name)
+        below.set_xlabel('v [mm]' if gear.linear else 'v [rad]')
+    axes[0, 0].set_ylabel('load')
+    axes[1, 0].set_ylabel('v − load; gap dotted')
+    axes[0, 0].legend()
+    figure.savefig(FIGURE, dpi=80)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Measure and print, or write."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--preset', action='append', choices=PRESETS)
+    parser.add_argument('--motion', action='append', choices=MOTIONS)
+    parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
+    options = parser.parse_args()
+    presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
+    sources = parallel(
+        find, [(p, e) for p in presets for e in (False, True)], 'identification', processors()
+    )
+    cases = parallel(
+        judge, [(motion, *sources[2 * i:2 * i + 2]) for i in range(len(presets))
+                for motion in motions], 'loops', processors(),
+    )
+    found, rows, bad = found_rows(sources), rows_of(cases), wrong(cases)
+    header = ('run', 'v from', 'what')
+    print(text_table(FOUND_HEADER, found))
+    print(text_table(HEADER, rows))
+    print(text_table(header, bad))
+    if options.write:
+        draw()
+        text = '\n\n'.join([
+            markdown_table(FOUND_HEADER, found), markdown_table(HEADER, rows),
+            f'Where less than {REMOVED:.0%} is removed, or *tracking* is said with the gap off by '
+            f'more than {OFF:.0%}, on {machine()}:', markdown_table(header, bad),
+        ])
+        page = DOCUMENT.read_text()
+        DOCUMENT.write_text(MARKS.sub(lambda mark: f'{mark[1]}{text}\n{mark[2]}', page))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
