@@ -15,7 +15,7 @@ from scipy.optimize import minimize
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
 
-from gear_physics import Gear, GearPhysics
+from gear_physics import PRESETS, Gear, GearPhysics
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.controller import AdaptiveController
@@ -37,6 +37,11 @@ from backlash_ros.tools.identify.identified_file import (
 Array = NDArray[np.float64]
 Motion = Callable[[float], float]  # of the phase [rad], between -1 and 1
 
+# Options of `identify`, in the order in which its own messages propose them.
+ATTEMPTS = {
+    '': Options(), '--integrator no': Options(integrators=(False,)),
+    '--integrator no --order 1-2': Options(orders=(1, 2), integrators=(False,)),
+}
 STROKES_S = 20.0  # of the motion for identification, at most 4000 samples
 SETTLING_S = 0.5  # at rest before a record
 PERIODS, FIRST = 4, 2  # of a motion, and those of them that do not count
@@ -160,7 +165,7 @@ class Identified:
 
 
 def identified(gear: Gear, encoder: bool) -> Identified:
-    """Identify from v, or from the motor encoder; if it is not of use, once more as told to."""
+    """Identify from v, or from the motor encoder; if it is not of use, again as told to."""
     v, motor, y = record(gear)
     reach, rate = gear.scale * gear.reach, gear.scale * gear.rate
     given: dict[str, Value] = {
@@ -168,10 +173,8 @@ def identified(gear: Gear, encoder: bool) -> Identified:
         'control.rate_max': rate, 'estimator.use_applied_control': 'true' if encoder else 'false',
     }
     results = []
-    for option, integrators in (('', (False, True)), ('--integrator no', (False,))):
-        found = identify(
-            motor if encoder else v, y, gear.sample_period, Options(integrators=integrators)
-        )
+    for option, choice in ATTEMPTS.items():
+        found = identify(motor if encoder else v, y, gear.sample_period, choice)
         try:
             results.append(Identified(found, option, identified_parameters(found, given)))
         except ParameterError as error:
@@ -277,3 +280,10 @@ def coasting_way(gear: Gear, motion: str) -> float:
     speed = np.abs(np.gradient([shape(float(x)) for x in phase], phase)).max()
     speed *= 2.0 * pi * times * gear.frequency * gear.swing
     return float(0.5 * gear.total_inertia * speed**2 / gear.friction / gear.gap)
+
+
+__all__ = [
+    'MOTIONS', 'PRESETS', 'Identified', 'Run', 'close_loop', 'coasting_way', 'constant',
+    'identified', 'inertia_ratio', 'learning', 'lost_motion', 'oracle', 'quasi_static', 'record',
+    'uncompensated',
+]

@@ -18,8 +18,10 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import matplotlib as mpl
 import numpy as np
+from gear_map import map_text
 from gear_runs import (
     MOTIONS,
+    PRESETS,
     Identified,
     Run,
     close_loop,
@@ -36,9 +38,6 @@ from reporting import ROOT, machine, markdown_table, parallel, processors, text_
 
 from backlash_ros.core.estimation.protocol import Status
 
-sys.path.append(str(ROOT / 'examples'))
-from gear_physics import PRESETS
-
 mpl.use('Agg')
 import matplotlib.pyplot as plt
 
@@ -46,6 +45,7 @@ DOCUMENT = ROOT / 'docs' / 'physics.md'
 FIGURE = ROOT / 'docs' / 'images' / 'physics.png'
 MARKS = re.compile(r'(<!-- physics: made by benchmarks -->\n).*?(<!-- end -->)', re.DOTALL)
 REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
+LITTLE = 0.05  # share of the error without compensation that constants avoid: the rest is not play
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,9 @@ class Case:
     loops: tuple[Loop, Loop]  # from the command, from the motor encoder
 
     def removed(self, loop: Loop) -> float:
-        """Share of the avoidable error that is removed."""
-        return (self.none - loop.error) / (self.none - self.best)
+        """Share of the avoidable error that is removed; nan where next to none is avoidable."""
+        avoidable = self.none - self.best
+        return (self.none - loop.error) / avoidable if avoidable > LITTLE * self.none else nan
 
 
 def find(job: tuple[str, bool]) -> Source:
@@ -179,7 +180,7 @@ def wrong(cases: list[Case]) -> list[list[str]]:
         for name, loop in zip(('command', 'motor encoder'), one.loops, strict=True):
             what = []
             if not one.removed(loop) >= REMOVED:
-                what.append(f'removes {one.removed(loop):.0%}')
+                what.append(loop.problem or f'removes {one.removed(loop):.0%}')
             if loop.tracking_off > OFF:
                 what.append(f'says tracking with the gap off by {loop.tracking_off:.0%}')
             if what:
@@ -215,8 +216,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--preset', action='append', choices=PRESETS)
     parser.add_argument('--motion', action='append', choices=MOTIONS)
+    parser.add_argument('--map', type=int, metavar='CELLS', default=0,
+                        help='only the map of inertia and bandwidth, with so many cells a side')
     parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
     options = parser.parse_args()
+    if options.map:
+        print(map_text(options.map))
+        return
     presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
     sources = parallel(
         find, [(p, e) for p in presets for e in (False, True)], 'identification', processors()
