@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from math import asin, inf, pi, sin
 from pathlib import Path
@@ -164,13 +164,19 @@ class Identified:
         return '; '.join(self.found.reasons) or 'of use'
 
 
-def identified(gear: Gear, encoder: bool) -> Identified:
-    """Identify from v, or from the motor encoder; if it is not of use, again as told to."""
-    v, motor, y = record(gear)
-    reach, rate = gear.scale * gear.reach, gear.scale * gear.rate
+def identified(
+    gear: Gear, encoder: bool, rate: float = 1.0, seconds: float = STROKES_S,
+) -> Identified:
+    """Identify from v, or from the motor encoder; if it is not of use, again as told to.
+
+    rate: share of the largest speed of v at which it moves for that.
+    """
+    v, motor, y = record(replace(gear, rate=rate * gear.rate), seconds)
+    reach = gear.scale * gear.reach
     given: dict[str, Value] = {
         'sample_period': gear.sample_period, 'control.min': -reach, 'control.max': reach,
-        'control.rate_max': rate, 'estimator.use_applied_control': 'true' if encoder else 'false',
+        'control.rate_max': gear.scale * gear.rate,
+        'estimator.use_applied_control': 'true' if encoder else 'false',
     }
     results = []
     for option, choice in ATTEMPTS.items():

@@ -22,6 +22,7 @@ from gear_map import map_text
 from gear_runs import (
     MOTIONS,
     PRESETS,
+    STROKES_S,
     Identified,
     Run,
     close_loop,
@@ -37,6 +38,8 @@ from gear_runs import (
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
 
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.parameter_table import Value
+from backlash_ros.tools.configuration import parse_setting
 
 mpl.use('Agg')
 import matplotlib.pyplot as plt
@@ -86,19 +89,19 @@ class Case:
         return (self.none - loop.error) / avoidable if avoidable > LITTLE * self.none else nan
 
 
-def find(job: tuple[str, bool]) -> Source:
-    """Identify one preset."""
-    preset, encoder = job
+def find(job: tuple[str, bool, float, float]) -> Source:
+    """Identify one preset, at a share of its largest speed, within so many seconds."""
+    preset, encoder, rate, seconds = job
     v, motor, load = quasi_static(PRESETS[preset])
     return Source(
         preset, encoder, lost_motion(motor if encoder else v, load),
-        identified(PRESETS[preset], encoder),
+        identified(PRESETS[preset], encoder, rate, seconds),
     )
 
 
-def judge(job: tuple[str, Source, Source]) -> Case:
-    """All loops of one motion."""
-    motion, command, encoder = job
+def judge(job: tuple[str, Source, Source, dict[str, Value]]) -> Case:
+    """All loops of one motion, with some parameters of the file changed."""
+    motion, command, encoder, changes = job
     gear, parameters = PRESETS[command.preset], command.identified.parameters
     none = best = nan
     if parameters is not None:
@@ -106,18 +109,17 @@ def judge(job: tuple[str, Source, Source]) -> Case:
         best, _ = oracle(gear, parameters, motion, command.lost)
     return Case(
         command.preset, motion, command.lost, none, best,
-        (_loop(command, motion), _loop(encoder, motion)),
+        (_loop(command, motion, changes), _loop(encoder, motion, changes)),
     )
 
 
-def _loop(source: Source, motion: str) -> Loop:
+def _loop(source: Source, motion: str, changes: dict[str, Value]) -> Loop:
     parameters, gear = source.identified.parameters, PRESETS[source.preset]
     if parameters is None:
         return Loop(nan, nan, nan, '', source.identified.refused)
     try:
-        run = close_loop(
-            gear, learning(source.identified.found, parameters), motion, source.encoder
-        )
+        controller = learning(source.identified.found, parameters.replaced(changes))
+        run = close_loop(gear, controller, motion, source.encoder)
     except (ArithmeticError, ValueError) as error:
         return Loop(nan, nan, nan, '', str(error))
     return Loop(
@@ -216,6 +218,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--preset', action='append', choices=PRESETS)
     parser.add_argument('--motion', action='append', choices=MOTIONS)
+    parser.add_argument('--rate', type=float, default=1.0, metavar='SHARE',
+                        help='of the largest speed, for identification, as `identify --rate`')
+    parser.add_argument('--duration', type=float, default=STROKES_S, metavar='S',
+                        help='of the motion for identification')
+    parser.add_argument('--parameter', action='append', default=[], metavar='KEY=VALUE',
+                        help='change the identified file for the loops that learn')
     parser.add_argument('--map', type=int, metavar='CELLS', default=0,
                         help='only the map of inertia and bandwidth, with so many cells a side')
     parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
@@ -225,10 +233,12 @@ def main() -> None:
         return
     presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
     sources = parallel(
-        find, [(p, e) for p in presets for e in (False, True)], 'identification', processors()
+        find, [(p, e, options.rate, options.duration) for p in presets for e in (False, True)],
+        'identification', processors(),
     )
+    changes = {one.name: one.value for one in map(parse_setting, options.parameter)}
     cases = parallel(
-        judge, [(motion, *sources[2 * i:2 * i + 2]) for i in range(len(presets))
+        judge, [(motion, *sources[2 * i:2 * i + 2], changes) for i in range(len(presets))
                 for motion in motions], 'loops', processors(),
     )
     found, rows, bad = found_rows(sources), rows_of(cases), wrong(cases)
