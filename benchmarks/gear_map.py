@@ -11,7 +11,7 @@ from math import nan, pi
 
 import numpy as np
 from gear_runs import PRESETS, close_loop, identified, learning
-from reporting import parallel, processors, text_table
+from reporting import parallel, processors
 
 from backlash_ros.core.estimation.protocol import Status
 
@@ -35,7 +35,10 @@ class Cell:
 
     @property
     def text(self) -> str:
-        """Errors of the gap in %, identification then loop, and what was said."""
+        """Errors of the gap in %, by identification and by the loop; t: share of tracking.
+
+        x: identification says that it is not of use. !: wrong by more than 10 % under tracking.
+        """
         said = '' if self.usable else 'x '
         if np.isnan(self.gap):
             return f'{said}{100.0 * (self.identified - 1.0):+.0f} refused'
@@ -69,15 +72,14 @@ def cell(job: tuple[float, float]) -> Cell:
     )
 
 
-def map_text(side: int) -> str:
-    """The map as a table; x: identification says that it is not of use; !: wrong by more than 10 %
-    while tracking; t: share of tracking."""
+def map_table(side: int) -> tuple[list[str], list[list[str]]]:
+    """The map as header and rows."""
     across, down = np.geomspace(*INERTIA, side), np.geomspace(*BANDWIDTH, side)
     cells = parallel(
         cell, [(float(i), float(b)) for b in down for i in across], 'map', processors()
     )
     header = ['bandwidth', *(f'{i:.2g}' for i in across)]
-    return text_table(header, [
+    return header, [
         [f'{b:.3g}', *(one.text for one in cells[side * k:side * (k + 1)])]
         for k, b in enumerate(down)
-    ])
+    ]

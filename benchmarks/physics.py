@@ -18,9 +18,10 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import matplotlib as mpl
 import numpy as np
-from gear_map import map_text
+from gear_map import map_table
 from gear_runs import (
     MOTIONS,
+    PERIODS,
     PRESETS,
     STROKES_S,
     Identified,
@@ -46,7 +47,7 @@ import matplotlib.pyplot as plt
 
 DOCUMENT = ROOT / 'docs' / 'physics.md'
 FIGURE = ROOT / 'docs' / 'images' / 'physics.png'
-MARKS = re.compile(r'(<!-- physics: made by benchmarks -->\n).*?(<!-- end -->)', re.DOTALL)
+MARKS = r'(<!-- {}: made by benchmarks -->\n).*?(<!-- end -->)'
 REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
 LITTLE = 0.05  # share of the error without compensation that constants avoid: the rest is not play
 
@@ -99,9 +100,9 @@ def find(job: tuple[str, bool, float, float]) -> Source:
     )
 
 
-def judge(job: tuple[str, Source, Source, dict[str, Value]]) -> Case:
-    """All loops of one motion, with some parameters of the file changed."""
-    motion, command, encoder, changes = job
+def judge(job: tuple[str, Source, Source, dict[str, Value], int]) -> Case:
+    """All loops of one motion; those that learn: some parameters changed, so many periods."""
+    motion, command, encoder, changes, periods = job
     gear, parameters = PRESETS[command.preset], command.identified.parameters
     none = best = nan
     if parameters is not None:
@@ -109,17 +110,17 @@ def judge(job: tuple[str, Source, Source, dict[str, Value]]) -> Case:
         best, _ = oracle(gear, parameters, motion, command.lost)
     return Case(
         command.preset, motion, command.lost, none, best,
-        (_loop(command, motion, changes), _loop(encoder, motion, changes)),
+        (_loop(command, motion, changes, periods), _loop(encoder, motion, changes, periods)),
     )
 
 
-def _loop(source: Source, motion: str, changes: dict[str, Value]) -> Loop:
+def _loop(source: Source, motion: str, changes: dict[str, Value], periods: int) -> Loop:
     parameters, gear = source.identified.parameters, PRESETS[source.preset]
     if parameters is None:
         return Loop(nan, nan, nan, '', source.identified.refused)
     try:
         controller = learning(source.identified.found, parameters.replaced(changes))
-        run = close_loop(gear, controller, motion, source.encoder)
+        run = close_loop(gear, controller, motion, source.encoder, periods)
     except (ArithmeticError, ValueError) as error:
         return Loop(nan, nan, nan, '', str(error))
     return Loop(
@@ -213,6 +214,13 @@ def draw() -> None:
     plt.close(figure)
 
 
+def write(name: str, text: str) -> None:
+    """Put a table into the document."""
+    marks = re.compile(MARKS.format(name), re.DOTALL)
+    page = DOCUMENT.read_text()
+    DOCUMENT.write_text(marks.sub(lambda mark: mark[1] + text + mark[2], page))
+
+
 def main() -> None:
     """Measure and print, or write."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -222,6 +230,7 @@ def main() -> None:
                         help='of the largest speed, for identification, as `identify --rate`')
     parser.add_argument('--duration', type=float, default=STROKES_S, metavar='S',
                         help='of the motion for identification')
+    parser.add_argument('--periods', type=int, default=PERIODS, help='of the motion')
     parser.add_argument('--parameter', action='append', default=[], metavar='KEY=VALUE',
                         help='change the identified file for the loops that learn')
     parser.add_argument('--map', type=int, metavar='CELLS', default=0,
@@ -229,7 +238,10 @@ def main() -> None:
     parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
     options = parser.parse_args()
     if options.map:
-        print(map_text(options.map))
+        header, rows = map_table(options.map)
+        print(text_table(header, rows))
+        if options.write:
+            write('physics_map', f'{markdown_table(header, rows)}\n')
         return
     presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
     sources = parallel(
@@ -238,8 +250,8 @@ def main() -> None:
     )
     changes = {one.name: one.value for one in map(parse_setting, options.parameter)}
     cases = parallel(
-        judge, [(motion, *sources[2 * i:2 * i + 2], changes) for i in range(len(presets))
-                for motion in motions], 'loops', processors(),
+        judge, [(motion, *sources[2 * i:2 * i + 2], changes, options.periods)
+                for i in range(len(presets)) for motion in motions], 'loops', processors(),
     )
     found, rows, bad = found_rows(sources), rows_of(cases), wrong(cases)
     header = ('run', 'v from', 'what')
@@ -253,8 +265,7 @@ def main() -> None:
             f'Where less than {REMOVED:.0%} is removed, or *tracking* is said with the gap off by '
             f'more than {OFF:.0%}, on {machine()}:', markdown_table(header, bad),
         ])
-        page = DOCUMENT.read_text()
-        DOCUMENT.write_text(MARKS.sub(lambda mark: f'{mark[1]}{text}\n{mark[2]}', page))
+        write('physics', f'{text}\n')
 
 
 if __name__ == '__main__':

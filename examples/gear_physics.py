@@ -69,17 +69,19 @@ class Gear:
 
     def with_settings(self, settings: list[str]) -> Gear:
         """The same with KEY=VALUE changed. Raises ValueError: no such key, or not its type."""
-        gear = self
+        names = [one.name for one in fields(self) if isinstance(getattr(self, one.name), float)]
+        changes = {}
         for setting in settings:
             key, _, text = setting.partition('=')
-            kinds = {one.name: type(getattr(self, one.name)) for one in fields(self)}
-            if key not in kinds or kinds[key] is not float:
+            try:
+                changes[key] = float(text)
+            except ValueError:
+                key = ''
+            if key not in names:
                 raise ValueError(
-                    f'{setting}: must be KEY=NUMBER, KEY one of '
-                    + ', '.join(name for name, kind in kinds.items() if kind is float)
+                    f'{setting!r} must be KEY=NUMBER, KEY one of {", ".join(names)}'
                 )
-            gear = replace(gear, **{key: float(text)})
-        return gear
+        return replace(self, **changes)
 
 
 PRESETS = {
