@@ -289,7 +289,8 @@ def coasting_way(gear: Gear, motion: str) -> float:
 
 
 __all__ = [
-    'MOTIONS', 'PERIODS', 'PRESETS', 'STROKES_S', 'Identified', 'Run', 'close_loop', 'coasting_way', 'constant',
+    'MOTIONS', 'PERIODS', 'PRESETS', 'STROKES_S', 'Identified', 'Run', 'close_loop',
+    'coasting_way', 'constant',
     'identified', 'inertia_ratio', 'learning', 'lost_motion', 'oracle', 'quasi_static', 'record',
     'uncompensated',
 ]
