@@ -64,7 +64,10 @@ def cell(job: tuple[float, float]) -> Cell:
     usable = found.usable and not source.refused
     if source.parameters is None:
         return Cell(inertia, bandwidth, False, found.gap / lost, nan, nan, nan)
-    run = close_loop(gear, learning(found, source.parameters), 'sine')
+    try:
+        run = close_loop(gear, learning(found, source.parameters), 'sine')
+    except (ArithmeticError, ValueError):  # a ParameterError is one
+        return Cell(inertia, bandwidth, False, found.gap / lost, nan, nan, nan)
     tracking = float(np.mean(run.status[run.first:] == Status.TRACKING))
     return Cell(
         inertia, bandwidth, usable, found.gap / lost, float(run.gap[-1]) / lost,
