@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from backlash_ros.core.estimation.constants import BY_CHANCE, NO_GAP, PRECISE_GAP, PRECISE_SLOPE
 from backlash_ros.core.estimation.crossings import Crossings
+from backlash_ros.core.estimation.prior import Prior
 from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.relabelling import Fitted
 
@@ -27,11 +28,20 @@ def usable(result: Fitted, bounds: Bounds, share: float = 1.0) -> Crossings | No
 
 
 def is_precise(found: Crossings, swing: float, share: float = 1.0) -> bool:
-    """Whether slope and gap are known well enough where v swings by so much; share: as above."""
+    """Whether slope and crossings are known well enough where v swings by so much; share: above."""
     return (
         found.std_m <= share * PRECISE_SLOPE * found.m
-        and found.std_gap <= share * largest_gap_std(found.gap, swing)
+        and max(found.std_gap, found.std_c_r, found.std_c_l)
+        <= share * largest_gap_std(found.gap, swing)
     )
+
+
+def differs(found: Crossings, prior: Prior) -> bool:
+    """Whether slope or crossings are further from a prior than an estimate may be uncertain."""
+    m, product_r, product_l = map(float, prior.theta)
+    c_r, c_l = product_r / m, product_l / m
+    furthest = max(abs(found.c_r - c_r), abs(found.c_l - c_l))
+    return abs(found.m - m) > PRECISE_SLOPE * m or furthest > PRECISE_GAP * (c_r - c_l)
 
 
 def largest_gap_std(gap: float, swing: float) -> float:

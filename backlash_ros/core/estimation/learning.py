@@ -13,7 +13,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.acceptance import is_precise, usable
+from backlash_ros.core.estimation.acceptance import differs, is_precise, usable
 from backlash_ros.core.estimation.constants import (
     BLOCK,
     FIRST_SEARCH,
@@ -158,16 +158,22 @@ class Learning:
         )
 
     def confirm(self) -> bool:
-        """Ask the samples alone about what was learned before; return whether they deny it."""
-        prior, fit = self.unconfirmed, self.fit.fit
-        if prior is None:
+        """Ask the samples alone about what was learned before; return whether they deny it.
+
+        They deny what is off by more than an estimate may be uncertain at all. What contradicts
+        them by less is neither denied nor confirmed: in a plant that is no backlash and no linear G
+        they may be as wrong. So may they where something else moves y.
+        """
+        prior, (fit, solution, _) = self.unconfirmed, self.fit
+        if prior is None or solution.moved_otherwise or self.around.walk > 0.0:
             return False
         alone = fit.solve(alone=True)
         found = alone.crossings
-        if found is None:
+        if found is None or not is_precise(found, fit.swing):
             return False
-        denied = is_precise(found, fit.swing) and contradicts(alone.of_theta, prior)
-        if denied or is_precise(found, fit.swing, REPLACING):
+        contradicted = contradicts(alone.of_theta, prior)
+        denied = contradicted and differs(found, prior)
+        if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
             self.unconfirmed = None
         return denied
 

@@ -107,8 +107,9 @@ class MovingHorizon:
     @property
     def proposal(self) -> StateModel | None:
         """The G that was learned where it is another one than `model`."""
-        learned = self.learned_model
-        known = self._learning.current is not None
+        learning, learned = self._learning, self.learned_model
+        # That of a fit which is not believed is no better than the one in use.
+        known = learning.current is not None and learning.reason is not Status.INCONSISTENT
         return learned if known and learned is not self.model else None
 
     @property
