@@ -208,7 +208,8 @@ def test_search_and_fit_learn_the_backlash_through_a_wrong_model(
     assert result.solution.gap == pytest.approx(truth.gap, rel=0.02)
     assert result.solution.m == pytest.approx(truth.m, rel=0.02)
     if ratio != 1.0:
-        assert result.around.model is not around(0.2).model
+        # Whether G moves or its error terms say so is up to the evidence.
+        assert max(result.around.scale, result.solution.posterior.scale) > 0.1
 
 
 def test_a_constant_u_is_no_backlash() -> None:
