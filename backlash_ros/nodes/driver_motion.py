@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.controller import plausible
 from backlash_ros.core.estimation.record_description import RecordFit
 from backlash_ros.core.estimation.record_fit import fit_record
-from backlash_ros.core.identification.intervals import v_of_intervals
+from backlash_ros.core.identification.intervals import REPORTED, v_of_intervals
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.transfer_function import TransferFunction
 from backlash_ros.nodes.command_history import ReportUse, report_use
@@ -46,7 +46,6 @@ ALTERED = 0.02  # of the swing of v: applied_control that differs by more was li
 ALTERED_SHARE = 0.05  # of the samples
 MORE_DELAY = 8  # samples that are tried beyond the expected delay
 FAR = 2.0  # times plant.uncertainty; an error of G beyond may be that of its sample period
-REPORTED = 0.9  # share of the samples that applied_control has to report
 
 
 @dataclass

@@ -111,7 +111,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
             and whole.fit.misfit(whole.solution, since - record.first) <= MISFIT:
         return learning.go_on_from(whole, record.first)
     # What is known from elsewhere may have changed before the record began.
-    earliest = [record.first] if around.prior is not learning.around.prior else []
+    earliest = [record.first] if learning.around.prior is not None else []
     before, learning.changed = learning.changed, None
     changes = []
     for first in (*earliest, since, (since + end) // 2):

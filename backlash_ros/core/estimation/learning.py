@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from math import inf
 
 import numpy as np
@@ -37,6 +38,14 @@ Array = NDArray[np.float64]
 Task = Generator[None, None, bool]
 
 CAPACITY = 2 * LONGEST  # samples kept: those that are fitted, and those that come meanwhile
+
+
+class Belief(Enum):
+    """Whether a fit is believed: it takes the place of the estimate, adds nothing to it, or not."""
+
+    REPLACES = auto()
+    AGREES = auto()
+    REFUSED = auto()
 
 
 @dataclass
@@ -133,29 +142,30 @@ class Learning:
         """The crossings of a fit that is precise enough, see acceptance.py."""
         return usable(result, self.bounds, share)
 
-    def believable(self, found: Crossings, estimate: Estimate, held: Array | None) -> bool:
-        """Whether a fit may take the place of the estimate that held so far.
+    def judged(self, found: Crossings | None, estimate: Estimate, held: Array | None) -> Belief:
+        """What becomes of a fit beside the estimate that held so far.
 
-        found: what the fit says. held: covariance (3, 3) of that estimate. Few samples can be
-        fitted by a backlash that never was, and so can many where y moves otherwise: after a
-        contradiction a fit has to foretell some, before it says something else or says it less
-        precisely.
+        found: what the fit says, None if it is of no use. held: covariance (3, 3) of that estimate.
+        Few samples can be fitted by a backlash that never was, and so can many where y moves
+        otherwise: after a contradiction a fit has to foretell some, before it says something else
+        or says it less precisely.
         """
+        if found is None:
+            return Belief.REFUSED
         if held is None:
-            return True
+            return Belief.REPLACES
         proven = self.consistent >= RECOVERED
         otherwise = self.fit.solution.moved_otherwise
         if beyond_chance(difference(found, estimate), found.cov + held):
-            return proven and not (otherwise and self.around.error.count == 0)
+            sure = proven and not (otherwise and self.around.error.count == 0)
+            return Belief.REPLACES if sure else Belief.REFUSED
         if otherwise and not self.expects_changes:
-            return bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
-        return proven or not np.any(np.diag(found.cov) > np.diag(held))
-
-    def agrees(self, found: Crossings, estimate: Estimate, held: Array | None) -> bool:
-        """Whether a fit that has foretold some samples says what is known already; as above."""
-        return held is not None and self.consistent >= RECOVERED and not beyond_chance(
-            difference(found, estimate), found.cov + held
-        )
+            sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
+        else:
+            sure = proven or not np.any(np.diag(found.cov) > np.diag(held))
+        if sure:
+            return Belief.REPLACES
+        return Belief.AGREES if proven else Belief.REFUSED
 
     def confirm(self) -> bool:
         """Ask the samples alone about what was learned before; return whether they deny it.

@@ -25,7 +25,7 @@ from backlash_ros.core.estimation.constants import (
 from backlash_ros.core.estimation.crossings import Crossings
 from backlash_ros.core.estimation.error_model import build_error_model
 from backlash_ros.core.estimation.learned_error import response_std
-from backlash_ros.core.estimation.learning import CAPACITY, Learning, Task
+from backlash_ros.core.estimation.learning import CAPACITY, Belief, Learning, Task
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
 from backlash_ros.core.estimation.schedule import next_task
 from backlash_ros.core.estimation.solution import SMALLEST_NOISE, Around
@@ -283,24 +283,21 @@ class MovingHorizon:
         """Make the newest fit the estimate where it is good enough, and go on from its state."""
         learning = self._learning
         current = learning.fit
-        found = learning.usable(current)
         if learning.confirm():
             # The estimate was that of another plant.
             learning.begin_acquisition(None)
             learning.reason, self.covariance = Status.INCONSISTENT, None
             return
-        believed = found is not None and learning.believable(found, self.estimate, self.covariance)
-        if found is not None and believed:
+        found = learning.usable(current)
+        belief = learning.judged(found, self.estimate, self.covariance)
+        if belief is Belief.REPLACES and found is not None:
             self._take_over(found)
-        agrees = believed or (
-            found is not None and learning.agrees(found, self.estimate, self.covariance)
-        )
-        if agrees and learning.contradicted_from is None:
-            learning.reason = Status.TRACKING
-        elif not agrees:
+        if belief is Belief.REFUSED:
             learning.reason = Status.INCONSISTENT
             if not self._following.begun:
                 return
+        elif learning.contradicted_from is None:
+            learning.reason = Status.TRACKING
         self._following.follow(current, self.estimate, learning.record)
 
     def _take_over(self, found: Crossings) -> None:

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]  # [ns], of one clock
 
+REPORTED = 0.9  # share of the samples that reports have to tell of to be believed
+
 
 def v_of_intervals(
     index: NDArray[np.int64], output_ns: Stamps, command_ns: Stamps, v: Array, reported: bool,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.bags.content import is_bag
-from backlash_ros.core.identification.intervals import v_of_intervals
+from backlash_ros.core.identification.intervals import REPORTED, v_of_intervals
 from backlash_ros.tools.bag_reading import read_plain_numbers
 from backlash_ros.tools.bag_sections import WHOLE, Span, choose_namespace
 from backlash_ros.tools.errors import InputError
@@ -25,7 +25,6 @@ Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values
 
 COLUMNS = ('t', 'v', 'y')
 OFF_GRID = 0.25  # of a period that a row of a CSV may miss its time
-REPORTED = 0.9  # share of the samples that applied_control has to report to be believed
 # Of a sample period: a stamp that is later is that of the next sample, and the clock of the driver
 # is slower by this per sample at most.
 LATEST, CLOCK_SLACK = 0.85, 0.01
