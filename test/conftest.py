@@ -37,8 +37,15 @@ def pytest_configure() -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Put tests with processes at the end: beside each other, not beside those that compute."""
+    """Put tests with processes at the end: beside each other, not beside those that compute.
+
+    They run against the clock of a machine that they do not have to themselves, so each may be
+    run once again, as `colcon test --retest-until-pass 1` does; the summary names those that were.
+    """
     items.sort(key=_starts_processes)
+    for item in items:
+        if _starts_processes(item):
+            item.add_marker(pytest.mark.flaky(reruns=1))
     if config.pluginmanager.hasplugin('xdist'):
         for item in items:
             if item.path.stem in SHARE_RUNS:

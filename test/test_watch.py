@@ -146,11 +146,12 @@ def test_a_subscriber_hears_the_estimates_of_its_controller(tmp_path: Path) -> N
         for label, messages in heard.items():
             # A driver that was held up finds what has come meanwhile.
             assert len(messages) - counted[label] <= 1.5 * passed_s / PERIOD_S, label
+        # A machine that is held up makes commands late, which the estimate takes some time to see.
+        driver.run_until(lambda: heard['status'][-1].data == Status.TRACKING, 'the status')
         newest = {label: messages[-1].data for label, messages in heard.items()}
         known = driver.estimate()
         assert newest['m'] == pytest.approx(known['m'], rel=0.05)
         assert newest['m_low'] < newest['m'] < newest['m_high']
         assert newest['gap'] == pytest.approx(known['c_r'] - known['c_l'], rel=0.05)
-        assert newest['status'] == Status.TRACKING
         assert newest['v'] in [message.data for message in driver.controls]
         assert controller.stop() == 0
