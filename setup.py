@@ -15,7 +15,7 @@ setup(
     maintainer_email='maintainers@example.org',
     license='Apache-2.0',
     packages=find_packages(exclude=['test*']),
-    package_data={PACKAGE: ['loopback.xml']},
+    package_data={f'{PACKAGE}.middleware': ['loopback.xml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -30,20 +30,22 @@ setup(
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
     install_requires=['matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm'],
-    extras_require={'test': ['hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout']},
+    extras_require={'test': [
+        'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-rerunfailures', 'pytest-timeout',
+    ]},
     entry_points={
         'console_scripts': [
             f'controller = {PACKAGE}.nodes.controller:main',
             f'plant = {PACKAGE}.nodes.plant:main',
             f'reference = {PACKAGE}.nodes.reference:main',
             f'recorder = {PACKAGE}.nodes.recorder:main',
-            f'bringup = {PACKAGE}.tools.bringup:main',
-            f'simulate = {PACKAGE}.tools.simulate:main',
-            f'report = {PACKAGE}.tools.report:main',
-            f'compare = {PACKAGE}.tools.compare:main',
+            f'bringup = {PACKAGE}.tools.bringup.command:main',
+            f'simulate = {PACKAGE}.tools.simulate.command:main',
+            f'report = {PACKAGE}.tools.report.command:main',
+            f'compare = {PACKAGE}.tools.compare.command:main',
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
             f'identify = {PACKAGE}.tools.identify.command:main',
-            f'replay = {PACKAGE}.tools.replay:main',
+            f'replay = {PACKAGE}.tools.replay.command:main',
             f'monitor = {PACKAGE}.nodes.monitor.command:main',
         ],
     },

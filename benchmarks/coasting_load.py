@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from math import copysign, pi
 
-from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.plant.backlash import Backlash
 
 STEP_S = 0.25e-3  # of the integration
 

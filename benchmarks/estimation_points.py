@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from reporting import Check, parallel
 from scipy.special import chdtri
 
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 Array = NDArray[np.float64]
 

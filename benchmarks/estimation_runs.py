@@ -11,12 +11,12 @@ from cramer_rao import cramer_rao
 from numpy.typing import NDArray
 from random_cases import Case, bound_of, random_case, uncertain_case
 
-from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
-from backlash_ros.core.controller import Limits
-from backlash_ros.core.estimation.moving_horizon import MovingHorizon
+from backlash_ros.core.control.controller import Limits
+from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Estimator, Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import RunRecord
+from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
 
 Array = NDArray[np.float64]
 

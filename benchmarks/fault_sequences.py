@@ -19,14 +19,14 @@ from backlash_ros.core.assembly import (
     build_true_model,
     law_fits,
 )
-from backlash_ros.core.controller import ControlStep, Limits
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.control.controller import ControlStep, Limits
+from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
+from backlash_ros.core.control.structure import LARGEST_FEEDBACK
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.proportional import LARGEST_F_OVER_M
-from backlash_ros.core.structure import LARGEST_FEEDBACK
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 PERIOD_S = 0.01
 SAMPLES = (300, 800)

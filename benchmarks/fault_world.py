@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core.loop.output import Output
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.driver_io import Output
 
 START_NS = 1_800_000_000_000_000_000
 TRANSIT = 0.05  # of a period: how long a message is under way

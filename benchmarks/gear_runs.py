@@ -18,8 +18,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
 from gear_physics import PRESETS, Gear, GearPhysics
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.controller import AdaptiveController
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.identification.identification import (
     Identification,
@@ -27,8 +26,9 @@ from backlash_ros.core.identification.identification import (
     identify,
 )
 from backlash_ros.core.identification.motion import strokes
-from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import Value
 from backlash_ros.tools.identify.identified_file import (
     as_estimate,
     identified_parameters,

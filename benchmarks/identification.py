@@ -22,13 +22,13 @@ from reporting import ROOT, machine, markdown_table, parallel, processors, text_
 from scipy.stats import chi2
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.identification.identification import Identification, identify
 from backlash_ros.core.identification.uncertainty import crossings_covariance, response
-from backlash_ros.core.metrics import delayed_tracking_error_rms
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.metrics import delayed_tracking_error_rms
 from backlash_ros.tools.identify.identified_file import as_estimate, identified_parameters
 
 DOCUMENT = ROOT / 'docs' / 'identification.md'

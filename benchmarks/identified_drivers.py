@@ -21,9 +21,9 @@ from pathlib import Path
 from reporting import ROOT, machine, markdown_table, text_table
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.metrics import delayed_tracking_error_rms
-from backlash_ros.tools.processes import child_environment, free_domain
-from backlash_ros.tools.report import open_source
+from backlash_ros.core.simulation.metrics import delayed_tracking_error_rms
+from backlash_ros.tools.bringup.processes import child_environment, free_domain
+from backlash_ros.tools.report.command import open_source
 
 EXAMPLES = ROOT / 'examples'
 DOCUMENT = ROOT / 'docs' / 'identification.md'
@@ -103,7 +103,7 @@ def identified(subject: Subject, folder: Path) -> float:
             stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
         )
         try:
-            run([sys.executable, '-m', 'backlash_ros.tools.identify.command', '--drive',
+            run([sys.executable, '-m', 'backlash_ros.tools.identify', '--drive',
                  '--config', str(subject.limits), '--duration', DRIVE_S,
                  '--out', str(folder / 'identified')], folder, domain)
         finally:

@@ -38,7 +38,7 @@ from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.loopback import prefer_loopback
+from backlash_ros.middleware.loopback import prefer_loopback
 
 Array = NDArray[np.float64]
 

@@ -26,10 +26,10 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.parameter_table import CONTROLLER, PARAMETERS
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.loopback import prefer_loopback
-from backlash_ros.tools.processes import (
+from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
+from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.tools.bringup.processes import (
     ProcessPlan,
     ProcessSupervisor,
     child_environment,

@@ -39,8 +39,8 @@ from gear_runs import (
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
 
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.parameter_table import Value
-from backlash_ros.tools.configuration import parse_setting
+from backlash_ros.core.parameters.table import Value
+from backlash_ros.tools.config.configuration import parse_setting
 
 mpl.use('Agg')
 import matplotlib.pyplot as plt

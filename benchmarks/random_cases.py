@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.assembly import build_true_model
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from reporting import Check
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.loopback import prefer_loopback
+from backlash_ros.middleware.loopback import prefer_loopback
 
 PERIOD_S = 0.005
 DRIVERS: dict[str, dict[str, object]] = {

@@ -23,8 +23,8 @@ from loop_latency import LATENCY_HEADER, RATES_HZ
 from reporting import CHECK_HEADER, ROOT, Check, machine, markdown_table, text_table
 from step_times import LAWS, MISSING, STEP_HEADER
 
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 DOCUMENT = ROOT / 'docs' / 'performance.md'
 DURATION_S = 20.0

@@ -26,7 +26,7 @@ from reporting import CHECK_HEADER, Check, text_table
 from scipy import linalg, signal
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.processes import Child, ProcessSupervisor
+from backlash_ros.tools.bringup.processes import Child, ProcessSupervisor
 
 PERIOD_S = 1e-3
 LATENCY_LIMIT = 1.5  # of p99

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from reporting import Check
 
 from backlash_ros.core.assembly import law_fits
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 try:
     from filterpy.kalman import KalmanFilter  # type: ignore[import-untyped]

@@ -34,18 +34,18 @@ from random_cases import random_case  # noqa: E402
 from scipy import signal  # noqa: E402
 
 from backlash_ros.core.assembly import build_model  # noqa: E402
-from backlash_ros.core.closed_loop import build_closed_loop  # noqa: E402
-from backlash_ros.core.metrics import (  # noqa: E402
+from backlash_ros.core.parameters import Parameters  # noqa: E402
+from backlash_ros.core.reference.signal import ReferenceSignal  # noqa: E402
+from backlash_ros.core.simulation.closed_loop import build_closed_loop  # noqa: E402
+from backlash_ros.core.simulation.metrics import (  # noqa: E402
     delayed_reference,
     delayed_tracking_error_rms,
     gap_crossings_per_reversal,
     total_variation,
     turns,
 )
-from backlash_ros.core.parameters import Parameters  # noqa: E402
-from backlash_ros.core.reference_signal import ReferenceSignal  # noqa: E402
-from backlash_ros.core.run_record import COLUMNS, RunRecord  # noqa: E402
-from backlash_ros.tools.command_line import format_table  # noqa: E402
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord  # noqa: E402
+from backlash_ros.tools.cli.command_line import format_table  # noqa: E402
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from backlash_ros.core.assembly import build_reference, build_true_model
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.configuration import effective_parameters
+from backlash_ros.tools.config.configuration import effective_parameters
 
 Case = TypeVar('Case')
 

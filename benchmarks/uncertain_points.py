@@ -27,7 +27,7 @@ from uncertain_runs import DEVIATIONS, Figures, run_job
 
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.configuration import effective_parameters
+from backlash_ros.tools.config.configuration import effective_parameters
 
 Array = NDArray[np.float64]
 

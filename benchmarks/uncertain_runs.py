@@ -12,11 +12,11 @@ from scipy.signal import lfilter
 from uncertain_cases import Job
 
 from backlash_ros.core.assembly import build_plant, build_true_model
-from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.reference_signal import ReferenceSignal
-from backlash_ros.core.run_record import RunRecord
+from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
 
 Array = NDArray[np.float64]
 

@@ -38,8 +38,8 @@ from rclpy.node import Node
 from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
 
 from backlash_ros import topics
-from backlash_ros.loopback import prefer_loopback
-from backlash_ros.tools.processes import child_environment, free_domain
+from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
 CONFIG = ROOT / 'config' / 'geared_motor.yaml'
 BOUND_S = 3.0

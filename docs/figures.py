@@ -18,10 +18,9 @@ from matplotlib.figure import Figure
 from runs import WITHOUT, simulate
 from tables import TABLES
 
-from backlash_ros.core.metrics import delayed_reference
-from backlash_ros.core.run_record import RunRecord
-from backlash_ros.tools.analysis import compare_laws, interesting_parts
-from backlash_ros.tools.drawing import (
+from backlash_ros.core.simulation.metrics import delayed_reference
+from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools.pages.drawing import (
     COLOURS,
     ESTIMATES,
     STYLES,
@@ -36,7 +35,8 @@ from backlash_ros.tools.drawing import (
     shade,
     zero_line,
 )
-from backlash_ros.tools.figures import draw_hysteresis, draw_laws
+from backlash_ros.tools.report.analysis import compare_laws, interesting_parts
+from backlash_ros.tools.report.figures import draw_hysteresis, draw_laws
 
 DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / 'images'

@@ -5,12 +5,12 @@ from __future__ import annotations
 from math import isfinite
 from pathlib import Path
 
-from backlash_ros.core.parameter_table import PARAMETERS, Parameter, as_yaml
+from backlash_ros.core.parameters.table import PARAMETERS, Parameter, as_yaml
 
 PAGE = Path(__file__).with_name('parameters.md')
 HEAD = """# Parameters
 
-Made from [parameter_table.py](../backlash_ros/core/parameter_table.py) by `make docs`; do not edit.
+Made from [table.py](../backlash_ros/core/parameters/table.py) by `make docs`; do not edit.
 The nodes, `bringup` and `simulate` all read one YAML file:
 [paper_example.yaml](../config/paper_example.yaml) shows every group.
 `y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in

@@ -7,12 +7,12 @@ from math import isfinite, sin
 
 import numpy as np
 
-from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.structure import Situation
 from backlash_ros.core.estimation.baselines.printed_law import printed_c, printed_f, printed_m
 from backlash_ros.core.estimation.protocol import Bounds, Estimate
-from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.proportional import Proportional
-from backlash_ros.core.structure import Situation
+from backlash_ros.core.plant.backlash import Backlash
 
 PERIOD = 0.01
 TRUE = (1.3, 3.0, -3.0)

@@ -9,10 +9,11 @@ from pathlib import Path
 
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import RunRecord
-from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.tools.configuration import effective_parameters
-from backlash_ros.tools.simulation import prepare, run_loop
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.simulate.simulation import run_loop
 
 # No compensation: the inverse is told that there is no gap, and learns nothing.
 WITHOUT = {
@@ -42,7 +43,7 @@ def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: st
     parameters = effective_parameters(
         Path(config) if config else None, [f'{name}={value}' for name, value in settings]
     )
-    loop = prepare(parameters)
+    loop = build_closed_loop(parameters)
     record = run_loop(loop, round(duration / parameters.real('sample_period')))
     learned = loop.controller.adopted
     model = build_model(parameters) if learned is None else learned.transfer_function

@@ -20,10 +20,10 @@ from runs import simulate
 
 from backlash_ros.core.assembly import build_model, build_true_model
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.metrics import control_error_rms, settling_time
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import RunRecord
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
+from backlash_ros.core.simulation.run_record import RunRecord
 
 NAMES = ('m', 'c_r', 'c_l')
 SECONDS = 10.0
@@ -220,8 +220,9 @@ def estimator_constants() -> str:
 def estimator_details() -> str:
     """The guards and the structure of single computations of the method."""
     rows: list[tuple[str, str, str, str, str]] = []
-    for path in sorted(ESTIMATION.glob('*.py')):
-        if path.name not in OF_EVERY_LAW and path != CONSTANTS:
+    for path in sorted(ESTIMATION.rglob('*.py'), key=lambda path: path.name):
+        of_the_law = path.name not in OF_EVERY_LAW and path.parent.name != 'baselines'
+        if of_the_law and path != CONSTANTS:
             link = f'[{path.name}](../{path.relative_to(ROOT)})'
             rows += [
                 (kind, f'`{name}`', value, what, link)

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from rosbags.highlevel import AnyReader
 
-from backlash_ros.tools import bringup
+from backlash_ros.tools.bringup import command as bringup
 
 DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
 

@@ -8,7 +8,7 @@ import pytest
 from bringup_processes import Session, bringup_sessions
 from hypothesis import HealthCheck, settings
 
-from backlash_ros.tools import report
+from backlash_ros.tools.report import command as report
 
 settings.register_profile(
     'repeatable', derandomize=True, database=None, deadline=None, max_examples=60,

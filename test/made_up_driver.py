@@ -8,10 +8,10 @@ import numpy as np
 from scipy.signal import cont2discrete
 
 from backlash_ros.core.assembly import build_plant
+from backlash_ros.core.driver_check.findings import FLOAT64, WRONG, Finding, Graph, Heard, Message
+from backlash_ros.core.driver_check.gentle_drive import GentleDrive, Range
+from backlash_ros.core.driver_check.verdict import judge
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.driver_findings import FLOAT64, WRONG, Finding, Graph, Heard, Message
-from backlash_ros.nodes.driver_verdict import judge
-from backlash_ros.nodes.gentle_drive import GentleDrive, Range
 
 PERIOD_S = 0.04  # long enough that a busy machine does not disturb it
 NATURAL = 2.0 * pi * 2.0  # rad/s

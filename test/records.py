@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
-from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 

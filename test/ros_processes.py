@@ -22,8 +22,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from backlash_ros.loopback import prefer_loopback
-from backlash_ros.tools.processes import child_environment, free_domain
+from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
 prefer_loopback(os.environ)  # the nodes of the tests themselves
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 PAPER_NUMERATOR = (1e-5, 4e-5, 1e-5)
 PAPER_DENOMINATOR = (1.0, -2.88504, 2.77196, -0.88692)

@@ -26,7 +26,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from backlash_ros.bags.content import BagError
 from backlash_ros.bags.remains import damage, open_remains
 from backlash_ros.bags.repair import repair, repair_command
-from backlash_ros.nodes.bag import STORAGE, Bag
+from backlash_ros.bags.writer import STORAGE, Bag
 
 ROOT = Path(__file__).resolve().parents[1]
 DEADLINE_S = 60.0
@@ -39,7 +39,7 @@ MAGIC = b'\x89MCAP0\r\n'
 # Writes without end, and tells after each flush what is safe.
 WRITER = """
 import itertools, struct, sys
-from backlash_ros.nodes.bag import Bag
+from backlash_ros.bags.writer import Bag
 bag = Bag(sys.argv[1], sys.argv[2])
 number = bag.add_topic('/number', 'std_msgs/msg/Float64')
 for i in itertools.count():

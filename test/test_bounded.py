@@ -18,19 +18,20 @@ from backlash_ros.core.assembly import (
     build_reference,
     law_fits,
 )
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.controller import AdaptiveController, Limits
+from backlash_ros.core.control.controller import AdaptiveController, Limits
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.last_command import last_commands
+from backlash_ros.core.control.pole_placement import PolePlacement
+from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.structure import LARGEST_CAREFUL, LARGEST_FEEDBACK, Structure
+from backlash_ros.core.control.tracking.design import Weights, design
+from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
-from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.last_command import last_commands
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.pole_placement import PolePlacement, place_poles
-from backlash_ros.core.proportional import Proportional
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import LARGEST_CAREFUL, LARGEST_FEEDBACK, Structure
-from backlash_ros.core.tracking import Tracking
-from backlash_ros.core.tracking_design import Weights, design
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.plant.four_blocks import place_poles
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 SAMPLES = 600
 # What becomes of y on the way to the controller, given y and the sample.

@@ -19,11 +19,12 @@ import yaml
 from bringup_processes import Session, bag_counts, marked_processes, wait_until
 
 from backlash_ros import topics
-from backlash_ros.tools import bringup, processes, supervision
-from backlash_ros.tools.configuration import effective_parameters
-from backlash_ros.tools.processes import ProcessPlan, ProcessSupervisor, child_environment
-from backlash_ros.tools.progress import ProgressDisplay, describe
-from backlash_ros.tools.run_plan import AxisPlan, RunPlan
+from backlash_ros.tools.bringup import command as bringup
+from backlash_ros.tools.bringup import processes, supervision
+from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor, child_environment
+from backlash_ros.tools.bringup.progress import ProgressDisplay, describe
+from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
+from backlash_ros.tools.config.configuration import effective_parameters
 
 NODES = ('controller', 'plant', 'recorder', 'reference')
 
@@ -174,7 +175,7 @@ def test_bad_input_is_refused_in_one_line_before_anything_is_made(
 
 def test_ctrl_c_is_heard_before_the_libraries_are_loaded() -> None:
     code = (
-        'import sys, backlash_ros.tools.bringup as b; b.parse_options([]);'
+        'import sys, backlash_ros.tools.bringup.command as b; b.parse_options([]);'
         'sys.exit(bool({"numpy", "scipy", "rosbags"} & set(sys.modules)))'
     )
     root = Path(bringup.__file__).resolve().parents[2]

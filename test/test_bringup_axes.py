@@ -15,10 +15,10 @@ import pytest
 import yaml
 from bringup_processes import Session, bag_counts
 
-from backlash_ros.tools import bringup
-from backlash_ros.tools.orchestrator import prepare
-from backlash_ros.tools.progress import ProgressDisplay
-from backlash_ros.tools.run_plan import RunPlan, plan_processes
+from backlash_ros.tools.bringup import command as bringup
+from backlash_ros.tools.bringup.orchestrator import prepare
+from backlash_ros.tools.bringup.progress import ProgressDisplay
+from backlash_ros.tools.bringup.run_plan import RunPlan, plan_processes
 
 CONFIG = Path(__file__).resolve().parents[1] / 'config' / 'two_axes.yaml'
 TRUTH = {'pan': (1.3, 3.0, -3.0), 'tilt': (0.8, 1.0, -2.0)}

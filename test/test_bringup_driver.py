@@ -14,16 +14,16 @@ import pytest
 from bringup_processes import DEADLINE_S, Session, wait_until
 from ros_processes import ros_world
 
-from backlash_ros.tools import processes, supervision
-from backlash_ros.tools.configuration import effective_parameters
-from backlash_ros.tools.processes import (
+from backlash_ros.tools.bringup import processes, supervision
+from backlash_ros.tools.bringup.processes import (
     ProcessPlan,
     ProcessSupervisor,
     child_environment,
     foreign_environment,
 )
-from backlash_ros.tools.progress import ProgressDisplay
-from backlash_ros.tools.run_plan import AxisPlan, RunPlan, plan_processes
+from backlash_ros.tools.bringup.progress import ProgressDisplay
+from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan, plan_processes
+from backlash_ros.tools.config.configuration import effective_parameters
 
 PLANT = f'{shlex.quote(sys.executable)} -m backlash_ros.nodes.plant'
 # Begins when controller, reference and recorder listen, so that nothing of it goes unrecorded.

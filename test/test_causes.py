@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.nodes.causes import (
+from backlash_ros.core.loop.causes import (
     LONGEST_TEXT,
     STATES,
     UNNAMED,

@@ -19,8 +19,8 @@ from ros_processes import Probe, wait_until
 from std_msgs.msg import Float64
 
 from backlash_ros.nodes.check_driver import main
-from backlash_ros.nodes.presence import LISTED, Presence
-from backlash_ros.tools.processes import child_environment, free_domain
+from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
+from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
 HERE = Path(__file__).resolve().parent
 DURATION_S = 6.0

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from backlash_ros.core.assembly import ESTIMATORS, STRUCTURES, build_controller, law_fits
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
+from backlash_ros.core.control.structure import LARGEST_FEEDBACK
 from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.proportional import LARGEST_F_OVER_M
-from backlash_ros.core.structure import LARGEST_FEEDBACK
+from backlash_ros.core.parameters.errors import ParameterError
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'docs'))
 

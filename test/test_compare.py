@@ -7,23 +7,24 @@ from pathlib import Path
 import pytest
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools import compare
+from backlash_ros.tools.compare.command import main
+from backlash_ros.tools.compare.comparison import Result, compare, contenders, row
 
 
 @pytest.fixture(scope='module')
-def results() -> dict[str, compare.Result]:
-    return {r.contender.name: r for r in compare.compare(Parameters(), 400)}
+def results() -> dict[str, Result]:
+    return {r.contender.name: r for r in compare(Parameters(), 400)}
 
 
 def test_document_and_figure_come_from_one_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert compare.main(['--out', str(tmp_path), '--duration', '2.5']) == 0
+    assert main(['--out', str(tmp_path), '--duration', '2.5']) == 0
     page = (tmp_path / 'comparison.md').read_text()
     assert (tmp_path / 'images' / 'comparison.png').read_bytes().startswith(b'\x89PNG')
     assert '](images/comparison.png)' in page
     printed = capsys.readouterr().out
-    for contender in compare.contenders(Parameters()):
+    for contender in contenders(Parameters()):
         assert f'| {contender.name} |' in page
         assert contender.name in printed
 
@@ -32,19 +33,19 @@ def test_without_a_folder_it_writes_where_all_results_go(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert compare.main(['--duration', '2.5']) == 0
+    assert main(['--duration', '2.5']) == 0
     assert [path.name for path in tmp_path.iterdir()] == ['results']
     assert (tmp_path / 'results' / 'latest' / 'comparison.md').is_file()
     assert 'document: results/' in capsys.readouterr().out
 
 
 def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert compare.main(['--set', 'amplitud=3']) == 2
+    assert main(['--set', 'amplitud=3']) == 2
     assert capsys.readouterr().err.count('\n') == 1
 
 
 def test_learned_backlash_costs_less_than_an_uncompensated_one(
-    results: dict[str, compare.Result],
+    results: dict[str, Result],
 ) -> None:
     learned, plain = results['moving_horizon, tracking'], results['no compensation, tracking']
     assert results['no backlash, tracking'].penalty == 0.0
@@ -54,5 +55,5 @@ def test_learned_backlash_costs_less_than_an_uncompensated_one(
 
 
 def test_a_loop_that_breaks_off_is_named_and_not_dropped() -> None:
-    broken = compare.Result(compare.contenders(Parameters())[0], None, note='it broke off')
-    assert compare.row(broken)[:2] == (broken.contender.name, 'broke off')
+    broken = Result(contenders(Parameters())[0], None, note='it broke off')
+    assert row(broken)[:2] == (broken.contender.name, 'broke off')

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.configuration import (
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.config.configuration import (
     Setting,
     effective_parameters,
     find_config,
@@ -20,7 +21,6 @@ from backlash_ros.tools.configuration import (
     shipped_configs,
     write_config,
 )
-from backlash_ros.tools.errors import InputError
 
 SHIPPED = sorted((Path(__file__).resolve().parents[1] / 'config').glob('*.yaml'))
 

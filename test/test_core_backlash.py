@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import Play, eighths, plays, signals
 
-from backlash_ros.core.backlash import Backlash, Region
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.backlash import Backlash, Region
 
 
 def as_printed(u_before: Fraction, v: Fraction, m: Fraction, c_r: Fraction, c_l: Fraction,

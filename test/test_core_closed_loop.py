@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from strategies import output_of, paper_example, plants
 
-from backlash_ros.core.closed_loop import ClosedLoop, build_closed_loop
-from backlash_ros.core.controller import AdaptiveController, ControlStep
+from backlash_ros.core.control.controller import AdaptiveController, ControlStep
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.metrics import control_error_rms, settling_time
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import RunRecord
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
+from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
+from backlash_ros.core.simulation.run_record import RunRecord
 
 TEN_SECONDS = 1000
 NAMES = ('m', 'c_r', 'c_l')

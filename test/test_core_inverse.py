@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import Play, plays, signals, usual_plays
 
-from backlash_ros.core.backlash import Backlash, Region
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.inverse import BacklashInverse
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.backlash import Backlash, Region
 
 
 def as_printed(

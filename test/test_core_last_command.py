@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.controller import Limits
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.last_command import last_commands
+from backlash_ros.core.control.controller import Limits
+from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
 
 values = st.floats(-1e3, 1e3)
 

@@ -7,8 +7,12 @@ from math import exp, nan, sqrt
 import numpy as np
 import pytest
 
-from backlash_ros.core.metrics import control_error_rms, settling_time, tracking_error_rms
-from backlash_ros.core.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.metrics import (
+    control_error_rms,
+    settling_time,
+    tracking_error_rms,
+)
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 
 T = np.arange(1000) * 0.01
 ONES = np.ones(1000)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from backlash_ros.core.assembly import build_controller, warnings_of
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
 
 
 def plant(numerator: list[float], denominator: list[float], **more: object) -> Parameters:

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.parameter_table import BY_NAME, PARAMETERS, Parameter
 from backlash_ros.core.parameters import Parameters, check_value
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import BY_NAME, PARAMETERS, Parameter
 
 NUMBERS = [p for p in PARAMETERS if isinstance(p.default, (int, float))
            and not isinstance(p.default, bool)]

@@ -10,7 +10,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from strategies import NO_STATE, KnownInput, Play, eighths, usual_plays
 
-from backlash_ros.core.backlash import Backlash
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.structure import Command, Situation
 from backlash_ros.core.estimation.baselines.printed_law import (
     PrintedLaw,
     printed_c,
@@ -18,10 +20,8 @@ from backlash_ros.core.estimation.baselines.printed_law import (
     printed_m,
 )
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval
-from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.proportional import Proportional
-from backlash_ros.core.reference_signal import ReferenceSignal
-from backlash_ros.core.structure import Command, Situation
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.reference.signal import ReferenceSignal
 
 WIDE = Bounds((1e-9, 1e9), (0.0, 1e9), (-1e9, 0.0))
 WIDE_F = (-1e9, 1e9)

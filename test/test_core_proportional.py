@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import NO_STATE, Play, signals, usual_plays
 
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.proportional import LARGEST_F_OVER_M, Proportional
+from backlash_ros.core.control.structure import Command, Situation
 from backlash_ros.core.estimation.protocol import Estimate
-from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.proportional import LARGEST_F_OVER_M, Proportional
-from backlash_ros.core.structure import Command, Situation
 
 LARGEST_SHARE = 0.8  # of m that f may have
 

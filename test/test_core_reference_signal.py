@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.reference_signal import SHAPES, ReferenceSignal
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.reference.signal import SHAPES, ReferenceSignal
 
 OMEGA = 2.0 * pi  # a period of one second
 

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from strategies import Play, output_of, paper_example, plants, signals, usual_plays
 
 from backlash_ros.core.assembly import build_plant
-from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 SLOW = TransferFunction([0.1], [1.0, -0.9])
 

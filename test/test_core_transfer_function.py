@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy import signal
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, output_of, plants
 
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 
 @given(model=plants(), seed=st.integers(0, 1000))

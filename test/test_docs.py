@@ -14,11 +14,14 @@ import pytest
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.parameter_table import BY_NAME
+from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.nodes import check_driver
-from backlash_ros.tools import batch, bringup, replay, simulate
-from backlash_ros.tools.configuration import effective_parameters
+from backlash_ros.tools.bringup import command as bringup
+from backlash_ros.tools.config.configuration import effective_parameters
 from backlash_ros.tools.identify import command as identify
+from backlash_ros.tools.replay import command as replay
+from backlash_ros.tools.simulate import batch
+from backlash_ros.tools.simulate import command as simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / 'docs'

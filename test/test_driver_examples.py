@@ -18,7 +18,7 @@ from ros_processes import Probe, RosWorld, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.tools.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / 'examples'

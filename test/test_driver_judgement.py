@@ -21,10 +21,7 @@ from made_up_driver import (
     subjects,
 )
 
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.nodes.driver_findings import (
+from backlash_ros.core.driver_check.findings import (
     FITS,
     FLOAT64,
     UNKNOWN,
@@ -32,8 +29,16 @@ from backlash_ros.nodes.driver_findings import (
     Heard,
     graph_findings,
 )
-from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
-from backlash_ros.nodes.gentle_drive import GentleDrive, IdentificationDrive, Range, drive_range
+from backlash_ros.core.driver_check.gentle_drive import (
+    GentleDrive,
+    IdentificationDrive,
+    Range,
+    drive_range,
+)
+from backlash_ros.core.driver_check.verdict import all_fit, judge, similar_topics, table
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 
 def test_a_good_driver_fits_and_its_backlash_is_told() -> None:

@@ -12,10 +12,10 @@ import pytest
 from scipy.special import chdtri
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.estimation.learning import CAPACITY
+from backlash_ros.core.estimation.moving_horizon.learning import CAPACITY
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
 

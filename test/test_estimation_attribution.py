@@ -11,12 +11,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
 from uncertain_cases import motor_jobs
 
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.estimation.attribution import attributed
-from backlash_ros.core.estimation.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.observer import Observer
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation.observer.attribution import attributed
+from backlash_ros.core.estimation.observer.observer import Observer
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 LATE = 0.07  # share of the commands that come one sample too late
 SECONDS = 6.0

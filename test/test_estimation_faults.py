@@ -7,10 +7,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import RunRecord
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
 
 NOISE = 1e-3
 NAMES = ('m', 'c_r', 'c_l')

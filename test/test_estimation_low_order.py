@@ -7,11 +7,11 @@ import pytest
 from records import PERIOD_S, resonance, swing
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.error_model import ErrorModel, build_error_model
-from backlash_ros.core.estimation.low_order import OutputError, low_order
-from backlash_ros.core.estimation.pace import drained
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.estimation.fit.low_order import OutputError, low_order
+from backlash_ros.core.estimation.fit.pace import drained
+from backlash_ros.core.estimation.regression.error_model import ErrorModel, build_error_model
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 NOISE = 1e-4
 FREQUENCIES = 2.0 * np.pi * PERIOD_S * np.array([0.7, 1.9, 3.7])  # of the motion

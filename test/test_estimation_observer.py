@@ -7,9 +7,9 @@ import pytest
 from records import resonance
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
-from backlash_ros.core.estimation.observer import RATIOS, REGULAR, Observer, gain_of
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.estimation.observer.observer import RATIOS, REGULAR, Observer, gain_of
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 MODELS = {
     'resonance': StateModel(resonance()),

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.estimation.record import Record
+from backlash_ros.core.estimation.fit.record import Record
 
 CAPACITY = 7
 steps = st.lists(st.one_of(

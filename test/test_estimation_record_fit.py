@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from records import PERIOD_S, Truth, output, resonance, swing
 from scipy.special import chdtri
 
-from backlash_ros.core.estimation.prior import Prior
+from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.protocol import Bounds
-from backlash_ros.core.estimation.record_description import RecordFit, frequencies_of
-from backlash_ros.core.estimation.record_fit import fit_record
-from backlash_ros.core.estimation.record_samples import SEARCHED_AT_MOST
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.estimation.whole_record.record_description import RecordFit, frequencies_of
+from backlash_ros.core.estimation.whole_record.record_fit import fit_record
+from backlash_ros.core.estimation.whole_record.record_samples import SEARCHED_AT_MOST
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 NOISE = 1e-3
 TRUTH = Truth()

@@ -9,7 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.estimation.regression import NOISE_WEIGHT, SCALES, Posterior, Triangle
+from backlash_ros.core.estimation.regression.posterior import (
+    NOISE_WEIGHT,
+    SCALES,
+    Posterior,
+    Triangle,
+)
 
 BASE, ERRORS, ROWS = 3, 4, 60
 VAGUE = 0.05  # weight of the prior of b: wide, yet such that dense matrices are well conditioned

@@ -14,14 +14,14 @@ from records import resonance
 from scipy.signal import lfilter
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, signals
 
-from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.estimation.error_model import ErrorFilter, ErrorModel, monic
-from backlash_ros.core.estimation.play import Labels, labels_of
-from backlash_ros.core.estimation.regressors import Regressors
-from backlash_ros.core.estimation.window_fit import weights_of
-from backlash_ros.core.model_check import ON_CIRCLE
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.estimation.fit.window_fit import weights_of
+from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel, monic
+from backlash_ros.core.estimation.regression.play import Labels, labels_of
+from backlash_ros.core.estimation.regression.regressors import Regressors
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.model_check import ON_CIRCLE
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 MODELS = {
     'resonance': resonance(), 'integrating': TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR),

@@ -8,15 +8,15 @@ from records import Truth, output, resonance, swing
 from scipy.signal import lfilter
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
-from backlash_ros.core.estimation.error_model import ErrorModel
-from backlash_ros.core.estimation.learned_error import response_std
-from backlash_ros.core.estimation.pace import Pace, drained
-from backlash_ros.core.estimation.play import Start
-from backlash_ros.core.estimation.relabelling import Fitted, fitted
-from backlash_ros.core.estimation.solution import Around
-from backlash_ros.core.learned_model import FREQUENCIES
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.estimation.fit.learned_error import response_std
+from backlash_ros.core.estimation.fit.pace import Pace, drained
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
+from backlash_ros.core.estimation.fit.solution import Around
+from backlash_ros.core.estimation.moving_horizon.learned_model import FREQUENCIES
+from backlash_ros.core.estimation.regression.error_model import ErrorModel
+from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = np.ndarray
 

@@ -13,15 +13,15 @@ from records import Truth, output, resonance, swing
 from scipy.special import chdtri
 
 from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED
-from backlash_ros.core.estimation.error_model import build_error_model
-from backlash_ros.core.estimation.pace import Pace, drained
-from backlash_ros.core.estimation.play import Start
-from backlash_ros.core.estimation.prior import Prior
-from backlash_ros.core.estimation.relabelling import Fitted, fitted, searched
-from backlash_ros.core.estimation.search import Found, search
-from backlash_ros.core.estimation.solution import Around
-from backlash_ros.core.estimation.window_fit import weights_of
-from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.estimation.fit.pace import Pace, drained
+from backlash_ros.core.estimation.fit.prior import Prior
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, searched
+from backlash_ros.core.estimation.fit.search import Found, search
+from backlash_ros.core.estimation.fit.solution import Around
+from backlash_ros.core.estimation.fit.window_fit import weights_of
+from backlash_ros.core.estimation.regression.error_model import build_error_model
+from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.plant.state_model import StateModel
 
 NOISE = 1e-3
 MODEL = resonance()

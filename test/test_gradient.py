@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import RunRecord
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
 
 TRUTH = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
 

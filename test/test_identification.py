@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.play import play
+from backlash_ros.core.estimation.regression.play import play
 from backlash_ros.core.identification.identification import (
     Identification,
     Options,

@@ -17,12 +17,12 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimation.storage import load_estimate
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools import simulate
-from backlash_ros.tools.configuration import effective_parameters
-from backlash_ros.tools.errors import InputError
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config.parameter_file import read_parameter_file
 from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.identify.measured_record import from_messages, read_measured
-from backlash_ros.tools.parameter_file import read_parameter_file
+from backlash_ros.tools.simulate import command as simulate
 
 QUICK = ('--order', '1-2', '--delay', '0-1')
 FILES = {
@@ -288,7 +288,7 @@ def test_the_sample_period_has_the_digits_that_the_stamps_tell(
 
 
 def test_a_span_is_cut_out(tmp_path: Path) -> None:
-    from backlash_ros.tools.bag_sections import Span
+    from backlash_ros.tools.run_files.bag_sections import Span
     v, y = record(400)
     source = write_csv(tmp_path / 'a.csv', v, y)
     part = read_measured(source, span=Span(0.5, 1.5))
@@ -338,7 +338,7 @@ def test_a_longer_record_than_is_searched_is_fitted_as_a_whole(tmp_path: Path) -
 
 
 def test_shipped_limits_are_enough_for_a_drive() -> None:
-    from backlash_ros.nodes.gentle_drive import drive_range
+    from backlash_ros.core.driver_check.gentle_drive import drive_range
     from backlash_ros.tools.identify.command import given_values
     given_by_user = given_values(Path('limits.yaml'), '')
     assert set(given_by_user) == {

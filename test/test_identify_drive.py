@@ -17,7 +17,7 @@ from ros_processes import Probe
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.tools.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
 ROOT = Path(__file__).resolve().parents[1]
 DEADLINE_S = 150.0
@@ -44,7 +44,7 @@ class Bench:
 
     def start(self, *options: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, '-m', 'backlash_ros.tools.identify.command', '--drive',
+            [sys.executable, '-m', 'backlash_ros.tools.identify', '--drive',
              '--config', str(self.folder / 'limits.yaml'), '--out', str(self.folder / 'out'),
              *options],
             env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from backlash_ros.core.identification.intervals import v_of_intervals
+from backlash_ros.core.loop.intervals import v_of_intervals
 
 
 def told(

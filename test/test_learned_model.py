@@ -12,26 +12,27 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
-from backlash_ros.core.backlash import Backlash
-from backlash_ros.core.controller import LONGEST_WAIT, AdaptiveController, Limits
-from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
-from backlash_ros.core.estimation.protocol import Estimate, Interval
-from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.pole_placement import PolePlacement, place_poles
-from backlash_ros.core.proportional import Proportional
-from backlash_ros.core.simulated_plant import SimulatedPlant
-from backlash_ros.core.slope_tolerance import margin_in_pieces
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Adoption, Structure
-from backlash_ros.core.tracking import Tracking
-from backlash_ros.core.tracking_design import (
+from backlash_ros.core.control.controller import LONGEST_WAIT, AdaptiveController, Limits
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.pole_placement import PolePlacement
+from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.structure import Adoption, Structure
+from backlash_ros.core.control.tracking.design import (
     Replay,
     TrackingDesign,
     Weights,
     better_design_in_pieces,
     design,
 )
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.control.tracking.slope_tolerance import margin_in_pieces
+from backlash_ros.core.control.tracking.tracking import Tracking
+from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
+from backlash_ros.core.estimation.protocol import Estimate, Interval
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.four_blocks import place_poles
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 T = TypeVar('T')

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from backlash_ros.nodes.causes import Finding, Level
-from backlash_ros.nodes.level_log import AGAIN_S, LASTS_S, LevelLog
+from backlash_ros.core.loop.causes import Finding, Level
+from backlash_ros.core.loop.level_log import AGAIN_S, LASTS_S, LevelLog
 
 WELL = Finding(Level.OK, 'learned', 'learned')
 WRONG = Finding(Level.ERROR, 'model', 'the model is wrong')

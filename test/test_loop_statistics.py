@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from backlash_ros.nodes.loop_statistics import Lately, LoopStatistics
-from backlash_ros.tools.results import _latency_ms
+from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
+from backlash_ros.tools.run_files.results import latency_ms
 
 
 def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> None:
@@ -13,7 +13,7 @@ def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> No
     statistics = LoopStatistics()
     for latency in latencies:
         statistics.note(0.0, 0.0, False, float(latency))
-    reported = _latency_ms(latencies)
+    reported = latency_ms(latencies)
     assert reported == {'p50': statistics.latency_ms(0.5), 'p99': statistics.latency_ms(0.99)}
 
 

@@ -10,8 +10,8 @@ from ros_processes import ros_world
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.loopback import OF_THE_FOLDER, PROFILE, VARIABLE, prefer_loopback
-from backlash_ros.tools.processes import DOMAIN_0_PORT, PORTS_PER_DOMAIN
+from backlash_ros.middleware.loopback import OF_THE_FOLDER, PROFILE, VARIABLE, prefer_loopback
+from backlash_ros.tools.bringup.processes import DOMAIN_0_PORT, PORTS_PER_DOMAIN
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 MAPS = Path('/proc/self/maps')  # Linux

@@ -17,9 +17,9 @@ from rosbags.typesys import Stores, get_typestore
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.bag_reading import read_bag
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.tools.run_files.bag_reading import read_bag
 
 NODES = ('recorder', 'controller', 'reference', 'plant')
 SIGNAL = {label: i for i, label in enumerate(topics.SIGNAL_LABELS)}

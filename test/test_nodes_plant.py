@@ -9,7 +9,7 @@ import rclpy
 from std_msgs.msg import Float64
 
 from backlash_ros.nodes.plant import PlantNode
-from backlash_ros.tools.processes import free_domain
+from backlash_ros.tools.bringup.processes import free_domain
 
 PERIOD_S = 10.0  # so long that the time that the test takes is nothing
 PERIOD_NS = int(PERIOD_S * 1e9)

@@ -8,14 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.command_history import (
+from backlash_ros.core.loop.command_history import (
     CONSISTENT,
     CommandHistory,
     ReportUse,
     report_use,
 )
-from backlash_ros.nodes.sample_counter import Arrival, SampleCounter
+from backlash_ros.core.loop.sample_counter import Arrival, SampleCounter
+from backlash_ros.core.parameters import Parameters
 
 PERIOD_S, PERIOD_NS = 0.01, 10_000_000
 START_NS = 1_800_000_000_000_000_000

@@ -9,11 +9,11 @@ from scipy import signal
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.pole_placement import place_poles
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.four_blocks import place_poles
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
 
@@ -72,8 +72,8 @@ def test_loop_without_backlash_answers_as_the_reference_model_says(filter_pole: 
 
 def closed_of(p: Parameters) -> np.ndarray:
     """A_m that the parameters lead to, read off the loop's own reference model."""
-    from backlash_ros.core.assembly import _four_blocks
-    return _four_blocks(p).reference.denominator
+    from backlash_ros.core.assembly import build_four_blocks
+    return build_four_blocks(p).reference.denominator
 
 
 def test_exact_inverse_makes_the_backlash_vanish() -> None:

@@ -10,7 +10,7 @@ from contextlib import closing
 
 import pytest
 
-from backlash_ros.nodes.presence import LISTED, Presence
+from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
 
 DOMAIN = os.getpid() + 1000  # of no ROS, so of nobody else
 LONG = '/a_name' * 30
@@ -48,7 +48,7 @@ def test_a_topic_may_have_a_long_name() -> None:
 
 def test_a_killed_process_is_gone_at_once(here: Presence) -> None:
     code = (
-        'import sys\nfrom backlash_ros.nodes.presence import Presence\n'
+        'import sys\nfrom backlash_ros.nodes.diagnostics.presence import Presence\n'
         f'presence = Presence({DOMAIN}, "/control", "b")\nprint(flush=True)\nsys.stdin.read()'
     )
     with subprocess.Popen(

@@ -17,11 +17,11 @@ from ros_processes import wait_until
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from backlash_ros.nodes import prompt_executor
-from backlash_ros.nodes.inbox import Inbox
-from backlash_ros.nodes.prompt_executor import NodeExecutor, PromptExecutor, make_executor
-from backlash_ros.nodes.spin import spin_paced
-from backlash_ros.tools.processes import free_domain
+from backlash_ros.nodes.runtime import prompt_executor
+from backlash_ros.nodes.runtime.inbox import Inbox
+from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, PromptExecutor, make_executor
+from backlash_ros.nodes.runtime.spin import spin_paced
+from backlash_ros.tools.bringup.processes import free_domain
 
 
 class Loop:

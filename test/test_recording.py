@@ -25,9 +25,9 @@ from std_msgs.msg import Float64, Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.bags.content import BagError, message_files
 from backlash_ros.bags.remains import damage, open_remains
-from backlash_ros.nodes.bag import STORAGE
-from backlash_ros.tools import report
-from backlash_ros.tools.bag_reading import read_bag
+from backlash_ros.bags.writer import STORAGE
+from backlash_ros.tools.report import command as report
+from backlash_ros.tools.run_files.bag_reading import read_bag
 
 ROOT = Path(__file__).resolve().parents[1]
 NODES = ('recorder', 'controller', 'reference', 'plant')
@@ -275,7 +275,7 @@ FILL = """
 import subprocess, sys
 from backlash_ros.bags.remains import open_remains
 from backlash_ros.bags.repair import repair_command
-from backlash_ros.nodes.bag import Bag, RecordingError
+from backlash_ros.bags.writer import Bag, RecordingError
 bag = Bag(sys.argv[1] + '/bag', sys.argv[2])
 number = bag.add_topic('/number', 'std_msgs/msg/Float64')
 try:

@@ -13,8 +13,8 @@ from ros_processes import ros_world
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.nodes.reference_pace import ReferencePace
-from backlash_ros.nodes.sample_counter import SampleCounter
+from backlash_ros.core.loop.reference_pace import ReferencePace
+from backlash_ros.core.loop.sample_counter import SampleCounter
 
 PERIOD_S = 0.005
 STEP_S = PERIOD_S / 50.0  # by which the tests let time go on

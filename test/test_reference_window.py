@@ -7,7 +7,7 @@ from collections import deque
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.reference_window import ReferenceWindow
+from backlash_ros.core.control.tracking.reference_window import ReferenceWindow
 
 
 @given(

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 AT = range(250, 292, 3)  # all phases of the reference
 STRUCTURES = {

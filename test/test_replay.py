@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.replay import parting, replay
-from backlash_ros.core.run_record import COLUMNS, RunRecord
-from backlash_ros.tools import simulate
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.replay import parting, replay
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.tools.bringup.processes import child_environment, free_domain
 from backlash_ros.tools.identify.measured_record import read_measured
-from backlash_ros.tools.processes import child_environment, free_domain
-from backlash_ros.tools.replay import main
-from backlash_ros.tools.report import open_source
+from backlash_ros.tools.replay.command import main
+from backlash_ros.tools.report.command import open_source
+from backlash_ros.tools.simulate import command as simulate
 
 NOISY = {'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
 # Losses, a structure that feeds y back, a learned G, a law of another kind, a limited v.

@@ -20,16 +20,17 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.learned_model import LearnedModel
+from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import COLUMNS, RunRecord
-from backlash_ros.tools import analysis, figures, report
-from backlash_ros.tools.bag_reading import read_bag
-from backlash_ros.tools.bag_sections import Span
-from backlash_ros.tools.configuration import write_config
-from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.results import summarise, write_run, write_summary
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.config.configuration import write_config
+from backlash_ros.tools.report import analysis, figures
+from backlash_ros.tools.report import command as report
+from backlash_ros.tools.run_files.bag_reading import read_bag
+from backlash_ros.tools.run_files.bag_sections import Span
+from backlash_ros.tools.run_files.results import summarise, write_run, write_summary
 
 PARAMETERS = Parameters({'estimator.law': 'lms', 'output_noise_std': 1e-4})
 LATENCY_S = 0.0004

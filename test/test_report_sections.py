@@ -12,12 +12,12 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from test_report import MULTI_ARRAY, PARAMETERS, TYPES, rows_of
 
 from backlash_ros import topics
-from backlash_ros.core.closed_loop import build_closed_loop
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import COLUMNS, RunRecord
-from backlash_ros.tools import report
-from backlash_ros.tools.bag_reading import read_bag
-from backlash_ros.tools.bag_sections import Span
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.tools.report import command as report
+from backlash_ros.tools.run_files.bag_reading import read_bag
+from backlash_ros.tools.run_files.bag_sections import Span
 
 PERIOD_NS = 10_000_000
 START_NS = 10**18

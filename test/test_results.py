@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.learned_model import LearnedModel
+from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import COLUMNS, RunRecord
-from backlash_ros.files import write_atomically
-from backlash_ros.tools import results
-from backlash_ros.tools.errors import InputError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.run_files import results
 
 FIELDS = [
     'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'final', 'final_std',

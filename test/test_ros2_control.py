@@ -14,7 +14,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 
 from backlash_ros import topics
-from backlash_ros.tools import report
+from backlash_ros.tools.report import command as report
 
 
 class StandIn:

@@ -13,12 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.storage import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.run_record import stated_deviations
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import stated_deviations
 
 LEARNED = Estimate(1.25, 2.5, -3.5, 0.2, 0.01, 0.02, 0.03, Status.TRACKING)
 

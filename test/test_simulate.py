@@ -15,14 +15,15 @@ from pathlib import Path
 
 import pytest
 
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools import batch
-from backlash_ros.tools.batch import Outcome, Sweep
-from backlash_ros.tools.command_line import number_of_samples, whole_samples
-from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.simulate import main
-from backlash_ros.tools.simulation import prepare, run_loop
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.tools.cli.command_line import number_of_samples, whole_samples
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.simulate import batch
+from backlash_ros.tools.simulate.batch import Outcome, Sweep
+from backlash_ros.tools.simulate.command import main
+from backlash_ros.tools.simulate.simulation import run_loop
 
 ROOT = Path(__file__).resolve().parents[1]
 NOISY = ['--set', 'output_noise_std=1e-3', '--set', 'estimator.law=lms']
@@ -140,7 +141,7 @@ def test_swept_seed_and_sample_period_take_effect() -> None:
 def test_file_as_reference_is_followed(tmp_path: Path) -> None:
     path = tmp_path / 'y_m.csv'
     path.write_text('t,y_m\n' + ''.join(f'{k * 0.01!r},{k / 8}\n' for k in range(40)))
-    loop = prepare(noisy({'waveform': 'file', 'file': str(path), 'amplitude': 1.0}))
+    loop = build_closed_loop(noisy({'waveform': 'file', 'file': str(path), 'amplitude': 1.0}))
     assert run_loop(loop, 40).column('y_m').tolist() == [k / 8 for k in range(40)]
 
 

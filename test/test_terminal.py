@@ -17,7 +17,7 @@ from ros_processes import NodeProcess, Probe, ros_world
 from std_msgs.msg import Float32, Float64
 
 from backlash_ros import topics
-from backlash_ros.nodes.causes import LONGEST_TEXT
+from backlash_ros.core.loop.causes import LONGEST_TEXT
 
 PERIOD_S = 0.01
 BEST_EFFORT = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

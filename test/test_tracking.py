@@ -9,26 +9,26 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from backlash_ros.core.assembly import build_model
-from backlash_ros.core.closed_loop import build_closed_loop
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.tracking.design import Weights, design
+from backlash_ros.core.control.tracking.lq_preview import preview_gains
+from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
+from backlash_ros.core.control.tracking.slope_tolerance import tolerates
+from backlash_ros.core.control.tracking.tracking import cautious_crossings
 from backlash_ros.core.estimation.protocol import Estimate, Status
-from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.lq_preview import preview_gains
-from backlash_ros.core.metrics import (
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.metrics import (
     delayed_reference,
     delayed_tracking_error_rms,
     gap_crossings_per_reversal,
     total_variation,
     turns,
 )
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.reference_signal import ReferenceSignal
-from backlash_ros.core.rest import SHORT, Mode, Rest
-from backlash_ros.core.run_record import COLUMNS, RunRecord
-from backlash_ros.core.slope_tolerance import tolerates
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.tracking import cautious_crossings
-from backlash_ros.core.tracking_design import Weights, design
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 
 NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 KNOWN = {'estimator.law': 'fixed', 'estimator.initial.m': 1.3}

@@ -14,12 +14,12 @@ from scipy.signal import cont2discrete, lfilter
 from strategies import plants
 
 from backlash_ros.core.assembly import build_model, build_plant, build_true_model
-from backlash_ros.core.closed_loop import build_closed_loop
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.core.true_plant import Alteration, altered_plant, delayed
-from backlash_ros.tools.configuration import effective_parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.true_plant import Alteration, altered_plant, delayed
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.tools.config.configuration import effective_parameters
 
 PERIOD = 0.005
 NOTHING = {

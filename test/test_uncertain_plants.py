@@ -28,8 +28,8 @@ from uncertain_cases import (
 from uncertain_runs import NAMES, _longest, _swaps, run_job
 
 from backlash_ros.core.assembly import build_controller, build_model, build_true_model
-from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.plant.backlash import Backlash
 
 PERIOD = 0.005
 

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
 from ros_processes import ros_world
 
-from backlash_ros.nodes.unused_sections import unused
+from backlash_ros.nodes.runtime.unused_sections import unused
 
 CONFIGS = sorted((Path(__file__).resolve().parents[1] / 'config').glob('*.yaml'))
 

@@ -9,37 +9,38 @@ from math import inf
 
 import numpy as np
 
-from backlash_ros.core.controller import AdaptiveController, Limits
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.control.controller import AdaptiveController, Limits
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.last_command import check_last_commands
+from backlash_ros.core.control.pole_placement import PolePlacement
+from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.structure import Structure
+from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
+from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
 from backlash_ros.core.estimation.baselines.gradient import GradientEstimator
 from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.estimation.baselines.printed_law import PrintedLaw
-from backlash_ros.core.estimation.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Estimator
-from backlash_ros.core.inverse import BacklashInverse
-from backlash_ros.core.last_command import check_last_commands
-from backlash_ros.core.model_check import check_model, model_warnings
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.pole_placement import FourBlocks, PolePlacement, place_poles
-from backlash_ros.core.proportional import Proportional
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles
+from backlash_ros.core.plant.model_check import check_model, model_warnings
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.scenario import (
     build_model,
     build_plant,
     build_reference,
     build_true_model,
 )
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.structure import Structure
-from backlash_ros.core.tracking import Tracking
-from backlash_ros.core.tracking_design import Weights, design, lq_gains, power_gain
-from backlash_ros.core.transfer_function import TransferFunction
 
 __all__ = [
-    'ESTIMATORS', 'STRUCTURES', 'build_controller', 'build_limits', 'build_model', 'build_plant',
-    'build_reference', 'build_state_model', 'build_structure', 'build_true_model', 'law_fits',
-    'warnings_of',
+    'ESTIMATORS', 'STRUCTURES', 'build_controller', 'build_four_blocks', 'build_limits',
+    'build_model', 'build_plant', 'build_reference', 'build_state_model', 'build_structure',
+    'build_true_model', 'law_fits', 'warnings_of',
 ]
 
 # Until the backlash is known, half of the motion of u may not be what the first guess says.
@@ -191,7 +192,7 @@ def law_fits(law: str, structure: str) -> bool:
 
 
 def _gradient(p: Parameters, initial: Estimate) -> Estimator:
-    blocks = _four_blocks(p)
+    blocks = build_four_blocks(p)
     return GradientEstimator(
         initial, _bounds(p), blocks, build_model(p).order, p.real('gradient.step'),
         p.real('estimator.output_noise_std'),
@@ -203,10 +204,11 @@ def _proportional(p: Parameters) -> Structure:
 
 
 def _pole_placement(p: Parameters) -> Structure:
-    return PolePlacement(_four_blocks(p))
+    return PolePlacement(build_four_blocks(p))
 
 
-def _four_blocks(p: Parameters) -> FourBlocks:
+def build_four_blocks(p: Parameters) -> FourBlocks:
+    """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
     model, state = build_model(p), build_state_model(p)
     weight = p.real('tracking.input_weight') * power_gain(model, np.pi / 10.0)
     gains = lq_gains(state, weight)

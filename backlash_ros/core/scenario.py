@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.reference_file import read_reference_file
-from backlash_ros.core.reference_signal import ReferenceSignal
-from backlash_ros.core.simulated_plant import Imperfections, SimulatedPlant
-from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.core.true_plant import Alteration, altered_plant, delayed
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.plant.true_plant import Alteration, altered_plant, delayed
+from backlash_ros.core.reference.file import read_reference_file
+from backlash_ros.core.reference.signal import ReferenceSignal
 
 
 def build_model(p: Parameters) -> TransferFunction:

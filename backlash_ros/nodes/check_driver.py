@@ -26,10 +26,8 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.controller import plausible
-from backlash_ros.core.parameter_table import CONTROLLER, RECORDER
-from backlash_ros.nodes.arguments import OptionParser, ros_arguments
-from backlash_ros.nodes.driver_findings import (
+from backlash_ros.core.control.controller import plausible
+from backlash_ros.core.driver_check.findings import (
     FLOAT64,
     WRONG,
     Finding,
@@ -38,14 +36,16 @@ from backlash_ros.nodes.driver_findings import (
     Message,
     timing_of,
 )
-from backlash_ros.nodes.driver_motion import record_of
-from backlash_ros.nodes.driver_verdict import all_fit, judge, similar_topics, table
-from backlash_ros.nodes.gentle_drive import Drive, GentleDrive, Range, drive_range
-from backlash_ros.nodes.messages import DEPTH
-from backlash_ros.nodes.presence import Presence
-from backlash_ros.nodes.prompt_executor import NodeExecutor
-from backlash_ros.nodes.rivals import identity_made_by, names_of
-from backlash_ros.nodes.spin import BAD_INPUT, DONE, ProcessNode, run
+from backlash_ros.core.driver_check.gentle_drive import Drive, GentleDrive, Range, drive_range
+from backlash_ros.core.driver_check.motion import record_of
+from backlash_ros.core.driver_check.verdict import all_fit, judge, similar_topics, table
+from backlash_ros.core.parameters.table import CONTROLLER, RECORDER
+from backlash_ros.nodes.diagnostics.presence import Presence
+from backlash_ros.nodes.diagnostics.rivals import identity_made_by, names_of
+from backlash_ros.nodes.runtime.arguments import OptionParser, ros_arguments
+from backlash_ros.nodes.runtime.messages import DEPTH
+from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
+from backlash_ros.nodes.runtime.spin import BAD_INPUT, DONE, ProcessNode, run
 from backlash_ros.shipped import find_config
 
 EXECUTABLE = 'check_driver'

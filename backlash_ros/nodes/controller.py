@@ -17,35 +17,36 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, warnings_of
-from backlash_ros.core.controller import ControlStep
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
-from backlash_ros.core.parameter_table import CONTROLLER
+from backlash_ros.core.loop.causes import Finding, Level
+from backlash_ros.core.loop.command_history import REMEMBERED
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.output import Output
+from backlash_ros.core.loop.sample_counter import SampleCounter
 from backlash_ros.core.parameters import NOISE, Parameters, missing_limits
-from backlash_ros.core.run_record import stated_deviations
-from backlash_ros.nodes.causes import Finding, Level
-from backlash_ros.nodes.command_history import REMEMBERED
-from backlash_ros.nodes.control_loop import ControlLoop
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.controller_services import offer_services
-from backlash_ros.nodes.declare import LiveParameters
-from backlash_ros.nodes.diagnosis import Diagnosis, counts_of, values_of, worst
-from backlash_ros.nodes.driver_io import DriverIo, Output, output_qos
+from backlash_ros.nodes.diagnostics.diagnosis import Diagnosis, counts_of, values_of, worst
+from backlash_ros.nodes.diagnostics.rivals import RivalWatch
 from backlash_ros.nodes.estimate_saver import EstimateSaver
-from backlash_ros.nodes.events import emit
-from backlash_ros.nodes.inbox import Inbox
-from backlash_ros.nodes.lifecycle import ManagedNode
-from backlash_ros.nodes.messages import (
+from backlash_ros.nodes.model_publisher import ModelPublisher
+from backlash_ros.nodes.runtime.declare import LiveParameters
+from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
+from backlash_ros.nodes.runtime.events import emit
+from backlash_ros.nodes.runtime.inbox import Inbox
+from backlash_ros.nodes.runtime.lifecycle import ManagedNode
+from backlash_ros.nodes.runtime.messages import (
     DEPTH,
     KEPT,
     DiagnosticsPublisher,
     LabelledArrayPublisher,
     stamp_ns_of,
 )
-from backlash_ros.nodes.model_publisher import ModelPublisher
-from backlash_ros.nodes.rivals import RivalWatch
-from backlash_ros.nodes.sample_counter import SampleCounter
-from backlash_ros.nodes.spin import run
+from backlash_ros.nodes.runtime.spin import run
 from backlash_ros.nodes.watch_publisher import WatchPublisher
 
 DIAGNOSTICS_PERIOD_S = 1.0

@@ -12,7 +12,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.estimation.storage import worth_saving
-from backlash_ros.nodes.control_loop import ControlLoop
+from backlash_ros.core.loop.control_loop import ControlLoop
 
 UNCONFIGURED = 'the controller is unconfigured: configure it first'
 

@@ -10,11 +10,11 @@ from pathlib import Path
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros import topics
-from backlash_ros.nodes.arguments import ros_arguments
+from backlash_ros.core.driver_check.findings import Message
+from backlash_ros.core.driver_check.gentle_drive import Drive, IdentificationDrive, Range
 from backlash_ros.nodes.check_driver import CheckDriverNode
-from backlash_ros.nodes.driver_findings import Message
-from backlash_ros.nodes.gentle_drive import Drive, IdentificationDrive, Range
-from backlash_ros.nodes.spin import DONE, run
+from backlash_ros.nodes.runtime.arguments import ros_arguments
+from backlash_ros.nodes.runtime.spin import DONE, run
 
 EXECUTABLE = 'identify'
 UNHEARD = 1  # exit code where the actuator was never moved

@@ -10,10 +10,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
-from backlash_ros.core.learned_model import learned_model_of
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.nodes.control_loop import ControlLoop
-from backlash_ros.nodes.messages import without_events
+from backlash_ros.core.estimation.moving_horizon.learned_model import learned_model_of
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.nodes.runtime.messages import without_events
 
 # Who comes late gets the newest ones: G may never change again. More than one, so that a subscriber
 # that is held up misses none.

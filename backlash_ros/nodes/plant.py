@@ -12,14 +12,14 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.parameter_table import PLANT
+from backlash_ros.core.loop.causes import TROUBLE, Finding, Level
+from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.table import PLANT
 from backlash_ros.core.scenario import build_plant
-from backlash_ros.nodes.causes import TROUBLE, Finding, Level
-from backlash_ros.nodes.declare import LiveParameters
-from backlash_ros.nodes.events import emit
-from backlash_ros.nodes.loop_statistics import Lately
-from backlash_ros.nodes.messages import (
+from backlash_ros.nodes.runtime.declare import LiveParameters
+from backlash_ros.nodes.runtime.events import emit
+from backlash_ros.nodes.runtime.messages import (
     DEPTH,
     KEPT,
     DiagnosticsPublisher,
@@ -27,8 +27,8 @@ from backlash_ros.nodes.messages import (
     arrival_ns,
     clock_message,
 )
-from backlash_ros.nodes.prompt_executor import NodeExecutor
-from backlash_ros.nodes.spin import ProcessNode, run, spin_paced
+from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
+from backlash_ros.nodes.runtime.spin import ProcessNode, run, spin_paced
 
 DIAGNOSTICS_PERIOD_S = 1.0
 # Share of a period after which it is too late to publish an output: it would look like the next.

@@ -25,15 +25,15 @@ from std_msgs.msg import Float64, Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.bags.content import CURE
 from backlash_ros.bags.repair import repair_command
-from backlash_ros.core.parameter_table import RECORDER
-from backlash_ros.nodes.bag import Bag, RecordingError
-from backlash_ros.nodes.causes import Finding, Level
-from backlash_ros.nodes.driver_io import STYLES, output_qos
-from backlash_ros.nodes.events import ENABLED, emit
-from backlash_ros.nodes.messages import KEPT, DiagnosticsPublisher, stamp_ns_of
-from backlash_ros.nodes.prompt_executor import NodeExecutor
-from backlash_ros.nodes.sample_counter import UNNUMBERED
-from backlash_ros.nodes.spin import BAD_INPUT, FAILED, ProcessNode, run
+from backlash_ros.bags.writer import Bag, RecordingError
+from backlash_ros.core.loop.causes import Finding, Level
+from backlash_ros.core.loop.sample_counter import UNNUMBERED
+from backlash_ros.core.parameters.table import RECORDER
+from backlash_ros.nodes.runtime.driver_io import STYLES, output_qos
+from backlash_ros.nodes.runtime.events import ENABLED, emit
+from backlash_ros.nodes.runtime.messages import KEPT, DiagnosticsPublisher, stamp_ns_of
+from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
+from backlash_ros.nodes.runtime.spin import BAD_INPUT, FAILED, ProcessNode, run
 
 DEPTH = 10_000  # messages that may wait while the disk is slow
 PROGRESS_PERIOD_S = 0.2

@@ -9,18 +9,19 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.parameter_table import REFERENCE
+from backlash_ros.core.loop.output import Output
+from backlash_ros.core.loop.reference_pace import ReferencePace
+from backlash_ros.core.loop.sample_counter import SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.reference_signal import PERIODIC
+from backlash_ros.core.parameters.table import REFERENCE
+from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.scenario import build_reference
-from backlash_ros.nodes.declare import LiveParameters
-from backlash_ros.nodes.driver_io import DriverIo, Output
-from backlash_ros.nodes.events import emit
-from backlash_ros.nodes.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
-from backlash_ros.nodes.prompt_executor import NodeExecutor
-from backlash_ros.nodes.reference_pace import ReferencePace
-from backlash_ros.nodes.sample_counter import SampleCounter
-from backlash_ros.nodes.spin import ProcessNode, run
+from backlash_ros.nodes.runtime.declare import LiveParameters
+from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.runtime.events import emit
+from backlash_ros.nodes.runtime.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
+from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
+from backlash_ros.nodes.runtime.spin import ProcessNode, run
 
 LONGEST_SLEEP_S = 0.05  # so that signals and requests are noticed
 

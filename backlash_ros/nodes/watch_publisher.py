@@ -10,7 +10,7 @@ from rclpy.publisher import Publisher
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.nodes.messages import without_events
+from backlash_ros.nodes.runtime.messages import without_events
 
 PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
 LOOK_S = 0.5  # between two looks at who listens

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.core.parameters.errors import ParameterError
 
 # Square of a signal below which it counts as none. Its inverse, times the square of any
 # measurement, still is a number.

@@ -7,10 +7,10 @@ from dataclasses import asdict, replace
 from math import isfinite, isnan, nan
 from pathlib import Path
 
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.files import write_atomically
+from backlash_ros.core.parameters.errors import ParameterError
 
 VERSION = 1  # of the file format
 LAW, FIXED = 'estimator.law', 'fixed'

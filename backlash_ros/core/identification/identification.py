@@ -14,9 +14,9 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.pace import drained
-from backlash_ros.core.estimation.record_description import frequencies_of
-from backlash_ros.core.estimation.record_samples import busiest, check_record, outliers
+from backlash_ros.core.estimation.fit.pace import drained
+from backlash_ros.core.estimation.whole_record.record_description import frequencies_of
+from backlash_ros.core.estimation.whole_record.record_samples import busiest, check_record, outliers
 from backlash_ros.core.identification import judgement, uncertainty
 from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.order_selection import (

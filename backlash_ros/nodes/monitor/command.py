@@ -10,9 +10,9 @@ import sys
 
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.nodes.arguments import OptionParser, ros_arguments
 from backlash_ros.nodes.monitor.node import EXECUTABLE, MonitorNode
-from backlash_ros.nodes.spin import run
+from backlash_ros.nodes.runtime.arguments import OptionParser, ros_arguments
+from backlash_ros.nodes.runtime.spin import run
 
 
 def main(args: list[str] | None = None) -> int:

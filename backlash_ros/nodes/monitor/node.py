@@ -19,11 +19,11 @@ from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros import topics
-from backlash_ros.nodes.inbox import Inbox
 from backlash_ros.nodes.monitor.keys import pressed_keys
 from backlash_ros.nodes.monitor.state import NAMES, ControllerState
 from backlash_ros.nodes.monitor.view import ASCII_BLOCKS, BLOCKS, plain_line, screen
-from backlash_ros.nodes.spin import DONE, ProcessNode
+from backlash_ros.nodes.runtime.inbox import Inbox
+from backlash_ros.nodes.runtime.spin import DONE, ProcessNode
 
 EXECUTABLE = 'monitor'
 LOOK_S = 1.0  # between two looks for further controllers

@@ -9,8 +9,8 @@ from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from backlash_ros.core.parameter_table import Value
-from backlash_ros.tools.command_line import (
+from backlash_ros.core.parameters.table import Value
+from backlash_ros.tools.cli.command_line import (
     FAILED,
     OptionParser,
     add_out_option,
@@ -18,16 +18,14 @@ from backlash_ros.tools.command_line import (
     run_tool,
     span_of,
 )
-from backlash_ros.tools.errors import InputError
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.identify.names import INTEGRATORS
 
 if TYPE_CHECKING:
-    from backlash_ros.tools.bag_sections import Span
     from backlash_ros.tools.identify.measured_record import MeasuredRecord
+    from backlash_ros.tools.run_files.bag_sections import Span
 
 EXECUTABLE = 'identify'
-YAML, JSON, PAGE = 'identified.yaml', 'identified.json', 'identify.html'
-ESTIMATES = 'estimates.json'
-INTEGRATORS = {'auto': (False, True), 'yes': (True,), 'no': (False,)}
 HIGHEST_ORDER, LONGEST_DELAY = 6, 20
 
 
@@ -166,8 +164,8 @@ def given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
     """What the user's file holds for the axis; nothing without a file."""
     if config is None:
         return {}
-    from backlash_ros.tools.configuration import find_config
-    from backlash_ros.tools.parameter_file import no_such_axis, read_parameter_file
+    from backlash_ros.tools.config.configuration import find_config
+    from backlash_ros.tools.config.parameter_file import no_such_axis, read_parameter_file
     file = read_parameter_file(find_config(config))
     axes = file.axes
     file.check_axes(axes)
@@ -178,7 +176,3 @@ def given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
     if axes and axis not in axes:
         raise InputError(no_such_axis(axis, axes))
     return file.values(axis)
-
-
-if __name__ == '__main__':
-    sys.exit(main())

@@ -23,14 +23,14 @@ from backlash_ros.core.identification.identification import (
     Options,
     identifying,
 )
-from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.command_line import BAD_INPUT
-from backlash_ros.tools.configuration import write_config
-from backlash_ros.tools.errors import BrokenOffError, InputError
+from backlash_ros.core.parameters.table import Value
+from backlash_ros.tools.bringup.supervision import StopRequests
+from backlash_ros.tools.cli.command_line import BAD_INPUT
+from backlash_ros.tools.cli.errors import BrokenOffError, InputError
+from backlash_ros.tools.config.configuration import write_config
 from backlash_ros.tools.identify.measured_record import MeasuredRecord, from_messages
 from backlash_ros.tools.identify.outcome import options_of
-from backlash_ros.tools.supervision import StopRequests
 
 NODE = 'backlash_ros.nodes.identification_drive'
 LOOK_S = 0.25  # between two looks at the record

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.errors import ParameterError
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.identification.least_response import known_up_to
 from backlash_ros.core.identification.uncertainty import response
-from backlash_ros.core.parameter_table import (
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import (
     BRINGUP,
     BY_NAME,
     PARAMETERS,
@@ -24,9 +25,8 @@ from backlash_ros.core.parameter_table import (
     Parameter,
     Value,
 )
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.configuration import yaml_value
-from backlash_ros.tools.parameter_file import ANY, EVERY_NODE
+from backlash_ros.tools.config.configuration import yaml_value
+from backlash_ros.tools.config.parameter_file import ANY, EVERY_NODE
 
 LEAST_DEVIATION = 1e-6  # relative: a deviation of 0 would say that a constant was given
 WIDER = 3.0  # bounds of the estimates, in times of what was found

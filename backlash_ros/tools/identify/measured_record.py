@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.bags.content import is_bag
-from backlash_ros.core.identification.intervals import REPORTED, v_of_intervals
-from backlash_ros.tools.bag_reading import read_plain_numbers
-from backlash_ros.tools.bag_sections import WHOLE, Span, choose_namespace
-from backlash_ros.tools.errors import InputError
-from backlash_ros.tools.report import BAG, open_source
-from backlash_ros.tools.results import RECORD, SAMPLES
+from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.report.command import BAG, open_source
+from backlash_ros.tools.run_files.bag_reading import read_plain_numbers
+from backlash_ros.tools.run_files.bag_sections import WHOLE, Span, choose_namespace
+from backlash_ros.tools.run_files.results import RECORD, SAMPLES
 
 Array = NDArray[np.float64]
 Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values

@@ -11,19 +11,18 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from backlash_ros.core.errors import ParameterError
+from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimation.storage import save_estimate
 from backlash_ros.core.identification.identification import (
     Identification,
     Options,
     identifying,
 )
-from backlash_ros.core.parameter_table import Value
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.files import write_atomically
-from backlash_ros.tools.command_line import format_table
-from backlash_ros.tools.errors import BrokenOffError
-from backlash_ros.tools.identify.command import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import Value
+from backlash_ros.tools.cli.command_line import format_table
+from backlash_ros.tools.cli.errors import BrokenOffError
 from backlash_ros.tools.identify.identified_file import (
     as_estimate,
     commented_yaml,
@@ -31,9 +30,10 @@ from backlash_ros.tools.identify.identified_file import (
     numbers,
 )
 from backlash_ros.tools.identify.measured_record import MeasuredRecord
+from backlash_ros.tools.identify.names import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
 from backlash_ros.tools.identify.page import render
 from backlash_ros.tools.identify.pictures import draw
-from backlash_ros.tools.results import result_directory, write_summary, write_table
+from backlash_ros.tools.run_files.results import result_directory, write_summary, write_table
 
 
 def options_of(options: argparse.Namespace) -> Options:

@@ -9,7 +9,7 @@ from math import isfinite
 import numpy as np
 
 from backlash_ros.core.identification.identification import Identification
-from backlash_ros.tools.html_report import NOTHING, Picture, page, picture_section, table
+from backlash_ros.tools.pages.html_page import NOTHING, Picture, page, picture_section, table
 
 TITLE = 'Identification of backlash and G(z)'
 

@@ -17,7 +17,7 @@ from backlash_ros.core.identification.uncertainty import (
     response_std,
     root_covariances,
 )
-from backlash_ros.tools.drawing import (
+from backlash_ros.tools.pages.drawing import (
     COLOURS,
     curve,
     label,
@@ -27,7 +27,7 @@ from backlash_ros.tools.drawing import (
     png,
     zero_line,
 )
-from backlash_ros.tools.html_report import Picture
+from backlash_ros.tools.pages.html_page import Picture
 
 Array = NDArray[np.float64]
 

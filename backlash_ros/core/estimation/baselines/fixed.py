@@ -12,9 +12,9 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.backlash import Backlash
 from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
-from backlash_ros.core.state_model import StateModel
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 

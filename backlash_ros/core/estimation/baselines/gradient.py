@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.baselines.agreement import Agreement
 from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
-from backlash_ros.core.pole_placement import FourBlocks
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.plant.four_blocks import FourBlocks
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from backlash_ros.core.errors import ParameterError
-from backlash_ros.core.model_check import check_model
-from backlash_ros.core.state_model import StateModel
-from backlash_ros.core.transfer_function import TransferFunction
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.model_check import check_model
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 

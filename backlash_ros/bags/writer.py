@@ -1,0 +1,161 @@
+"""Writes serialised messages to a rosbag2 bag of which a crash leaves all but the last moment."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.typesys import Stores, get_typestore
+
+from backlash_ros.bags.content import lock_folder, sync_path
+from backlash_ros.core.parameters.errors import ParameterError
+
+STORAGE = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+
+
+class RecordingError(RuntimeError):
+    """The bag cannot take any more: the message is the reason in a few words."""
+
+
+class Bag:
+    """An open bag. After a RecordingError it is closed, and holds what was flushed before.
+
+    path: folder, must not exist. storage: a key of STORAGE. Raises ParameterError.
+    saved: messages that a crash leaves. saved_ns: the time from the first to the last of them.
+    """
+
+    def __init__(self, path: str, storage: str) -> None:
+        self.path = Path(path)
+        self.saved = 0
+        self.saved_ns = 0
+        self._written = 0
+        self._first_ns, self._last_ns = 2**63, 0
+        self._types = get_typestore(Stores.ROS2_JAZZY)
+        self._lock: int | None = None
+        try:
+            self._writer = Writer(self.path, version=9, storage_plugin=STORAGE[storage])
+        except (WriterError, OSError) as error:
+            raise _refusal(path, error) from None
+        try:
+            self._writer.open()
+            self._lock = lock_folder(self.path)
+            self._flush = _flush_of(self._writer)
+            if self._flush is not None:
+                self._flush()
+            sync_path(self.path)
+            sync_path(self.path.parent)
+        except (WriterError, OSError, sqlite3.Error) as error:
+            self._abort()
+            if not isinstance(error, WriterError):
+                # Half a bag would be in the way of the next attempt.
+                shutil.rmtree(self.path, ignore_errors=True)
+            raise _refusal(path, error) from None
+
+    @property
+    def survives_a_crash(self) -> bool:
+        """Whether flush() works with the version of rosbags that is installed."""
+        return self._flush is not None
+
+    def add_topic(self, topic: str, message_type: str) -> Connection:
+        """Announce a topic, with a type like std_msgs/msg/Float64; raises RecordingError."""
+        try:
+            return self._writer.add_connection(topic, message_type, typestore=self._types)
+        except (OSError, sqlite3.Error) as error:
+            raise self._broken(error) from error
+
+    def write(self, connection: Connection, stamp_ns: int, message: bytes) -> None:
+        """Append a message in CDR; raises RecordingError."""
+        try:
+            self._writer.write(connection, stamp_ns, message)
+        except (OSError, sqlite3.Error) as error:
+            raise self._broken(error) from error
+        self._written += 1
+        self._first_ns = min(self._first_ns, stamp_ns)
+        self._last_ns = max(self._last_ns, stamp_ns)
+
+    def flush(self) -> None:
+        """Let all that was written survive a crash and a power cut; raises RecordingError."""
+        if self._flush is None or self._written == self.saved:
+            return
+        try:
+            self._flush()
+        except (OSError, sqlite3.Error) as error:
+            raise self._broken(error) from error
+        self._note_saved()
+
+    def close(self) -> None:
+        """Write what readers need to open the bag; raises RecordingError."""
+        try:
+            self._writer.close()
+            for file in (*self.path.iterdir(), self.path):
+                sync_path(file)
+        except (OSError, sqlite3.Error) as error:
+            raise self._broken(error) from error
+        self._note_saved()
+        self._unlock()
+
+    def _note_saved(self) -> None:
+        self.saved = self._written
+        self.saved_ns = max(0, self._last_ns - self._first_ns)
+
+    def _broken(self, error: OSError | sqlite3.Error) -> RecordingError:
+        self._abort()
+        return RecordingError(_reason(error))
+
+    def _abort(self) -> None:
+        # What does not fit on the disk now did not a moment ago.
+        with contextlib.suppress(OSError, sqlite3.Error):
+            self._writer.abort()
+        self._unlock()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+
+def _flush_of(writer: Writer) -> Callable[[], None] | None:
+    """What writes a bag to the disk and keeps it open; None if this rosbags has changed too much.
+
+    The only place that looks inside of rosbags, which has no such function of its own.
+    """
+    storage: Any = writer.storage
+    try:
+        if writer.storage_plugin is StoragePlugin.SQLITE3:
+            commit: Callable[[], None] = storage.conn.commit
+            return commit
+        finish_chunk, stream, messages = storage.close_chunk, storage.bio, storage.chunk.msgs
+    except AttributeError:
+        return None
+    if not callable(finish_chunk) or messages:
+        return None
+
+    def flush() -> None:
+        # A chunk without messages would have no time.
+        if storage.chunk.msgs:
+            finish_chunk()
+        stream.flush()
+        os.fsync(stream.fileno())
+
+    return flush
+
+
+def _reason(error: Exception) -> str:
+    text = (error.strerror or '') if isinstance(error, OSError) else ''
+    return text or ' '.join(str(error).split()) or type(error).__name__
+
+
+def _refusal(path: str, error: Exception) -> ParameterError:
+    if isinstance(error, (WriterError, FileExistsError)):
+        return ParameterError('bag', path, 'exists already', 'name a new folder')
+    return ParameterError(
+        'bag', path, f'cannot be made: {_reason(error)}',
+        'name a folder where there is room and you may write',
+    )

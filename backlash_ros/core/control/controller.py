@@ -1,0 +1,226 @@
+"""The adaptive backlash inverse controller: estimator, structure, inverse and limits."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from math import inf, isnan
+from typing import NamedTuple, Protocol
+
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.structure import Adoption, Situation, Structure
+from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.state_model import StateModel
+
+# Samples after which a better design takes over though v crosses the gap: an unstable loop never
+# stops to.
+LONGEST_WAIT = 200
+# Lost outputs in a row that are stepped over; after more nothing is left to predict from them.
+LONGEST_GAP = 1000
+LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
+
+
+def plausible(value: float) -> bool:
+    """Whether a value can be a measurement at all; nan, inf and absurd magnitudes are not."""
+    return abs(value) <= LARGEST
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds of v [unit of v] and of its move per sample."""
+
+    low: float = -inf
+    high: float = inf
+    move: float = inf
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ParameterError(
+                'control.min', self.low, f'must be < control.max={self.high!r}'
+            )
+
+    @property
+    def zero(self) -> float:
+        """The v nearest to 0 within the bounds."""
+        return min(max(0.0, self.low), self.high)
+
+    def apply(self, v: float, v_before: float) -> float:
+        """What may be sent instead of v after v_before: every command passes through here, last.
+
+        It is within the bounds, or as far on the way to them as one sample allows; v_before stays
+        where v is no number.
+        """
+        if self.low <= v <= self.high and abs(v - v_before) <= self.move and abs(v) <= LARGEST:
+            return v
+        if isnan(v):
+            v = v_before
+        # Beyond the largest measurement nobody could tell what v does.
+        v = min(max(v, self.low, -LARGEST), self.high, LARGEST)
+        return min(max(v, v_before - self.move), v_before + self.move)
+
+
+class ControlStep(NamedTuple):
+    """What one sample made: the command, and the estimate it was computed with."""
+
+    y_m: float
+    y: float
+    u_d: float
+    v: float
+    estimate: Estimate
+
+
+class ModelLearner(Protocol):
+    """Learns a better model of G."""
+
+    @property
+    def proposal(self) -> StateModel | None:
+        """A better G, of whatever order; None if none is new."""
+
+    def adopt(self, model: StateModel) -> None:
+        """Let x_hat be in the coordinates of this model from now on."""
+
+
+class AdaptiveController:
+    """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
+
+    Call `step` once per received y, and `refine` when v is on its way. Learning from y(k) comes
+    before v(k) only where the structure feeds y back; else v(k) need not wait for it.
+
+    compensating: False inverts the slope alone, as if there were no gap.
+    learner: who proposes better models of G, for the structure to be designed anew; None where
+    that of the beginning is kept.
+    """
+
+    def __init__(
+        self, estimator: Estimator, structure: Structure, inverse: BacklashInverse,
+        limits: Limits, learner: ModelLearner | None = None,
+    ) -> None:
+        self.estimator, self.structure = estimator, structure
+        self.inverse, self.limits = inverse, limits
+        self.compensating = True
+        self.lost_samples = 0
+        self.adopted: StateModel | None = None  # the learned model of G that is in use
+        self._learner = learner
+        self._considered: StateModel | None = None  # the proposal that was designed for last
+        self._design: Iterator[Adoption | None] = iter(())
+        self._adoption: Adoption | None = None  # of the finished design, until it may take over
+        self._waited = 0  # samples for which it could not
+        self._interval: Interval | None = None
+        # y(k), the interval before it, samples lost before it and what was applied, as long as
+        # it is still to be learned from.
+        self._lesson: (
+            tuple[float, Interval, int, Sequence[float], Sequence[float]] | None
+        ) = None
+
+    def step(
+        self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
+        instead: Sequence[float] = (),
+    ) -> ControlStep:
+        """Return the command for sample k.
+
+        y, y_m: output and reference, finite. lost: samples that never arrived since the last
+        call; the plant went on with the last v through all of them. applied: the v that was
+        really applied in each of the lost + 1 intervals since then, if it is known. instead: what
+        may have been applied in each of them, nan where there is no doubt.
+        """
+        if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST):
+            raise ValueError(f'y={y!r} and y_m={y_m!r} must be finite and no larger than '
+                             f'{LARGEST:g}')
+        if lost < 0:
+            raise ValueError(f'lost={lost!r} must be >= 0')
+        if applied or instead:
+            _check_intervals(lost + 1, applied, instead)
+        if self._lesson is not None:
+            self._learn()
+        if self._interval is not None:
+            self._lesson = y, self._interval, lost, applied, instead
+            if self.structure.needs_output:
+                self._learn()
+        estimator, inverse = self.estimator, self.inverse
+        used = estimate = estimator.estimate
+        if not self.compensating:
+            used = replace(estimate, c_r=0.0, c_l=0.0)
+        v_before = inverse.v
+        u_d, v, f = self.structure.control(Situation(y_m, y, used, estimator), inverse)
+        v = self.limits.apply(v, v_before)
+        inverse.applied(v)
+        self._interval = Interval(v, y_m, u_d, f)
+        return ControlStep(y_m, y, u_d, v, estimate)
+
+    def start_from(self, v: float) -> None:
+        """Say which v acts now, so that the first command goes on from there."""
+        self.inverse.start_from(v)
+
+    def go_on_from(self, before: AdaptiveController) -> None:
+        """Take over from the controller before this one, as the state of the plant got unknown.
+
+        v, the line that is engaged and the learned model of G stay.
+        """
+        self.inverse.go_on_from(before.inverse)
+        self._considered = before._considered
+        if self._learner is not None and before.adopted is not None:
+            self._learner.adopt(before.adopted)
+            self.adopted = before.adopted
+        self.structure.go_on_from(before.structure, state_known=False)
+
+    def refine(self, budget_s: float = inf) -> None:
+        """Do what the command did not have to wait for, for about so many seconds at most.
+
+        Who has no time for it leaves it out: the next step learns what it has to, and a search
+        for the gap pauses.
+        """
+        started = time.perf_counter()
+        if self._lesson is not None:
+            self._learn()
+        self.estimator.refine(budget_s)
+        if self._learner is not None:
+            self._design_on(self._learner, started + budget_s)
+
+    def _design_on(self, learner: ModelLearner, until: float) -> None:
+        """Design the structure for the newest proposal, a piece at a time while there is time."""
+        while time.perf_counter() < until:
+            # A design that is begun is ended: a proposal a second would never be used otherwise.
+            for adoption in self._design:
+                self._adoption = adoption
+                break
+            else:
+                proposal = learner.proposal
+                if proposal is not None and proposal is not self._considered:
+                    self._considered, self._design = proposal, self.structure.design(proposal)
+                    self._adoption, self._waited = None, 0
+                    continue
+                if self._adoption is None:
+                    return
+                self._waited += 1
+                if self.structure.may_change or self._waited > LONGEST_WAIT:
+                    # At once and together: x_hat and gains of two models do not fit each other.
+                    assert self._considered is not None
+                    learner.adopt(self._considered)
+                    self.adopted = self._considered
+                    self._adoption(self.estimator)
+                    self._adoption = None
+                return
+
+    def _learn(self) -> None:
+        lesson, self._lesson = self._lesson, None
+        assert lesson is not None
+        y, interval, lost, applied, instead = lesson
+        v, y_m, u_d, f, other = interval
+        for i in range(lost + 1):
+            if applied:
+                v = applied[i]
+            if instead:
+                other = instead[i]
+            self.estimator.update(y if i == lost else None, Interval(v, y_m, u_d, f, other))
+        self.lost_samples += lost
+
+
+def _check_intervals(count: int, applied: Sequence[float], instead: Sequence[float]) -> None:
+    for values in (applied, instead):
+        if values and len(values) != count:
+            raise ValueError(f'applied and instead must have lost + 1 = {count!r} values each')
+    for v in applied:
+        if not -LARGEST <= v <= LARGEST:
+            raise ValueError(f'applied={applied!r} must be finite and no larger than {LARGEST:g}')

@@ -1,0 +1,140 @@
+"""Backlash inverse, equations (2.2) and (2.3), with a direction band and a slow take-up."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.backlash import Region
+
+LEFT, GAP, RIGHT = Region.LEFT, Region.GAP, Region.RIGHT
+
+
+class BacklashInverse:
+    """v = BI(u_d): crosses the gap whenever u_d turns, equations (2.2) and (2.3).
+
+    With the true m, c_r, c_l this is the exact inverse (2.2); with estimates, which may differ
+    from call to call, the adaptive inverse (2.3).
+
+    direction_band: u_d has turned only when it came back from its extreme by more than this
+        [unit of u_d]; until then v is held. 0 is the printed inverse.
+    take_up: largest move of v per sample while the gap is crossed (2.3: "a line segment with a
+        finite slope"), and over to a line that new estimates have moved by more than that [unit
+        of v]; inf jumps. From there on v goes as far as u_d does.
+    """
+
+    def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
+        if not direction_band >= 0.0:
+            raise ParameterError('inverse.direction_band', direction_band, 'must be >= 0')
+        if not take_up > 0.0:
+            raise ParameterError('inverse.take_up_rate', take_up, 'must be > 0')
+        self.direction_band, self.take_up = direction_band, take_up
+        self._least_band = direction_band
+        self.limited = False  # whether the last v could not be applied as it was
+        self.v = 0.0
+        self.side = GAP  # line in use; GAP until u_d moves for the first time
+        self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
+        self.taking_up = False  # whether v is still on its way to the line
+        self._slowed = False  # whether that counts for the whole way to where u_d wants v
+        self._play = nan, nan, nan  # m, c_r, c_l in use the sample before
+        self._u = 0.0  # what they make of v, as long as v is on its way to a line
+
+    def set_band(self, band: float) -> None:
+        """Use this band, and none narrower from now on."""
+        self.direction_band = self._least_band = band
+
+    def widen_band(self, band: float) -> None:
+        """Use this band while it is wider than the one set: the noise of u_d may vary."""
+        least = self._least_band
+        self.direction_band = band if band > least else least
+
+    def go_on_from(self, other: BacklashInverse) -> None:
+        """Take over v and the line that is engaged."""
+        self.v, self.side, self.extreme = other.v, other.side, other.extreme
+        self.taking_up, self.limited = other.taking_up, other.limited
+        self._play, self._u, self._slowed = other._play, other._u, other._slowed
+
+    def direction(self, u_d: float) -> Region:
+        """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held.
+
+        Asking does not advance the state.
+        """
+        move, band = u_d - self.extreme, self.direction_band
+        # Only a turn has to leave the band; going on in the same direction is never noise.
+        if move > 0.0:
+            return RIGHT if band == 0.0 or self.side is RIGHT or move > band else GAP
+        if move < 0.0:
+            return LEFT if band == 0.0 or self.side is LEFT or move < -band else GAP
+        return GAP
+
+    def step(self, u_d: float, m: float, c_r: float, c_l: float) -> float:
+        """Return v(t) for u_d(t) and the parameters in use, equation (2.3)."""
+        side = self.direction(u_d)
+        if not self.taking_up:
+            self._u = self.extreme
+        elif self.side is not GAP:
+            side = self._side_on_the_way(u_d, side)
+        if side is not GAP:
+            self.taking_up = self.taking_up or side is not self.side
+            self.side, self.extreme = side, u_d
+        elif not self.taking_up or self.side is GAP:
+            return self.v
+        crossing = c_r if self.side is RIGHT else c_l
+        # Where v begins to move u, or would have stood if these parameters had been in use before.
+        until = self.extreme if self._slowed else self._u
+        way, take_up = until / m + crossing - self.v, self.take_up
+        if way > take_up or way < -take_up:
+            self.v += take_up if way > 0.0 else -take_up
+            self.taking_up = True
+        else:
+            self.v, self.taking_up = self.extreme / m + crossing, False
+            self._slowed = False
+        self._play = m, c_r, c_l
+        return self.v
+
+    def _side_on_the_way(self, u_d: float, side: Region) -> Region:
+        """The same as `direction` while v is on its way to a line.
+
+        u is held until v arrives: u_d has turned only when it lies on the other side of that.
+        """
+        m, c_r, c_l = self._play
+        low, high = m * (self.v - c_r), m * (self.v - c_l)
+        if self._u < low:
+            self._u = low
+        elif self._u > high:
+            self._u = high
+        if side is GAP:
+            return GAP
+        if self.side is RIGHT:
+            return LEFT if u_d < self._u - self.direction_band else RIGHT
+        return RIGHT if u_d > self._u + self.direction_band else LEFT
+
+    def slow_down(self) -> None:
+        """Let v go on to where u_d wants it like it crosses the gap, until it is there."""
+        self.taking_up = self._slowed = True
+
+    def aim(self, u_d: float, side: Region) -> None:
+        """Let the next step go to u_d on the line of this side, whatever it came from."""
+        self.side, self.extreme, self.taking_up = side, u_d, True
+
+    def hold(self, u_d: float) -> float:
+        """Keep v although u_d moved to where no line fits, and return v."""
+        if self.direction_band == 0.0:
+            self.extreme = u_d
+        return self.v
+
+    def start_from(self, v: float) -> None:
+        """Say which v acts before the next step, whatever was sent."""
+        if v != self.v and self.side is not GAP:
+            slope, c_r, c_l = self._play
+            self.extreme = slope * (v - (c_r if self.side is RIGHT else c_l))
+        self.v = v
+
+    def applied(self, v: float) -> None:
+        """Say which v was really applied (limits), so that the next move starts from there."""
+        limited = v != self.v
+        self.limited = limited
+        if limited:
+            # A v that was held back goes on its way although u_d rests.
+            self.taking_up = True
+            self.v = v

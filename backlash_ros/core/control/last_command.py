@@ -1,0 +1,39 @@
+"""What becomes of v when the loop ends or y stays away: it is held, or goes to zero."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from math import inf
+
+from backlash_ros.core.control.controller import Limits
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+
+
+def last_commands(action: str, v: float, limits: Callable[[], Limits]) -> Iterator[float]:
+    """Commands that follow v, one per sample; the last one stays in force.
+
+    action: hold (no further command), zero or ramp. Both go to the v nearest to 0 within the limits
+    as fast as the limits allow; where they allow any move, which ramp is refused for, that is one
+    command.
+
+    limits: those that hold when the next command is made.
+    """
+    if action == 'hold':
+        return
+    if action == 'zero' and v == limits().zero:
+        yield v  # said even if nothing changes
+    while v != limits().zero:
+        before, v = v, limits().apply(limits().zero, v)
+        if v == before:
+            return  # v is so large that a step at rate_max does not change it
+        yield v
+
+
+def check_last_commands(p: Parameters) -> None:
+    """Raise ParameterError for a ramp without a slope."""
+    for name in ('on_stop', 'on_timeout'):
+        if p.word(name) == 'ramp' and p.real('control.rate_max') == inf:
+            raise ParameterError(
+                name, 'ramp', 'needs a finite control.rate_max', 'set it, or take hold or zero'
+            )

@@ -1,0 +1,98 @@
+"""The four-block structure of Tao and Kokotović: u_d from filtered u_d, y and r, v = BI(u_d).
+
+The filters, the gains and what they make of the loop stand in four_blocks.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.structure import (
+    LARGEST_CAREFUL,
+    LARGEST_FEEDBACK,
+    Adoption,
+    Command,
+    Situation,
+    Structure,
+)
+from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.plant.four_blocks import FourBlocks
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+
+class PolePlacement:
+    """u_d from the four blocks, v = BI(u_d).
+
+    delay: what B/A_m delays a slow reference by, rounded to samples.
+    """
+
+    needs_output = True
+
+    def __init__(self, blocks: FourBlocks) -> None:
+        self._blocks = blocks
+        size = len(blocks.filter) - 1
+        self._companion = np.eye(size, k=-1)
+        self._companion[:1] = -blocks.filter[1:]
+        self._w_1: Array = np.zeros(size)
+        self._w_2: Array = np.zeros(size)
+        # r and what it asks for, newest first.
+        self._r: Array = np.zeros(len(blocks.demand[0]))
+        self._asked: Array = np.zeros(len(blocks.demand[1]) - 1)
+        self._reach = 0.0  # largest of it so far
+        self.delay = round(_delay_of(blocks.reference))
+
+    @property
+    def may_change(self) -> bool:
+        """Nothing here changes with G."""
+        return True
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """The gains stay those of the G that was told."""
+        return iter(())
+
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over what the filters hold."""
+        if isinstance(other, PolePlacement) and len(other._w_1) == len(self._w_1):
+            self._w_1, self._w_2 = other._w_1, other._w_2
+            self._r, self._asked, self._reach = other._r, other._asked, other._reach
+
+    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+        """Return u_d and v = BI(u_d)."""
+        blocks, estimate = self._blocks, situation.estimate
+        u_d = float(blocks.theta_1 @ self._w_1 + blocks.theta_2 @ self._w_2)
+        u_d += blocks.theta_20 * situation.y + blocks.theta_3 * situation.y_m
+        u_d = self._bounded(u_d, situation.y_m, estimate)
+        v = inverse.step(u_d, estimate.m, estimate.c_r, estimate.c_l)
+        self._w_1 = self._companion @ self._w_1
+        self._w_2 = self._companion @ self._w_2
+        self._w_1[:1] += u_d
+        self._w_2[:1] += situation.y
+        return Command(u_d, v, 0.0)
+
+    def _bounded(self, u_d: float, r: float, estimate: Estimate) -> float:
+        """u_d, no further than feedback may go from what r asks for without disturbances."""
+        numerator, denominator = self._blocks.demand
+        self._r[1:] = self._r[:-1]
+        self._r[0] = r
+        asked = float(numerator @ self._r - denominator[1:] @ self._asked)
+        self._asked[1:] = self._asked[:-1]
+        self._asked[0] = asked
+        self._reach = max(self._reach, abs(asked))
+        reach = max(self._reach, estimate.m * (estimate.c_r - estimate.c_l))
+        share = LARGEST_FEEDBACK if estimate.status is Status.TRACKING else LARGEST_CAREFUL
+        return min(max(u_d, asked - share * reach), asked + share * reach)
+
+
+def _delay_of(model: TransferFunction) -> float:
+    """Group delay at z = 1 in samples."""
+    a, b = model.denominator, model.numerator
+    return float(
+        np.polyval(np.polyder(a), 1.0) / np.sum(a) - np.polyval(np.polyder(b), 1.0) / np.sum(b)
+    )

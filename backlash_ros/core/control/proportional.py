@@ -1,0 +1,112 @@
+"""The paper's structure u_d = y_m + f v, equation (3.2), with its algebraic loop solved."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from math import hypot, inf, isnan
+
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.structure import Adoption, Command, Situation, Structure
+from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.state_model import StateModel
+
+# (m - f) divides: f beyond this share of m would multiply every error in m by more than five.
+LARGEST_F_OVER_M = 0.8
+
+
+# Turns of u_d smaller than this many of its standard deviations are noise of the estimates.
+NOISE_BAND = 3.0
+ROUNDING = 1e-12
+
+
+class Proportional:
+    """u_d = y_m + f v (3.2) with v = BI(u_d) (2.3): each needs the other.
+
+    On the branch with crossing c the loop has one solution, u_d = m (y_m + f c) / (m - f).
+    The branch counts when the direction of u_d agrees with it. m = f is singular: f is limited
+    to 0.8 m.
+    """
+
+    delay = 0
+    needs_output = False
+
+    def __init__(self) -> None:
+        self._estimate: Estimate | None = None  # that of the sample before
+
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over what the present v was made with."""
+        if isinstance(other, Proportional):
+            self._estimate = other._estimate
+
+    @property
+    def may_change(self) -> bool:
+        """Nothing here changes with G."""
+        return True
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Nothing here depends on G."""
+        yield lambda source: None
+
+    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+        """Return u_d and v that satisfy (3.2) and (2.3) together."""
+        y_m, estimate = situation.y_m, situation.estimate
+        m, c_r, c_l, f = estimate.m, estimate.c_r, estimate.c_l, estimate.f
+        before, self._estimate = self._estimate, estimate
+        if f == 0.0:  # nothing to solve
+            return Command(y_m, inverse.step(y_m, m, c_r, c_l), f)
+        if f > LARGEST_F_OVER_M * m:
+            f = LARGEST_F_OVER_M * m
+        if before is not None and before is not estimate and inverse.take_up < inf:
+            # A new estimate moves u_d too, so the inverse cannot tell by itself.
+            now, then = _solution(y_m, estimate, inverse), _solution(y_m, before, inverse)
+            if abs(now - then) > inverse.take_up:
+                inverse.slow_down()
+        right = m * (y_m + f * c_r) / (m - f)
+        left = m * (y_m + f * c_l) / (m - f)
+        v = inverse.v
+        nearer_right = abs(right / m + c_r - v) <= abs(left / m + c_l - v)
+        held = y_m + f * v
+        rests = abs(held - inverse.extreme) <= ROUNDING * (abs(held) + abs(v))
+        if not (rests or inverse.taking_up):
+            # Going on along the line in use, by far the most frequent case, needs no band.
+            side = inverse.side
+            u_d = right if nearer_right else left
+            if (
+                side is (Region.RIGHT if nearer_right else Region.LEFT)
+                and (held - inverse.extreme) * side > 0.0
+                and (u_d - inverse.extreme) * side > 0.0
+            ):
+                return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
+        if not isnan(estimate.std_m):
+            inverse.widen_band(NOISE_BAND * _deviation(y_m, f, estimate))
+        if inverse.taking_up:
+            for side, u_d in ((Region.RIGHT, right), (Region.LEFT, left)):
+                if inverse.side is side and inverse.direction(u_d) is Region.GAP:
+                    v = inverse.step(u_d, m, c_r, c_l)  # u_d rests, v goes on to its line
+                    return Command(y_m + f * v, v, f)
+        elif rests or inverse.direction(held) is Region.GAP:
+            return Command(held, v, f)  # first case of (3.3): u_d rests, and so does v
+        right_fits = inverse.direction(right) is Region.RIGHT
+        left_fits = inverse.direction(left) is Region.LEFT
+        if right_fits and left_fits:
+            # Both directions solve the loop: the smaller move is the one a shaft would make.
+            right_fits = nearer_right
+        if right_fits or left_fits:
+            u_d = right if right_fits else left
+            return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
+        return Command(held, inverse.hold(held), f)
+
+
+def _solution(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> float:
+    """v on the line in use."""
+    m, c = estimate.m, estimate.c_r if inverse.side is Region.RIGHT else estimate.c_l
+    return c + (y_m + estimate.f * c) / (m - min(estimate.f, LARGEST_F_OVER_M * m))
+
+
+def _deviation(y_m: float, f: float, estimate: Estimate) -> float:
+    """Standard deviation of u_d that comes from the estimates."""
+    m = estimate.m
+    by_m = f * (y_m + f * estimate.c_r) / (m - f) ** 2
+    by_c = m * f / (m - f)
+    return hypot(by_m * estimate.std_m, by_c * max(estimate.std_c_r, estimate.std_c_l))

@@ -1,0 +1,90 @@
+"""What every linear part of the controller offers: it turns y_m into u_d and v."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from operator import mul
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.estimation.protocol import Estimate, StateSource
+from backlash_ros.core.plant.state_model import StateModel
+
+# Largest feedback, whatever y does, in units of the u that the reference has asked for so far or
+# that the gap takes: while the backlash is unknown, as wrong as a first guess may be; later what
+# leads y back from where it has gone until then.
+LARGEST_CAREFUL, LARGEST_FEEDBACK = 10.0, 100.0
+
+
+class Situation(NamedTuple):
+    """What is known at a sample: reference, output, estimate, and who knows the state of G."""
+
+    y_m: float
+    y: float
+    estimate: Estimate
+    source: StateSource
+
+    @property
+    def x_hat(self) -> Sequence[float]:
+        """State of G in the coordinates of StateModel, shape (n,)."""
+        x_hat = self.source.x_hat
+        return x_hat.tolist() if isinstance(x_hat, np.ndarray) else x_hat
+
+    @property
+    def x_cov(self) -> NDArray[np.float64] | None:
+        """Covariance of x_hat, shape (n, n); None where there is none."""
+        return self.source.x_cov
+
+
+class Command(NamedTuple):
+    """Desired input u_d of G, the control v that shall cause it, and the gain f in use."""
+
+    u_d: float
+    v: float
+    f: float
+
+
+def dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Inner product of two states: beside so few numbers a call of NumPy takes longer."""
+    product: float = sum(map(mul, a, b))
+    return product
+
+
+# Makes a structure use what it has designed, given who knows the state of the better model.
+Adoption = Callable[[StateSource], None]
+
+
+class Structure(Protocol):
+    """Makes u_d from the reference and drives the inverse with it."""
+
+    @property
+    def delay(self) -> int:
+        """Samples by which y is meant to follow y_m."""
+
+    @property
+    def needs_output(self) -> bool:
+        """Whether u_d(k) depends on y(k); else v(k) may leave before y(k) was learned from."""
+
+    @property
+    def may_change(self) -> bool:
+        """Whether a design for a better model may take over at this sample."""
+
+    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+        """Return the command of this sample; advances the inverse by one step."""
+
+    def design(self, model: StateModel) -> Iterator[Adoption | None]:
+        """Prepare for a better model of G, a piece of some 0.3 ms each time it is asked on.
+
+        Yields None as long as there is more to do, and last what makes the structure use the
+        result at once and without a jump, when it `may_change`. Where the result would be less
+        safe than what is in use, or the structure does not adapt to G, it ends without that.
+        """
+
+    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+        """Take over from a structure that has made v until now, so that v does not jump.
+
+        state_known: whether x_hat still says where the plant is.
+        """

@@ -1,0 +1,192 @@
+"""What v does while the reference rests: as little as keeps y where it belongs.
+
+Feedback through a gap that is not known to the last digit would cross it for ever. So v is held
+while y is within a tolerance of the trajectory, and otherwise moves in single steps:
+
+- to the u that holds G at rest, stopping short of it by what is uncertain about the crossing. What
+  is left of u shows in y. Once it is known it is taken away by going on in the same direction,
+  which crosses no gap;
+- where y has left the tolerance, to a u that brings it back, and then to rest again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum, auto
+from math import inf, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.structure import dot
+from backlash_ros.core.control.tracking.design import TrackingDesign
+from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.plant.backlash import Region
+
+Array = NDArray[np.float64]
+
+# v is held as long as |x - x*| is within so many standard deviations of the noise on y (StateModel
+# scales x so that |x| is the energy of the free response of y over some 50 samples: 7 stands for
+# an error of the size of the noise).
+TOLERANCE = 21.0
+# The same for the first samples of a rest, in which y is brought as close as the noise allows.
+# Later only a drift is worth a step.
+CLOSE, SETTLING = 7.0, 200
+DOUBT = 2.0  # the same in standard deviations of x, where that is more
+SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
+ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
+TURNS = 2  # while the trajectory rests, after which feedback goes on in single steps
+ARRIVED = 0.5  # share of the tolerance within which v comes to rest after a motion
+STEADY = 0.004  # share of the tolerance by which x* may still move per sample
+OFF = 6.0  # standard deviations of y that mean a deviation while the state is unknown
+
+LED_BACK = 0.25  # share of what brings y back below which it is no longer needed
+TOO_WEAK = 0.5  # share of it with which y would not come back
+SHORT = 2.0  # standard deviations of the crossing by which v stops short of the u at rest
+GAIN = 1.5  # least factor by which a step has to lessen what u is off
+MATTERS = 0.25  # share of the tolerance that it must move x by
+
+
+class Mode(Enum):
+    """What v does."""
+
+    FOLLOW = auto()  # the trajectory moves, or y is far from it
+    HOLD = auto()  # u is to be that at rest
+    LEAD_BACK = auto()  # u is to bring y back
+
+
+class Rest:
+    """Decides whether v rests, and steps it there.
+
+    noise_std: of y.
+    """
+
+    def __init__(self, design: TrackingDesign, noise_std: float) -> None:
+        self.mode = Mode.HOLD
+        self.u_d = 0.0  # where v rests
+        self.caution = 0.0  # standard deviations by which the crossings are shrunk for it
+        self._noise_std = noise_std
+        self.use(design)
+        self._reach = 0.0  # square of the largest |x*| so far
+        self._limit = 0.0  # tolerance in use
+        self._rested = 0  # samples for which the trajectory has rested
+        self._turns, self._side = 0, Region.GAP  # since x* rests; line in use the sample before
+        self._near = 0  # samples since y was last away
+        self._pull = 0.0  # u - u* with which leading back began
+        self._low, self._high = inf, -inf  # of the window, where it was still the sample before
+
+    def use(self, design: TrackingDesign) -> None:
+        """Rest as this design says."""
+        self._gain: list[float] = design.gentle.tolist()
+        self._push = design.push
+
+    def go_on_from(self, other: Rest) -> None:
+        """Take over where another one of the same model rests."""
+        self.mode, self.u_d, self.caution = other.mode, other.u_d, other.caution
+        self._reach, self._limit, self._pull = other._reach, other._limit, other._pull
+        self._rested, self._near = other._rested, other._near
+        self._turns, self._side = other._turns, other._side
+
+    def decide(
+        self, y: float, window: Array, x: Sequence[float], onward: Sequence[float],
+        deviation: Sequence[float], x_std: float | None, side: Region,
+    ) -> Mode:
+        """Set the mode for this sample.
+
+        window: r from now on. x, onward: x* now and at the next sample. deviation: x_hat - x*.
+        x_std: standard deviation of x_hat, None where it is unknown. side: line in use.
+        """
+        self._reach = max(self._reach, dot(x, x))
+        least = SHARE * sqrt(self._reach)
+        tolerance = max(TOLERANCE * self._noise_std, least)
+        motion = 0.0
+        for now, then in zip(x, onward, strict=True):
+            motion += (then - now) ** 2
+        if motion > (STEADY * tolerance) ** 2:
+            self._low, self._high = inf, -inf
+            self._moves_on()
+        elif not self._is_still(window):
+            self._moves_on()
+        elif x_std is None:
+            off = abs(y - window.item(0)) > OFF * self._noise_std
+            self.mode = Mode.FOLLOW if off else Mode.HOLD
+        else:
+            self._rested += 1
+            if self._rested < SETTLING:
+                tolerance = max(CLOSE * self._noise_std, least)
+            self._limit = max(tolerance, DOUBT * x_std)
+            if self.mode is Mode.FOLLOW and side is not self._side:
+                self._turns += 1
+            self.mode = self._mode_for(deviation)
+        self._side = side
+        return self.mode
+
+    def _moves_on(self) -> None:
+        self.mode, self._rested, self._turns = Mode.FOLLOW, 0, 0
+
+    def _is_still(self, window: Array) -> bool:
+        newest = window.item(-1)
+        if self._low <= newest <= self._high:
+            return True  # it has lost one value and won one between the others
+        low, high = float(window.min()), float(window.max())
+        still = high - low <= self._noise_std
+        self._low, self._high = (low, high) if still else (inf, -inf)
+        return still
+
+    def _mode_for(self, deviation: Sequence[float]) -> Mode:
+        size = sqrt(dot(deviation, deviation))
+        # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
+        # it is due again when y has stayed where it belongs for a while, and is pushed away.
+        self._near = self._near + 1 if size <= self._limit else 0
+        if self._near >= SETTLING:
+            self._turns = 0
+        follows = self._turns < TURNS
+        if size > ASTRAY * self._limit and follows:
+            return Mode.FOLLOW
+        if self.mode is Mode.FOLLOW and follows:
+            return Mode.HOLD if size <= ARRIVED * self._limit else Mode.FOLLOW
+        pull = self._pull_back(deviation)
+        if self.mode is Mode.LEAD_BACK:
+            if pull * self._pull > LED_BACK * self._pull**2:
+                return Mode.LEAD_BACK
+            return Mode.HOLD
+        if size <= self._limit:
+            return Mode.HOLD
+        self._pull = pull
+        return Mode.LEAD_BACK
+
+    def stay(self, u_d: float) -> None:
+        """Rest at this u."""
+        self.u_d, self.caution = u_d, 0.0
+
+    def step(
+        self, estimate: Estimate, ideal: float, deviation: Sequence[float],
+        inverse: BacklashInverse, begins: bool,
+    ) -> None:
+        """Aim the inverse at the u that is wanted, where that is better than to stay.
+
+        ideal: u*. begins: whether the mode has changed with this sample.
+        """
+        if begins:
+            self.stay(inverse.extreme)
+        if inverse.taking_up:
+            return  # still on its way
+        engaged = estimate.c_l if inverse.side == Region.LEFT else estimate.c_r
+        u = estimate.m * (inverse.v - engaged)
+        if self.mode is Mode.LEAD_BACK:
+            pull = self._pull_back(deviation)
+            if begins or (u - ideal) * pull < TOO_WEAK * pull * pull:
+                self._aim(ideal + pull, u, 0.0, inverse)
+            return
+        side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
+        away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
+        if away * self._push > MATTERS * self._limit and away > GAIN * uncertain:
+            self._aim(ideal, u, SHORT, inverse)
+
+    def _pull_back(self, deviation: Sequence[float]) -> float:
+        return -dot(self._gain, deviation)
+
+    def _aim(self, u_d: float, u: float, caution: float, inverse: BacklashInverse) -> None:
+        self.u_d, self.caution = u_d, caution
+        inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)

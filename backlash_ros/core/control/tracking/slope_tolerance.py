@@ -1,0 +1,129 @@
+"""How far feedback is from instability where the slope of the backlash, or G, is another one."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from functools import lru_cache
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from backlash_ros.core.plant.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+# Variance of the disturbance per sample, seen in y, over that of the noise on y: from an observer
+# that believes its model to one that believes y alone.
+CONFIDENCES = (1e-4, 1e-1, 1e2, 1e5)
+FREQUENCIES = 120  # at which the distance from instability is looked at, on a log scale
+SLOWEST = 1e-3  # of them [rad per sample]
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """u = -gain x_hat - integral q, x_hat from an observer that believes `model`.
+
+    The observer is one of [x; d] as in FixedBacklash, d being a slow disturbance of u, and
+    q(k+1) = q(k) - y(k). gain: shape (n,).
+    """
+
+    model: StateModel
+    gain: Array
+    integral: float = 0.0
+
+
+def tolerates(model: StateModel, gain: Array, factor: float) -> bool:
+    """Whether u = -gain x_hat keeps G stable although u acts `factor` times as strongly.
+
+    x_hat comes from an observer of [x; d] that does not know of the factor, d being a slow
+    disturbance of u (FixedBacklash). gain: shape (n,). The gap itself is left out: it limits what
+    u can do wrong, but not for ever.
+    """
+    feedback = Feedback(model, gain)
+    return all(_is_stable(model, feedback, trust, factor) for trust in CONFIDENCES)
+
+
+def margin_in_pieces(plant: StateModel, feedback: Feedback) -> Generator[None, None, float]:
+    """Return the modulus margin of the loop; stops after each part of the work.
+
+    That is the distance of the open loop L from -1, min |1 + L| over all frequencies, for the
+    worst of the observers; 0 where the loop is unstable with one of them.
+    """
+    margin = inf
+    for confidence in CONFIDENCES:
+        _correction(feedback.model, confidence)
+        yield
+        if not _is_stable(plant, feedback, confidence):
+            return 0.0
+        yield
+        margin = min(margin, _distance(plant, feedback, confidence))
+        yield
+    return margin
+
+
+def _is_stable(
+    plant: StateModel, feedback: Feedback, confidence: float, factor: float = 1.0,
+) -> bool:
+    """Whether the loop with the state [x of the plant; x_hat; d_hat; q] is stable."""
+    correction = _correction(feedback.model, confidence)
+    if correction is None:
+        return False
+    n = plant.order
+    believed, drive, seen = _believed(feedback.model)
+    size = n + len(drive) + 1
+    gain = np.zeros(size)
+    gain[n:-2], gain[-1] = feedback.gain, feedback.integral
+    loop = np.zeros((size, size))
+    loop[:n, :n] = plant.a
+    loop[:n] -= factor * np.outer(plant.b, gain)
+    # x_hat(k+1) = prediction + correction (y(k+1) - its prediction)
+    loop[n:-1, n:-1] = believed
+    loop[n:-1] -= np.outer(drive, gain)
+    loop[n:-1] += np.outer(correction, plant.c * loop[0] - seen @ loop[n:-1])
+    if feedback.integral:
+        loop[-1, 0], loop[-1, -1] = -plant.c, 1.0
+    return bool(np.abs(linalg.eigvals(loop)).max() < 1.0)
+
+
+def _distance(plant: StateModel, feedback: Feedback, confidence: float) -> float:
+    """Least |1 + L| of a stable loop, opened at u."""
+    correction = _correction(feedback.model, confidence)
+    assert correction is not None
+    believed, drive, seen = _believed(feedback.model)
+    gain = np.append(feedback.gain, 0.0)
+    closed = believed - np.outer(drive, gain)
+    closed -= np.outer(correction, seen @ closed)
+    z = np.exp(1j * np.geomspace(SLOWEST, np.pi, FREQUENCIES))[:, None, None]
+    x = np.linalg.solve(z * np.eye(plant.order) - plant.a, plant.b[:, None])
+    x_hat = np.linalg.solve(z * np.eye(len(gain)) - closed, z * correction[:, None])
+    z = z[:, 0, 0]
+    minus_u = (gain @ x_hat)[:, 0] - feedback.integral / (z - 1.0)
+    return float(np.abs(1.0 + plant.c * x[:, 0, 0] * minus_u).min())
+
+
+def _believed(model: StateModel) -> tuple[Array, Array, Array]:
+    """Transition, input and output of [x; d]."""
+    n = model.order
+    a, b, c = np.eye(n + 1), np.append(model.b, 0.0), np.zeros(n + 1)
+    a[:n, :n], a[:n, n], c[0] = model.a, model.b, model.c
+    return a, b, c
+
+
+@lru_cache(maxsize=16)
+def _correction(model: StateModel, confidence: float) -> Array | None:
+    """Gain of the observer of [x; d], shape (n + 1,); None where none exists."""
+    n = model.order
+    a, _, c = _believed(model)
+    # In units in which one sample of d moves y like its noise does.
+    drift = np.zeros((n + 1, n + 1))
+    drift[n, n] = confidence / (float(np.linalg.norm(model.b)) * model.c) ** 2
+    # A trace of noise on x keeps the equation regular.
+    drift += 1e-12 * drift[n, n] * np.eye(n + 1)
+    try:
+        p = linalg.solve_discrete_are(a.T, c[:, None], drift, np.eye(1))
+    except (linalg.LinAlgError, ValueError):
+        return None
+    return np.asarray(p @ c / (c @ p @ c + 1.0))

@@ -1,0 +1,235 @@
+"""The fit of a record: labels, least squares, gap; labels anew with that gap, until it stands.
+
+Every solve is a Gauss-Newton step in the gap and the start of the play output, as window_fit.py
+explains. The G that is fitted around moves as well: to the one of low order that does what
+G (1 + Delta) does, where the data speak for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import (
+    BY_CHANCE,
+    CANDIDATES,
+    ENGAGED,
+    FAR_CANDIDATES,
+    GROWTH,
+    NO_GAP,
+    UNDECIDED_BY,
+    WALKS,
+    ZOOM,
+)
+from backlash_ros.core.estimation.fit.learned_error import wants_another_model
+from backlash_ros.core.estimation.fit.low_order import OutputError, low_order
+from backlash_ros.core.estimation.fit.pace import Pace
+from backlash_ros.core.estimation.fit.prior import beyond_chance
+from backlash_ros.core.estimation.fit.search import Candidate, search
+from backlash_ros.core.estimation.fit.solution import Around, Solution
+from backlash_ros.core.estimation.fit.window_fit import WindowFit, weights_of
+from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.model_check import check_model
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+RELABELLINGS = 8  # of relabelling, at most
+STANDS = 0.02  # standard deviations by which the gap may still move
+FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
+NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
+MODELS = 6  # times that G may move in one fit
+
+
+class Fitted(NamedTuple):
+    """A fit of a record with its solution. decided: whether no other gap is nearly as likely."""
+
+    fit: WindowFit
+    solution: Solution
+    decided: bool = True
+
+    @property
+    def around(self) -> Around:
+        """What it was made around."""
+        return self.fit.around
+
+    @property
+    def evidence(self) -> float:
+        """Log-likelihood, comparable between fits of the same samples."""
+        return self.solution.posterior.evidence
+
+    @property
+    def keeps_prior(self) -> bool:
+        """Whether the samples do not deny what was known from elsewhere."""
+        prior = self.around.prior
+        return prior is None or not beyond_chance(self.solution.theta - prior.theta, prior.cov)
+
+    def beginning(self, v: Array) -> Start:
+        """Where another fit of v (N,) is to begin."""
+        solution = self.solution
+        return self.fit.start._replace(p=solution.start).with_gap(solution.gap, v)
+
+
+def fitted(
+    v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """Fit v (N,) and y (N,), nan where lost, from labels for `start` on; yields between pieces."""
+    weights = weights_of(y)
+    reach = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
+    best: Fitted | None = None
+    for _ in range(RELABELLINGS):
+        fit = WindowFit(around, start, slope, reach, int(GROWTH * len(v)))
+        while fit.length < len(v):
+            part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
+            fit.take(fit.columns(v[part], y[part]), y[part], weights[part])
+            yield
+        solution = fit.solve()
+        result = Fitted(fit, solution)
+        if best is None or result.evidence >= best.evidence:
+            best = result
+        if fit.layout.leak:
+            # Without a leak an offset of u explains one as long as the labels are wrong.
+            solution = fit.solve(leaking=True)
+        if abs(solution.gap - start.gap) <= STANDS * solution.std_gap or solution.m == 0.0:
+            break
+        slope, start = solution.m, Fitted(fit, solution).beginning(v)
+        yield
+    assert best is not None
+    return best
+
+
+def searched(
+    v: Array, y: Array, around: Around, widest: float, pace: Pace,
+) -> Generator[None, None, Fitted | None]:
+    """Search the gap and fit around the best candidates.
+
+    None where a constant u explains y as well: v never engaged.
+    """
+    found = yield from search(
+        v, y, weights_of(y), around.model, around.error, around.told_std, widest,
+        pace,
+    )
+    if not found.candidates or found.candidates[0].evidence < found.null + ENGAGED:
+        return None
+    fits = []
+    for candidate in _apart(found.candidates):
+        start = Start(candidate.gap, candidate.start)
+        fits.append((yield from fitted(v, y, around, start, candidate.m, pace)))
+    # Those far away only tell whether the choice is clear.
+    best = most_likely(fits[:CANDIDATES])
+    # With an error of G the evidence is that of the best error for each gap: too flat to tell.
+    if not around.error.count:
+        best = best._replace(decided=not any(_rivals(best, other) for other in fits))
+    result = yield from with_better_model(v, y, best, pace)
+    return result._replace(decided=best.decided)
+
+
+def _rivals(best: Fitted, other: Fitted) -> bool:
+    """Whether the gap of another fit is nearly as likely, and not the same."""
+    behind = best.evidence - other.evidence
+    apart = abs(other.solution.gap - best.solution.gap)
+    return behind < UNDECIDED_BY and apart > BY_CHANCE * best.solution.std_gap + ZOOM[0] * abs(
+        best.solution.gap
+    )
+
+
+def _apart(candidates: list[Candidate]) -> list[Candidate]:
+    """The best candidates whose gaps are no neighbours, and the best ones far from them."""
+    chosen: list[Candidate] = []
+    for least, count in ((NEIGHBOURS, CANDIDATES), (ZOOM[0], CANDIDATES + FAR_CANDIDATES)):
+        for candidate in candidates:
+            if len(chosen) == count:
+                break
+            if all(abs(candidate.gap - other.gap) > least * other.gap for other in chosen):
+                chosen.append(candidate)
+    return chosen
+
+
+def fitted_with_model(
+    v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """The fit of a record, with the better G that follows from it."""
+    result = yield from fitted(v, y, around, start, slope, pace)
+    return (yield from with_better_model(v, y, result, pace))
+
+
+def motionless(
+    v: Array, y: Array, around: Around, slope: float, swing: float, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """The fit of a constant u: that of a gap wider than all of v, which moves by `swing`."""
+    start = Start(3.0 * swing, float(v[0]) + 1.5 * swing)
+    return (yield from fitted(v, y, around, start, slope, pace))
+
+
+def most_likely(results: Sequence[Fitted]) -> Fitted:
+    """The one with the largest evidence, the first of equals."""
+    return max(results, key=lambda result: result.evidence)
+
+
+def with_better_model(
+    v: Array, y: Array, result: Fitted, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """Let G move to the one of low order that fits best, until the evidence grows no more."""
+    weights = np.where(np.isfinite(y), weights_of(y), 0.0)
+    for _ in range(MODELS):
+        solution, around = result.solution, result.around
+        posterior = solution.posterior
+        if not solution.m > 0.0 or not wants_another_model(result.fit, solution):
+            break
+        transfer = around.model.transfer_function
+        u = result.fit.input(solution, v)
+        newest = slice(-max(pace.pieces(around.error.taps + 2), FEWEST_ROWS), None)
+        problem = OutputError(transfer, u[newest], y[newest], weights[newest], posterior.noise_std)
+        yield
+        better = yield from low_order(transfer, around.error, problem, posterior.scale)
+        if better is None or not _allowed(better):
+            break
+        model = StateModel(better)
+        moved = around.moved_to(model)._replace(scale=max(around.scale, posterior.scale))
+        yield
+        other = yield from fitted(v, y, moved, result.beginning(v), solution.m, pace)
+        gained = other.evidence - result.evidence
+        # What moving K coefficients may cost or bring by chance.
+        if gained < -around.error.count:
+            break
+        result = other
+        if gained < around.error.count:
+            break
+    return result
+
+
+def with_walk(
+    v: Array, y: Array, result: Fitted, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """Let a disturbance of u walk where the residual hints at it and the evidence is for it."""
+    solution, around = result.solution, result.around
+    if not solution.m > 0.0 or (solution.correlation == 0.0 and around.walk == 0.0):
+        return result
+    start = result.beginning(v)
+    still = around._replace(walk=0.0)
+    if around.walk > 0.0:
+        result = yield from fitted(v, y, still, start, solution.m, pace)
+    size = solution.m * max(solution.gap, NO_GAP * result.fit.swing)
+    tried = still._replace(walk=size)
+    walking = yield from fitted(v, y, tried, start, solution.m, pace)
+    evidence = [
+        walking.fit.solve(share * size).posterior.evidence for share in WALKS
+    ]
+    best = int(np.argmax(evidence))
+    if evidence[best] <= result.evidence:
+        return result
+    around = still._replace(walk=WALKS[best] * size)
+    return (yield from fitted(v, y, around, walking.fit.start, solution.m, pace))
+
+
+def _allowed(model: TransferFunction) -> bool:
+    try:
+        check_model(model)
+    except ParameterError:
+        return False
+    return True

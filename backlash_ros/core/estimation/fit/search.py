@@ -1,0 +1,170 @@
+"""Which gap, and which start of the play output within it, the samples speak for.
+
+All pairs are compared by the evidence of the regression in which the gap is given: then y depends
+on m, m c_r, the state at the start and the error of G alone, and what all pairs have in common is
+projected out once. A coarse grid over all gaps comes first, a close one around the best second:
+where v moves by half a gap per sample, minima lie some 3 % of the gap apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core.estimation.constants import GAPS, NO_GAP, STARTS, ZOOM
+from backlash_ros.core.estimation.fit.pace import Pace
+from backlash_ros.core.estimation.regression.error_model import ErrorModel
+from backlash_ros.core.estimation.regression.posterior import NOISE_WEIGHT, SCALES
+from backlash_ros.core.estimation.regression.regressors import held
+from backlash_ros.core.plant.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+
+class Candidate(NamedTuple):
+    """A gap with the best start for it. evidence: log-likelihood, comparable within a search."""
+
+    evidence: float
+    gap: float
+    start: float
+    m: float
+
+
+class Found(NamedTuple):
+    """Candidates, best first, and the evidence that v never engaged."""
+
+    candidates: list[Candidate]
+    null: float
+
+
+def search(
+    v: Array, y: Array, weights: Array, model: StateModel, error: ErrorModel, told_std: float,
+    widest: float, pace: Pace,
+) -> Generator[None, None, Found]:
+    """Compare gaps up to `widest` over v (N,) and y (N,), nan where lost; yields between pieces."""
+    swing = float(np.ptp(v))
+    top = min(swing, widest)
+    if not (top > 0.0 and NO_GAP * swing > 0.0) \
+            or float(weights[np.isfinite(y)].sum()) <= model.order + 3:
+        return Found([], 0.0)
+    comparison = _Comparison(v, y, weights, model, error, told_std)
+    null = comparison.null
+    gaps: Array = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
+    coarse = yield from comparison.best_per_gap(gaps, STARTS, pace)
+    best = max(coarse)
+    reach, count = ZOOM
+    close = np.asarray(best.gap * np.linspace(1.0 - reach, 1.0 + reach, count))
+    fine = yield from comparison.best_per_gap(
+        close[close <= top], 2 * STARTS - 1, pace
+    )
+    found = sorted([*coarse, *fine], reverse=True)
+    return Found(found, null)
+
+
+class _Comparison:
+    """The regression for given gaps, many at once."""
+
+    def __init__(
+        self, v: Array, y: Array, weights: Array, model: StateModel, error: ErrorModel,
+        told_std: float,
+    ) -> None:
+        self._v, self._model, self._error = v, model, error
+        self._told_std = told_std
+        self._kept = np.flatnonzero(np.isfinite(y))
+        self._root = np.sqrt(weights[self._kept])
+        self.rows = float(weights[self._kept].sum())
+        n = model.order
+        inputs = np.zeros((n + 1, len(v)))
+        inputs[n] = 1.0
+        states = np.zeros((n + 1, n))
+        states[:n] = model.to_observer.T
+        common = self._filtered(inputs, states)
+        if error.leak:
+            before = np.append(0.0, np.cumsum(held(y, 0.0))[:-1])
+            common = np.vstack([common, before[self._kept] * self._root])
+        self._basis = np.linalg.qr(common.T)[0]
+        self._y = self._projected((y[self._kept] * self._root)[None, :])[0]
+        self._energy = float(self._y @ self._y)
+        self._freedom = self.rows - len(common) + NOISE_WEIGHT
+        self._told = NOISE_WEIGHT * told_std**2
+        self.null = float(self._log_likelihood(self._energy + self._told))
+
+    def best_per_gap(
+        self, gaps: Array, starts: int, pace: Pace,
+    ) -> Generator[None, None, list[Candidate]]:
+        """The best start for each gap."""
+        v0 = float(self._v[0])
+        pairs = [
+            (float(gap), v0 + float(share) * float(gap))
+            for gap in gaps for share in np.linspace(0.0, 1.0, starts if gap > 0.0 else 1)
+        ]
+        best: dict[float, Candidate] = {}
+        while pairs:
+            count = pace.pieces(len(self._v))
+            part, pairs = np.array(pairs[:count]), pairs[count:]
+            evidence, slopes = self._compare(part[:, 0], part[:, 1])
+            for (gap, start), value, m in zip(part, evidence, slopes, strict=True):
+                if gap not in best or value > best[gap].evidence:
+                    best[gap] = Candidate(float(value), float(gap), float(start), float(m))
+            yield
+        return list(best.values())
+
+    def _compare(self, gaps: Array, starts: Array) -> tuple[Array, Array]:
+        """Evidence and slope of each pair, shape (H,)."""
+        p = np.empty((len(self._v), len(gaps)))
+        held = starts.copy()
+        for k, value in enumerate(self._v.tolist()):
+            np.maximum(held, value, out=held)
+            np.minimum(held, value + gaps, out=held)
+            p[k] = held
+        moved = self._projected(self._filtered(p.T))
+        energy = np.einsum('hn,hn->h', moved, moved)
+        still = energy <= 0.0  # v never engaged: all is in common
+        energy[still] = 1.0
+        slopes = np.where(still, 0.0, moved @ self._y / energy)
+        squares = np.maximum(self._energy - slopes**2 * energy, 0.0)
+        if not self._error.count:
+            return self._log_likelihood(squares + self._told), slopes
+        jumps = np.diff(p, axis=0, prepend=starts[None, :]).T
+        direct = self._answers(jumps)
+        columns = self._error.filtered(direct)[:, self._kept]
+        columns = np.swapaxes(columns @ self._error.spread, 1, 2) * self._root
+        columns = columns - (columns @ self._basis) @ self._basis.T
+        along = np.einsum('hkn,hn->hk', columns, moved) / energy[:, None]
+        columns = columns - along[:, :, None] * moved[:, None, :]
+        gram = columns @ np.swapaxes(columns, 1, 2)
+        s, back = np.linalg.eigh(gram)
+        target = columns @ self._y
+        s = np.maximum(s, 1e-30)
+        z2 = (np.einsum('hkj,hk->hj', back, target)) ** 2 / s
+        z2 = np.minimum(z2, squares[:, None])
+        s = s * (slopes**2)[:, None]
+        squares = np.maximum(squares - z2.sum(axis=1), 0.0) + self._told
+        ratios = np.append(0.0, SCALES**2)[None, :, None] * (self._freedom / squares)[:, None, None]
+        shrink = 1.0 / (1.0 + ratios * s[:, None, :])
+        left = squares[:, None] + (shrink * z2[:, None, :]).sum(axis=2)
+        evidence = 0.5 * np.log(shrink).sum(axis=2) + self._log_likelihood(left)
+        evidence -= 0.5 * np.append(0.0, SCALES**2)  # as posterior.py has it
+        return evidence.max(axis=1), slopes
+
+    def _log_likelihood(self, squares: Array | float) -> Array:
+        return np.asarray(-0.5 * self._freedom * np.log(squares / self._freedom))
+
+    def _answers(self, inputs: Array, states: Array | None = None) -> Array:
+        transfer = self._model.transfer_function
+        if states is None:
+            states = np.zeros((len(inputs), self._model.order))
+        late, last = lfilter(transfer.numerator, transfer.denominator, inputs, zi=states)
+        answers: Array = np.empty_like(late)
+        answers[:, :-1], answers[:, -1] = late[:, 1:], last[:, 0]
+        return answers
+
+    def _filtered(self, inputs: Array, states: Array | None = None) -> Array:
+        return np.asarray(self._answers(inputs, states)[:, self._kept] * self._root)
+
+    def _projected(self, rows: Array) -> Array:
+        return np.asarray(rows - (rows @ self._basis) @ self._basis.T)

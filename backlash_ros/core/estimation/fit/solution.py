@@ -1,0 +1,85 @@
+"""What a fit is made around, and what it says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.fit.crossings import Crossings
+from backlash_ros.core.estimation.fit.prior import Prior
+from backlash_ros.core.estimation.regression.error_model import ErrorModel
+from backlash_ros.core.estimation.regression.posterior import Posterior
+from backlash_ros.core.plant.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+# --- guards
+SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
+
+
+class Around(NamedTuple):
+    """What a fit is made around.
+
+    model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that
+    of the error of the G that was told, once this one was moved to where the data want it: it is no
+    better known for that. most: largest scale that is believed. walk: deviation by which a
+    disturbance of u walks over the record [unit of u], 0 for none.
+    """
+
+    model: StateModel
+    error: ErrorModel
+    told_std: float
+    prior: Prior | None = None
+    scale: float = 0.0
+    most: float = inf
+    walk: float = 0.0
+
+    def moved_to(self, model: StateModel) -> Around:
+        """The same around another G with as many moving poles."""
+        return self._replace(model=model, error=self.error.around(model))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What the samples of a window say.
+
+    posterior: of all unknowns. crossings: with honest deviations; None unless m > 0. gap: of the
+    solution, start: p of the solution at the start. count: samples that count, repeated readings
+    once. correlation: of successive residuals beyond chance. inflation: 1 - rho + N rho, by which
+    the covariance is widened. rms: of the residual.
+    """
+
+    posterior: Posterior
+    theta: Array
+    theta_cov: Array
+    crossings: Crossings | None
+    gap: float
+    start: float
+    count: float
+    correlation: float
+    inflation: float
+    rms: float
+
+    @property
+    def m(self) -> float:
+        """Slope; negative where v and y have opposite signs."""
+        return float(self.theta[0])
+
+    @property
+    def of_theta(self) -> Prior:
+        """What it says of theta."""
+        return Prior(self.theta, self.theta_cov)
+
+    @property
+    def moved_otherwise(self) -> bool:
+        """Whether y moves in a way that no backlash and no G explains, beyond chance."""
+        return self.count * self.correlation > 1.0
+
+    @property
+    def std_gap(self) -> float:
+        """Standard deviation of the gap; inf unless m > 0."""
+        return self.crossings.std_gap if self.crossings is not None else inf

@@ -1,0 +1,296 @@
+"""Least squares over a window of samples for one gap, with all that is not known of G.
+
+The labels of the play operator hold for the gap they were made with. The solution has a gap of its
+own, (m c_r - m c_l) / m, because the column of m c_l is free: it carries the derivative of y by the
+gap, so that labels made anew with it are a Gauss-Newton step (relabelling.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from math import inf, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, SLOW
+from backlash_ros.core.estimation.fit.crossings import crossings_of
+from backlash_ros.core.estimation.fit.solution import Around, Solution
+from backlash_ros.core.estimation.regression.play import NO_PAST, Labels, Start
+from backlash_ros.core.estimation.regression.posterior import (
+    VAGUE,
+    Posterior,
+    Triangle,
+    mixture,
+    with_zero,
+)
+from backlash_ros.core.estimation.regression.regressors import RAMPS, Regressors
+from backlash_ros.core.plant.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+PAST = 3  # memories of G for which what its error does may last
+STEP_SAMPLES = 64  # samples over which the size of a column is told
+# --- guards
+ANY_STATE = 1e3  # prior of x0, in units of the largest output and of the noise
+NO_RESIDUAL = 1e-10  # share of the largest y below which a residual is rounding
+
+
+class WindowFit:
+    """Takes in samples and solves for all unknowns.
+
+    slope: about m, for the prior of the error of G. reach: largest |y| and |v|. samples: how many
+    are expected, for a walk.
+    """
+
+    def __init__(
+        self, around: Around, start: Start, slope: float, reach: tuple[float, float],
+        samples: int = 0,
+    ) -> None:
+        self.around, self.start, self.slope, self.reach = around, start, slope, reach
+        self.model = around.model
+        ramp = max(-(-samples // RAMPS), SLOW) if around.walk > 0.0 else 0
+        past = start.past
+        self._begun = begun = start.after(past)
+        self._regressors = Regressors(around.model, around.error, begun.side == 0, ramp)
+        if len(past):
+            self._regressors.begin_after(np.diff(start.labels(past).p, prepend=start.p))
+        self.layout = self._regressors.layout
+        self.length = 0  # samples
+        self.reversals = 0
+        self._play = begun
+        self._highest, self._lowest = -inf, inf
+        self._rows: Array = np.empty((0, self.layout.unknowns))
+        self._y: Array = np.empty(0)
+        self._triangle = Triangle(self._vague(*reach))
+
+    @property
+    def swing(self) -> float:
+        """Distance between the largest and the smallest v."""
+        return max(self._highest - self._lowest, 0.0)
+
+    def _vague(self, y_reach: float, v_reach: float) -> Array:
+        """Weights of priors that are no information."""
+        n, layout = self.layout.n, self.layout
+        weights = np.zeros(layout.unknowns)
+        told_std = self.around.told_std
+        weights[:n] = told_std / (ANY_STATE * (y_reach + told_std))
+        unit = VAGUE * step_norm(self.model)
+        weights[n:layout.driven] = unit
+        weights[n + 1] = unit * (v_reach or 1.0)
+        weights[layout.walk] = unit
+        return weights
+
+    def columns(self, v: Array, y: Array) -> Array:
+        """Columns for the next v (N,), applied one after the other, and y (N,) after each.
+
+        `take` is to follow.
+        """
+        play = self._play
+        labels = play.labels(v)
+        self._advance(labels)
+        self._highest = max(self._highest, float(v.max()))
+        self._lowest = min(self._lowest, float(v.min()))
+        return self._regressors.rows(labels, y)
+
+    def take(self, rows: Array, y: Array, weights: Array) -> None:
+        """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
+        first, last = self.length, self.length + len(y)
+        weight = np.where(np.isfinite(y), weights, 0.0)
+        root = np.sqrt(weight)
+        rows = rows * root[:, None]
+        if last > len(self._y):
+            self._grow(last)
+        self._rows[first:last] = rows
+        self._y[first:last] = np.where(weight > 0.0, y, 0.0) * root
+        self._triangle.append(rows, self._y[first:last], float(weight.sum()))
+        self.length = last
+
+    def _grow(self, least: int) -> None:
+        """Make room for more samples than now, twice as many as there are."""
+        more = max(2 * len(self._y), least) - len(self._y)
+        self._rows = np.concatenate([self._rows, np.empty((more, self.layout.unknowns))])
+        self._y = np.concatenate([self._y, np.empty(more)])
+
+    def contradiction(
+        self, rows: Array, y: Array, solution: Solution,
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Square of y minus its prediction from rows, in units of its variance, shape (N,).
+
+        And which of them are outliers. nan where y was lost.
+        """
+        posterior = solution.posterior
+        var = np.einsum('np,pq,nq->n', rows, posterior.cov, rows) * solution.inflation + 1.0
+        squares: Array = (y - rows @ posterior.mean) ** 2 / (var * posterior.noise_std**2)
+        return squares, squares > GATE**2
+
+    def _advance(self, labels: Labels) -> None:
+        sides = labels.right - labels.left
+        before = self._play.side
+        changes = int(np.count_nonzero(np.diff(sides, prepend=float(before))))
+        # The first engagement is no reversal.
+        self.reversals += changes - int(before == 0 and changes > 0)
+        self._play = Start(
+            self._play.gap, float(labels.p[-1]), int(sides[-1]), float(labels.v_a[-1])
+        )
+
+    def play_output(self, gap: float, solution: Solution) -> float:
+        """Play output after the newest sample for a gap close to that of the labels."""
+        play = self._play
+        if play.side == 0:
+            return solution.start
+        return play.v_a + (gap if play.side < 0 else 0.0)
+
+    def start_after(self, v: Array) -> Start:
+        """Where the play operator stands after v (N,), the first samples of this fit."""
+        after = self._begun.after(v)
+        if not self.layout.errors or after.side == 0:
+            return after
+        history = np.concatenate([self.start.past, v])
+        gone = max(len(history) - PAST * self.model.memory, 0)
+        begin = self.start._replace(past=NO_PAST).after(history[:gone])
+        return begin._replace(past=history[gone:])
+
+    def restarted(self, around: Around, start: Start) -> WindowFit:
+        """A fit of samples yet to come, with the prior of `around`, after a break."""
+        return WindowFit(around, start, self.slope, self.reach)
+
+    def unexplained(self, solution: Solution) -> float:
+        """Motion of u behind the correlated part of the residual, over m times the gap."""
+        size = step_norm(self.model) / sqrt(STEP_SAMPLES)
+        scale = size * abs(solution.m) * max(solution.gap, 0.0)
+        motion = sqrt(solution.correlation) * solution.rms
+        return motion / scale if scale > 0.0 else inf
+
+    def solve(
+        self, walk: float | None = None, leaking: bool = False, alone: bool = False,
+    ) -> Solution:
+        """The solution for all samples so far.
+
+        walk: instead of that of `around`. leaking: where G integrates, it leaks for sure. alone:
+        without the prior of theta.
+        """
+        layout, gap = self.layout, self.start.gap
+        spreads: Array = np.ones(layout.errors)
+        if layout.jump:
+            # The first jump of p is known no better than the gap.
+            spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
+        triangle, offset, prior = self._triangle, 0.0, self.around.prior
+        if prior is not None and not alone:
+            triangle = triangle.informed(
+                layout.theta, prior.theta, prior.cov, self.around.told_std
+            )
+        if layout.ramps:
+            step = (walk or self.around.walk) / sqrt(layout.ramps)
+            triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
+        posterior = self._posterior(triangle, spreads, leaking)
+        posterior = replace(posterior, evidence=posterior.evidence + offset)
+        residual = self.residual(posterior)
+        squares = float(residual @ residual)
+        count = self._triangle.count
+        correlation = 0.0
+        if squares > count * (NO_RESIDUAL * self.reach[0]) ** 2 and count > 1.0:
+            lag = float(residual[1:] @ residual[:-1]) / squares
+            correlation = max(0.0, lag - BY_CHANCE / sqrt(count))
+        inflation = 1.0 - correlation + count * correlation
+        now = self._theta_now()
+        theta = now @ posterior.mean
+        cov = now @ posterior.cov @ now.T * (posterior.noise_std**2 * inflation)
+        m = float(theta[0])
+        held = float(posterior.mean[layout.n])
+        start = self.start.p
+        if self._begun.side == 0 and m != 0.0:
+            start = (held + float(posterior.mean[layout.n + 2])) / m
+        return Solution(
+            posterior, theta, cov, crossings_of(theta, cov),
+            float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
+            inflation, sqrt(squares / max(count, 1.0)),
+        )
+
+    def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:
+        """Of all unknowns; where G integrates, it may leak or not.
+
+        One is as likely as the other before the data speak.
+        """
+        layout, around = self.layout, self.around
+
+        def of(part: Triangle, base: int) -> Posterior:
+            return part.posterior(
+                base, self.slope, spreads, around.told_std, around.scale, around.most
+            )
+
+        if not layout.leak:
+            return of(triangle, layout.base)
+        where, base = layout.driven, layout.base
+        leaky, offset = triangle.with_prior(
+            slice(where, where + 1), around.error.leak, around.told_std
+        )
+        other = of(leaky, base)
+        if leaking:
+            return other
+        tight = triangle.without(where)
+        offset += tight.log_precision(where, base - 1) - leaky.log_precision(where + 1, base)
+        return mixture(with_zero(of(tight, base - 1), where), other, offset)
+
+    def _theta_now(self) -> Array:
+        """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""
+        layout = self.layout
+        now = np.zeros((3, layout.unknowns))
+        now[:, layout.theta] = np.eye(3)
+        now[1:, layout.walk] = -self._regressors.heights
+        return now
+
+    def residual(self, posterior: Posterior, since: int = 0) -> Array:
+        """Weighted y minus its fit from sample `since` on; 0 where y was lost."""
+        rows, y = self._rows[since:self.length], self._y[since:self.length]
+        return np.asarray(y - rows @ posterior.mean)
+
+    def misfit(self, solution: Solution, since: int) -> float:
+        """Mean square of the residual from sample `since` on, over that of all samples."""
+        newest = self.residual(solution.posterior, since)
+        known = np.count_nonzero(newest)
+        if not known or solution.rms == 0.0:
+            return 0.0
+        return float(newest @ newest) / known / solution.rms**2
+
+    def state(self, solution: Solution) -> tuple[Array, Array]:
+        """State of G after the newest sample, shape (n,), and its honest covariance (n, n)."""
+        posterior = solution.posterior
+        by = self._regressors.state_map()
+        variance = posterior.noise_std**2 * solution.inflation
+        known = self.layout.base
+        cov = by @ posterior.cov[:known, :known] @ by.T
+        return by @ posterior.mean[:known], cov * variance
+
+    def input(self, solution: Solution, v: Array) -> Array:
+        """u as the fit has it, shape (N,). v: the samples taken in."""
+        n = self.layout.n
+        labels = self._begun.labels(v)
+        mean = solution.posterior.mean
+        held, m, right, left = mean[n:n + 4]
+        walked = mean[self.layout.walk] @ self._regressors.ramps(0, len(v))
+        return np.asarray(
+            labels.held * held + labels.v_a * m - labels.right * right - labels.left * left + walked
+        )
+
+
+def weights_of(y: Array) -> Array:
+    """Weight of each reading: 1 over the length of the run of equal readings it stands in.
+
+    A sensor with a resolution repeats its error with its reading; what repeats tells nothing new.
+    """
+    changes = np.flatnonzero(np.diff(y) != 0.0) + 1  # nan differs from itself
+    lengths = np.diff(np.concatenate([[0], changes, [len(y)]]))
+    return np.repeat(1.0 / lengths, lengths)
+
+
+@lru_cache(maxsize=64)
+def step_norm(model: StateModel) -> float:
+    """Norm of the first samples of the step response of G."""
+    x: Array = np.zeros(model.order)
+    total = 0.0
+    for _ in range(STEP_SAMPLES):
+        x = model.a @ x + model.b
+        total += (model.c * float(x[0])) ** 2
+    return sqrt(total)

@@ -1,0 +1,99 @@
+"""From nothing, or from what was inherited, to the first estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import (
+    AS_GOOD,
+    BLOCK,
+    REPLACING,
+    REVERSALS,
+    SEARCH_GROWTH,
+    UNDECIDED,
+)
+from backlash_ros.core.estimation.fit.learned_error import plausible
+from backlash_ros.core.estimation.fit.prior import contradicts, prior_of
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, motionless, searched
+from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
+from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimation.regression.play import Start
+
+Array = NDArray[np.float64]
+
+TOLD = 1.0  # scale of the error of G that was told
+
+
+def acquire(learning: Learning) -> Task:
+    """Look for the backlash in the newest samples."""
+    record, search = learning.record, learning.acquisition
+    end = record.end
+    search.next_at = end + max(int(len(record) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
+    first = max(record.first, end - learning.searched)
+    record.forget_before(first)
+    v, y = record.since(first)
+    around = learning.free._replace(walk=learning.told_walk)
+    found = yield from searched(v, y, around, learning.widest, learning.pace)
+    if search.inherited is not None:
+        for begin in (0, len(v) // 2):
+            kept = yield from confirmed(
+                learning, v[begin:], y[begin:], search.inherited, found if begin == 0 else None
+            )
+            if kept is not None:
+                learning.unconfirmed = kept.around.prior
+                return learning.go_on_from(kept, first + begin)
+        if found is None or learning.usable(found, REPLACING) is None:
+            learning.reason = Status.INCONSISTENT
+            return False
+    before, search.candidate = search.candidate, None
+    if found is None or learning.usable(found) is None:
+        _explain(learning, found)
+        return False
+    # A first estimate has to be found twice: some samples alone may mislead.
+    search.candidate = found.solution.of_theta
+    search.next_at = end + BLOCK[0]
+    again = before is not None and not contradicts(search.candidate, before)
+    wanted = REVERSALS if around.error.count else 1
+    if again and found.decided and found.fit.reversals >= wanted:
+        return learning.go_on_from(found, first)
+    return False
+
+
+def confirmed(
+    learning: Learning, v: Array, y: Array, inherited: Estimate, free: Fitted | None,
+) -> Generator[None, None, Fitted | None]:
+    """A fit with what was learned before; None where the samples contradict it.
+
+    free: a fit without it, if there is one.
+    """
+    prior, current, pace = prior_of(inherited), learning.current, learning.pace
+    # G is no worse known than it was: it does not explain whatever has happened.
+    most = TOLD if current is None else current.solution.posterior.scale
+    alone = learning.free._replace(most=most)
+    gap = inherited.c_r - inherited.c_l
+    start = Start(gap, float(v[0]) + 0.5 * gap)
+    kept = yield from fitted(v, y, alone._replace(prior=prior), start, inherited.m, pace)
+    still = yield from motionless(v, y, alone, inherited.m, float(np.ptp(v)) + gap, pace)
+    least = still.solution.rms
+    if free is not None:
+        usable = learning.usable(free, REPLACING) is not None
+        if usable and contradicts(free.solution.of_theta, prior):
+            return None
+        least = min(least, free.solution.rms)
+    good = kept.solution.rms <= AS_GOOD * least and plausible(kept.fit, kept.solution)
+    return kept if good and kept.keeps_prior else None
+
+
+def _explain(learning: Learning, result: Fitted | None) -> None:
+    """Say why there is no estimate, where the samples should suffice for one."""
+    if learning.record.end < UNDECIDED:
+        return
+    learning.acquisition.rejected = result
+    if result is None:
+        learning.reason = Status.NOT_EXCITED
+        return
+    inconsistent = result.solution.m < 0.0 or result.solution.moved_otherwise
+    learning.reason = Status.INCONSISTENT if inconsistent else Status.ACQUIRING

@@ -1,0 +1,186 @@
+"""What becomes of the fit where samples contradict it: another explanation, or a shorter record."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from math import log
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import (
+    AS_GOOD,
+    BLOCK,
+    MISFIT,
+    RECOVERED,
+    REPLACING,
+    SEARCH_GROWTH,
+    SEARCHED,
+)
+from backlash_ros.core.estimation.fit.prior import Prior, contradicts
+from backlash_ros.core.estimation.fit.relabelling import (
+    Fitted,
+    fitted,
+    fitted_with_model,
+    most_likely,
+    searched,
+)
+from backlash_ros.core.estimation.fit.solution import Around
+from backlash_ros.core.estimation.moving_horizon.acquisition import confirmed
+from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
+from backlash_ros.core.estimation.protocol import Estimate, Status
+
+Array = NDArray[np.float64]
+
+
+def note_block(learning: Learning, fits: bool, number: int, count: int, changed: int) -> None:
+    """Note from when on the samples contradict the fit, or that they fit again.
+
+    fits: whether the `count` samples from `number` on do. changed: sample from which those that do
+    not fit do not.
+    """
+    if fits:
+        learning.consistent += count
+        since = learning.contradicted_from
+        if since is not None and learning.consistent >= RECOVERED:
+            # Whatever it was, it is over: what was measured meanwhile says nothing.
+            learning.record.lose(np.arange(since, number + count - learning.consistent))
+            learning.contradicted_from = None
+        return
+    learning.consistent = 0
+    if learning.contradicted_from is None:
+        learning.contradicted_from = learning.next_try = changed
+
+
+def change(squares: Array) -> int:
+    """Where samples begin to contradict a fit, from the normalised squares of residuals (N,).
+
+    The likeliest sample of a change after which their mean is beyond MISFIT (cumulative sum test:
+    E. S. Page, Continuous inspection schemes, Biometrika 41 (1954) 100-115).
+    """
+    excess = np.where(np.isfinite(squares), squares - MISFIT, 0.0)
+    return int(np.argmax(np.cumsum(excess[::-1])[::-1]))
+
+
+def halve(learning: Learning) -> Task:
+    """Let the older half of the record go where the newer one contradicts the whole.
+
+    Or where theta, as told, drifts by more than its deviation meanwhile.
+    """
+    record, (fit, solution, _), pace = learning.record, learning.fit, learning.pace
+    learning.next_try = record.end + max(fit.length // 4, BLOCK[1])
+    half = fit.length // 2
+    if half < RECOVERED:
+        return False
+    v, y = record.since(record.first)
+    around = learning.free
+    start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
+    newer = yield from fitted(v[half:], y[half:], around, start, solution.m, pace)
+    if learning.usable(newer, REPLACING) is None:
+        return False
+    whole = Prior(solution.theta, np.zeros((3, 3)))
+    if not (contradicts(newer.solution.of_theta, whole)
+            or learning.drifts_more(newer.solution, half)):
+        return False
+    if learning.expects_changes and not around.error.count:
+        # What the older half says holds as far as theta has not drifted since.
+        older = yield from fitted(
+            v[:half], y[:half], learning.around._replace(walk=0.0), fit.start, solution.m, pace
+        )
+        prior = learning.drifted(older.solution, half)
+        if older.solution.m > 0.0 and not contradicts(newer.solution.of_theta, prior):
+            newer = yield from fitted(
+                v[half:], y[half:], around._replace(prior=prior), newer.fit.start, solution.m, pace
+            )
+    return learning.go_on_from(newer, record.first + half, changed=True)
+
+
+def reconsider(learning: Learning, estimate: Estimate) -> Task:
+    """Explain samples that contradict the fit: by all of them, or by a change of the plant.
+
+    estimate: the published one.
+    """
+    current, since, record = learning.fit, learning.contradicted_from, learning.record
+    assert since is not None
+    bound = AS_GOOD * current.solution.posterior.noise_std
+    around, end = learning.free, record.end
+    learning.next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
+    # What is known from elsewhere still holds, unless the plant has changed.
+    whole = yield from _best_of_all(learning, learning.around._replace(walk=0.0))
+    if whole is not None and whole.solution.rms <= bound \
+            and whole.fit.misfit(whole.solution, since - record.first) <= MISFIT:
+        return learning.go_on_from(whole, record.first)
+    # What is known from elsewhere may have changed before the record began.
+    earliest = [record.first] if learning.around.prior is not None else []
+    before, learning.changed = learning.changed, None
+    changes = []
+    for first in (*earliest, since, (since + end) // 2):
+        first = max(first, end - SEARCHED)
+        if end - first < RECOVERED:
+            continue
+        v, y = record.since(first)
+        found = yield from searched(v, y, around, learning.widest, learning.pace)
+        if found is not None:
+            changes.append(found)
+            if learning.usable(found, REPLACING) is not None and found.solution.rms <= bound \
+                    and _has_changed(current, found, whole, first == record.first):
+                theta = learning.changed = found.solution.of_theta
+                # As a first estimate, one that nobody expects has to be found twice.
+                again = before is not None and not contradicts(theta, before)
+                if again or learning.expects_changes:
+                    return learning.go_on_from(found, first, changed=True)
+        # The same backlash, but something has moved the plant meanwhile.
+        kept = yield from confirmed(learning, v, y, estimate, found)
+        if kept is not None and kept.solution.rms <= bound \
+                and _has_changed(current, kept, whole):
+            if learning.unconfirmed is not None:
+                learning.unconfirmed = kept.around.prior
+            return learning.go_on_from(kept, first)
+    if whole is not None and changes and not any(
+        _has_changed(current, found, whole) for found in changes
+    ):
+        return learning.go_on_from(whole, record.first)
+    if end - since >= RECOVERED:
+        learning.reason = Status.INCONSISTENT
+    if end - since > SEARCHED:
+        learning.begin_acquisition(estimate)
+    return False
+
+
+def _best_of_all(
+    learning: Learning, around: Around,
+) -> Generator[None, None, Fitted | None]:
+    """The most likely usable fit of the record by one plant."""
+    current, pace = learning.fit, learning.pace
+    v, y = learning.record.since(learning.record.first)
+    results = []
+    for beginning in learning.beginnings(around):
+        result: Fitted | None
+        if len(v) <= SEARCHED:
+            result = yield from searched(v, y, beginning, learning.widest, pace)
+        else:
+            start = current.fit.start.with_gap(current.solution.gap, v)
+            result = yield from fitted_with_model(
+                v, y, beginning, start, current.solution.m, pace
+            )
+        if result is not None and result.keeps_prior and learning.usable(result) is not None:
+            results.append(result)
+    return most_likely(results) if results else None
+
+
+def _has_changed(
+    current: Fitted, newer: Fitted, whole: Fitted | None, before: bool = False,
+) -> bool:
+    """Whether two plants, the present fit and one of the newer samples, are more likely.
+
+    Than one for the whole record. before: the newer one is of the whole record as well. Every
+    unknown of the newer one costs half the logarithm of its samples (G. Schwarz, Estimating the
+    dimension of a model, Annals of Statistics 6 (1978) 461-464).
+    """
+    if whole is None:
+        return True
+    fit = newer.fit
+    unknowns = fit.layout.driven + newer.around.error.count
+    told = newer.around.told_std / newer.solution.posterior.noise_std
+    both = newer.evidence + log(told) + (0.0 if before else current.evidence)
+    return both - 0.5 * unknowns * log(fit.length) > whole.evidence

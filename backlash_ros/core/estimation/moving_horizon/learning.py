@@ -1,0 +1,236 @@
+"""What the tasks of the fit share: the record, the fit of it, and when to do what next.
+
+A task is a generator that stops between its pieces and returns whether it leaves a fit that is to
+be published (schedule.py names them).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import (
+    BLOCK,
+    FIRST_SEARCH,
+    GROWTH,
+    LONGEST,
+    MEMORIES_SEARCHED,
+    RECOVERED,
+    REPLACING,
+    SEARCHED,
+)
+from backlash_ros.core.estimation.fit.crossings import Crossings, difference
+from backlash_ros.core.estimation.fit.pace import Pace
+from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance, contradicts, drifted
+from backlash_ros.core.estimation.fit.record import Record
+from backlash_ros.core.estimation.fit.relabelling import Fitted
+from backlash_ros.core.estimation.fit.solution import Around, Solution
+from backlash_ros.core.estimation.moving_horizon.acceptance import differs, is_precise, usable
+from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
+from backlash_ros.core.estimation.regression.play import Start
+
+Array = NDArray[np.float64]
+Task = Generator[None, None, bool]
+
+CAPACITY = 2 * LONGEST  # samples kept: those that are fitted, and those that come meanwhile
+
+
+class Belief(Enum):
+    """Whether a fit is believed: it takes the place of the estimate, adds nothing to it, or not."""
+
+    REPLACES = auto()
+    AGREES = auto()
+    REFUSED = auto()
+
+
+@dataclass
+class Acquisition:
+    """The search for a backlash that is not known.
+
+    next_at: sample at which to search. inherited: what is believed unless the samples deny it.
+    candidate: what the last search found. rejected: last fit of a search that gave no estimate.
+    """
+
+    next_at: int = FIRST_SEARCH
+    inherited: Estimate | None = None
+    candidate: Prior | None = None
+    rejected: Fitted | None = None
+
+
+@dataclass
+class Learning:
+    """The record and the fit of it.
+
+    told: around what the first fit is made, with G as told. told_walk: of u, a first guess. drift:
+    random walk of m, c_r, c_l per square root of a sample, shape (3,). around: what the next fit is
+    made around. current: the fit, None while it is searched for. reason: why there is no estimate.
+    refit_at: length of the record at which all of it is fitted anew; moved_at: from which a gap
+    that moved is reason to do so. contradicted_from: sample from which the fit does not hold;
+    consistent: samples that do fit since then; next_try: sample at which to look for an explanation
+    again. changed: what theta seems to have become. refitted: whether it was fitted anew since the
+    record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
+    do not deny it.
+    """
+
+    bounds: Bounds
+    told: Around
+    told_walk: float
+    drift: Array
+    around: Around
+    pace: Pace = field(default_factory=Pace)
+    record: Record = field(default_factory=lambda: Record(CAPACITY))
+    acquisition: Acquisition = field(default_factory=Acquisition)
+    current: Fitted | None = None
+    reason: Status = Status.ACQUIRING
+    refit_at: float = 0.0
+    moved_at: int = 0
+    contradicted_from: int | None = None
+    consistent: int = 0
+    next_try: int = 0
+    refitted: bool = False
+    changed: Prior | None = None
+    unconfirmed: Prior | None = None
+
+    @property
+    def expects_changes(self) -> bool:
+        """Whether m, c_r, c_l drift as told: a change is believed at once."""
+        return bool(self.drift.any())
+
+    @property
+    def fit(self) -> Fitted:
+        """The fit, of tasks that begin once there is one."""
+        assert self.current is not None
+        return self.current
+
+    @property
+    def free(self) -> Around:
+        """Around the G of now, with nothing else taken for known."""
+        return self.around._replace(prior=None, most=inf, walk=0.0)
+
+    @property
+    def searched(self) -> int:
+        """Newest samples that the first search looks at: G has forgotten what was before them."""
+        return min(max(SEARCHED, MEMORIES_SEARCHED * self.around.model.memory), LONGEST)
+
+    @property
+    def widest(self) -> float:
+        """Largest gap that the bounds allow."""
+        return self.bounds.c_r[1] - self.bounds.c_l[0]
+
+    @property
+    def waiting(self) -> int:
+        """Samples of the record that no fit has taken in yet."""
+        taken = self.current.fit.length if self.current is not None else 0
+        return len(self.record) - taken
+
+    def beginnings(self, around: Around) -> list[Around]:
+        """This one, and that of the G that was told where it is another one.
+
+        A G that was moved step by step may have gone astray.
+        """
+        told = self.told
+        if around.model is told.model:
+            return [around]
+        return [around, around._replace(model=told.model, error=told.error, scale=0.0)]
+
+    def usable(self, result: Fitted, share: float = 1.0) -> Crossings | None:
+        """The crossings of a fit that is precise enough, see acceptance.py."""
+        return usable(result, self.bounds, share)
+
+    def judged(self, found: Crossings | None, estimate: Estimate, held: Array | None) -> Belief:
+        """What becomes of a fit beside the estimate that held so far.
+
+        found: what the fit says, None if it is of no use. held: covariance (3, 3) of that estimate.
+        Few samples can be fitted by a backlash that never was, and so can many where y moves
+        otherwise: after a contradiction a fit has to foretell some, before it says something else
+        or says it less precisely.
+        """
+        if found is None:
+            return Belief.REFUSED
+        if held is None:
+            return Belief.REPLACES
+        proven = self.consistent >= RECOVERED
+        otherwise = self.fit.solution.moved_otherwise
+        if beyond_chance(difference(found, estimate), found.cov + held):
+            sure = proven and not (otherwise and self.around.error.count == 0)
+            return Belief.REPLACES if sure else Belief.REFUSED
+        if otherwise and not self.expects_changes:
+            sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
+        else:
+            sure = proven or not np.any(np.diag(found.cov) > np.diag(held))
+        if sure:
+            return Belief.REPLACES
+        return Belief.AGREES if proven else Belief.REFUSED
+
+    def confirm(self) -> bool:
+        """Ask the samples alone about what was learned before; return whether they deny it.
+
+        They deny what is off by more than an estimate may be uncertain at all. What contradicts
+        them by less is neither denied nor confirmed: in a plant that is no backlash and no linear G
+        they may be as wrong. So may they where something else moves y.
+        """
+        prior, (fit, solution, _) = self.unconfirmed, self.fit
+        if prior is None or solution.moved_otherwise or self.around.walk > 0.0:
+            return False
+        alone = fit.solve(alone=True)
+        found = alone.crossings
+        if found is None or not is_precise(found, fit.swing):
+            return False
+        contradicted = contradicts(alone.of_theta, prior)
+        denied = contradicted and differs(found, prior)
+        if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
+            self.unconfirmed = None
+        return denied
+
+    def drifts_more(self, solution: Solution, samples: int) -> bool:
+        """Whether drift over so many samples is more than the noise leaves unknown."""
+        found = solution.crossings
+        if found is None or not self.expects_changes or samples < BLOCK[1]:
+            return False
+        return bool(np.any(self.drift**2 * (samples / 3.0) > np.diag(found.cov)))
+
+    def drifted(self, solution: Solution, samples: int) -> Prior:
+        """What a solution says of theta after so many samples of drift."""
+        return drifted(solution.theta, solution.theta_cov, self.drift, samples)
+
+    def begin_acquisition(self, inherited: Estimate | None) -> None:
+        """Look for the backlash afresh; inherited: what is believed unless the samples deny it."""
+        self.current = None
+        self.acquisition = Acquisition(self.record.end + FIRST_SEARCH, inherited)
+        self.refit_at, self.moved_at = 0.0, 0
+        self.refitted = False
+        self.contradicted_from = self.changed = self.unconfirmed = None
+
+    def go_on_from(self, result: Fitted, first: int, changed: bool = False) -> bool:
+        """Go on from this fit of the record from sample `first` on; it is to be published.
+
+        changed: whether it is of a plant that has changed.
+        """
+        self.current, self.around = result, result.around
+        if result.around.prior is not self.unconfirmed:
+            self.unconfirmed = None
+        self.record.forget_before(first)
+        self.refit_at = min(GROWTH * result.fit.length, LONGEST)
+        self.moved_at = result.fit.length + BLOCK[1]
+        self.contradicted_from = self.changed = self.acquisition.rejected = None
+        if changed:
+            self.consistent = RECOVERED if self.expects_changes else 0
+        return True
+
+    def restart(self, start: Start) -> None:
+        """Begin a new record with what the old one says as a prior."""
+        current, record = self.current, self.record
+        record.forget_before(record.end)
+        if current is None:
+            self.begin_acquisition(self.acquisition.inherited)
+            return
+        self.around = self.around._replace(prior=current.solution.of_theta)
+        fit = current.fit.restarted(self.around, start)
+        self.current = Fitted(fit, fit.solve())
+        self.refit_at = GROWTH * BLOCK[1]
+        self.contradicted_from = None

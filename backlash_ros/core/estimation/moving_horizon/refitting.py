@@ -1,0 +1,126 @@
+"""How new samples come into the fit: block by block, and now and then all of the record anew."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from math import inf, nan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.constants import (
+    BEGINNING,
+    BLOCK,
+    LONGEST,
+    MISFIT,
+    OUTLIER_SHARE,
+    SEARCHED,
+)
+from backlash_ros.core.estimation.fit.relabelling import (
+    Fitted,
+    fitted,
+    fitted_with_model,
+    most_likely,
+    searched,
+    with_walk,
+)
+from backlash_ros.core.estimation.fit.solution import Around
+from backlash_ros.core.estimation.fit.window_fit import PAST, weights_of
+from backlash_ros.core.estimation.moving_horizon.change_detection import change, note_block
+from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
+from backlash_ros.core.estimation.observer.attribution import attributed
+from backlash_ros.core.estimation.observer.observer import Observer
+from backlash_ros.core.estimation.regression.play import Start
+
+Array = NDArray[np.float64]
+
+AT_ONCE = 4  # largest blocks that are taken in at once, where there was no time before
+
+
+def take_block(learning: Learning) -> Task:
+    """Take in the samples that have come since the last block."""
+    record, (fit, solution, _) = learning.record, learning.fit
+    number = record.first + fit.length
+    v, y = record.since(number)
+    v, y = v[:AT_ONCE * BLOCK[1]], y[:AT_ONCE * BLOCK[1]]
+    rows = fit.columns(v, y)
+    squares, outliers = fit.contradiction(rows, y, solution)
+    valid = np.isfinite(y)
+    if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
+        valid &= ~outliers
+        record.lose(number + np.flatnonzero(outliers))
+    misfit = float(squares[valid].mean()) if valid.any() else 0.0
+    fits = misfit <= MISFIT
+    fit.take(rows, np.where(valid & fits, y, nan), weights_of(y))
+    yield
+    note_block(learning, fits, number, len(v), number + change(squares))
+    learning.current = Fitted(fit, fit.solve())
+    return fits
+
+
+def refit(learning: Learning) -> Task:
+    """Fit the whole record anew; a long one loses its oldest third first."""
+    current = learning.fit
+    yield from _attribute(learning, current)
+    around, start, first = yield from _shortened(learning, current)
+    v, y = learning.record.since(first)
+    start = start.with_gap(current.solution.gap, v)
+    results: list[Fitted] = []
+    # The G that was told is as good a beginning as one that was moved; the scale that is found for
+    # its error holds for both.
+    for beginning in reversed(learning.beginnings(around)):
+        if results:
+            beginning = beginning._replace(scale=results[0].around.scale)
+        results.insert(0, (yield from fitted_with_model(
+            v, y, beginning, start, current.solution.m, learning.pace
+        )))
+    result = yield from with_walk(v, y, most_likely(results), learning.pace)
+    if len(v) <= SEARCHED and around.prior is None:
+        # The gap of a short record may be one of several.
+        other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
+        if other is not None and learning.usable(other) is not None:
+            result = most_likely([result, other])
+    return learning.go_on_from(result, first)
+
+
+def _shortened(
+    learning: Learning, current: Fitted,
+) -> Generator[None, None, tuple[Around, Start, int]]:
+    """What to fit a record around that is not too long, its start and its first sample."""
+    record, around = learning.record, learning.around
+    fit, solution, _ = current
+    if fit.length < LONGEST:
+        if around.error.count:
+            # Where the play began costs as many unknowns as the error of G has. What that did
+            # has to die out as well.
+            v, _ = record.since(record.first)
+            gone = fit.start.forgotten_after(v) + PAST * around.model.memory
+            if gone <= BEGINNING * len(v):
+                return around, fit.start_after(v[:gone]), record.first + gone
+        return around, fit.start, record.first
+    gone = LONGEST // 3
+    v, y = record.since(record.first)
+    prior = None
+    if around.error.count == 0 and solution.correlation == 0.0:
+        part = yield from fitted(
+            v[:gone], y[:gone], around, fit.start, solution.m, learning.pace
+        )
+        prior = learning.drifted(part.solution, len(v) - gone)
+    around = around._replace(prior=prior, most=around.most if prior else inf)
+    return around, fit.start_after(v[:gone]), record.first + gone
+
+
+def _attribute(learning: Learning, current: Fitted) -> Generator[None, None, None]:
+    """Let those v have acted over the record that the estimates speak for."""
+    record, found, model = learning.record, current.solution.crossings, learning.around.model
+    others = record.others(record.first)
+    if found is None or np.isnan(others).all():
+        return
+    # The observer begins at rest: what it expects says nothing yet.
+    others[:model.memory] = nan
+    v, y = record.since(record.first)
+    chosen = yield from attributed(
+        v, y, others, (current.solution.start, found.gap), found.m, found.m * found.c_r,
+        Observer(model, current.solution.posterior.noise_std), learning.pace.pieces(1),
+    )
+    record.attribute(record.first, chosen)

@@ -1,0 +1,44 @@
+"""Which task of the fit is due.
+
+    no estimate yet                    acquire      (acquisition.py)
+    a block of new samples             take_block   (refitting.py)
+    samples contradict the fit         reconsider   (change_detection.py)
+    the record has grown, or the gap
+    has left its labels                refit        (refitting.py)
+    the record contradicts itself      refit, and if that does not help halve (change_detection.py)
+"""
+
+from __future__ import annotations
+
+from backlash_ros.core.estimation.constants import BLOCK, BLOCK_SHARE, MOVED
+from backlash_ros.core.estimation.moving_horizon.acquisition import acquire
+from backlash_ros.core.estimation.moving_horizon.change_detection import halve, reconsider
+from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
+from backlash_ros.core.estimation.moving_horizon.refitting import refit, take_block
+from backlash_ros.core.estimation.protocol import Estimate
+
+
+def next_task(learning: Learning, estimate: Estimate) -> Task | None:
+    """What is to be done next; None while nothing is. estimate: the published one."""
+    record, current = learning.record, learning.current
+    if current is None:
+        return acquire(learning) if record.end >= learning.acquisition.next_at else None
+    fit, solution, _ = current
+    contradicted = learning.contradicted_from is not None
+    fewest, most = BLOCK
+    wanted = fewest if contradicted else min(max(fit.length // BLOCK_SHARE, fewest), most)
+    if learning.waiting >= wanted:
+        return take_block(learning)
+    due = record.end >= learning.next_try
+    if contradicted:
+        return reconsider(learning, estimate) if due else None
+    moved = abs(solution.gap - fit.start.gap) > MOVED * solution.std_gap
+    if fit.length >= learning.refit_at or (moved and fit.length >= learning.moved_at):
+        return refit(learning)
+    aged = solution.correlation > 0.0 or learning.drifts_more(solution, fit.length)
+    if not (aged and due):
+        return None
+    # What contradicts may be a G that went astray: the plant has changed only where the best fit
+    # of all says so.
+    learning.refitted = bool(learning.around.error.count) and not learning.refitted
+    return refit(learning) if learning.refitted else halve(learning)

@@ -1,0 +1,1 @@
+"""What happens at every sample: u and the state of G, outliers, which command acted."""

@@ -1,0 +1,1 @@
+"""The same fit as one function of a record."""

@@ -1,0 +1,1 @@
+"""From an output to a command, whatever the driver does: samples, times, counts; no ROS."""

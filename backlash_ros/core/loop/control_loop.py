@@ -1,0 +1,275 @@
+"""From an output to a command: which sample it is, what was lost, what the core says to it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from math import isfinite, nan
+
+import numpy as np
+
+from backlash_ros.core.assembly import (
+    build_controller,
+    build_limits,
+    build_model,
+    build_structure,
+)
+from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep, plausible
+from backlash_ros.core.control.last_command import last_commands
+from backlash_ros.core.estimation.baselines.lms import NormalisedLms
+from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.loop.command_history import CommandHistory, report_use
+from backlash_ros.core.loop.loop_statistics import LoopStatistics
+from backlash_ros.core.loop.output import Output
+from backlash_ros.core.loop.sample_counter import Arrival, SampleCounter
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.state_model import StateModel
+
+# Live parameters that only a new structure takes up.
+OF_THE_STRUCTURE = (
+    'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution',
+    'estimator.output_noise_std',
+)
+
+
+class ControlLoop:
+    """Answers outputs with commands, whatever the driver does.
+
+    send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
+    learned before. counter: goes on counting where another loop has ended. v: the newest command,
+    0 as long as nobody knows (knows_v) which one acts. told: G(z) as the parameters have it.
+    silent: the driver was given up for the time being. standing_down: another controller commands
+    the actuator, so nothing is sent.
+    """
+
+    def __init__(
+        self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
+        inherited: Estimate | None, counter: SampleCounter, v: float | None = None,
+    ) -> None:
+        self.statistics = LoopStatistics()
+        self.counter = counter
+        self.commands = CommandHistory(p.real('sample_period'), report_use(p))
+        self.y_m = nan  # the newest one
+        self.v, self.knows_v = v or 0.0, v is not None
+        self.silent = self.standing_down = False
+        self.adapting = self.compensating = True
+        self.last: ControlStep | None = None
+        self.heard_at: float | None = None  # on the steady clock [s]
+        self._p, self._send, self._now_ns = p, send, now_ns
+        self._lockstep = p.flag('lockstep')
+        self._missing = 0  # outputs since the newest one that was used
+        self._unsent = 0  # those of them that were never published
+        self._anew = False  # whether sender or clock began anew since then
+        self._begun = False  # whether the present core has taken a step
+        self.core = build_controller(p, inherited)
+        self.told = build_model(p)
+
+    @property
+    def learned_model(self) -> StateModel | None:
+        """The G that the law has come to, None for a law that learns none."""
+        estimator = self.core.estimator
+        return estimator.learned_model if isinstance(estimator, MovingHorizon) else None
+
+    @property
+    def estimate(self) -> Estimate:
+        """What is known of the backlash."""
+        return self.core.estimator.estimate
+
+    @property
+    def takes_up_noise(self) -> bool:
+        """Whether the law can change what it takes for the noise on y while it runs."""
+        return isinstance(self.core.estimator, MovingHorizon)
+
+    def renew(self, inherited: Estimate | None) -> None:
+        """Go on with a new core from the present v: nothing is known of the state of the plant.
+
+        inherited: estimates to begin with, None for those of the parameters.
+        """
+        before, self.core = self.core, build_controller(self._p, inherited)
+        self.core.go_on_from(before)
+        self.core.compensating = self.compensating
+        self.core.estimator.adapting = self.adapting
+        self._begun, self._missing = False, 0
+
+    def adapt(self, adapting: bool) -> None:
+        """Learn, or hold the estimates."""
+        self.adapting = self.core.estimator.adapting = adapting
+
+    def compensate(self, compensating: bool) -> None:
+        """Cancel the gap, or invert the slope alone."""
+        self.compensating = self.core.compensating = compensating
+
+    def take_reference(self, y_m: float) -> bool:
+        """Take in a reference; an absurd one is counted and the last one holds."""
+        if not plausible(y_m):
+            self.statistics.note_bad_reference()
+            return False
+        self.y_m = y_m
+        return True
+
+    def take_applied(self, v: float, stamp_ns: int) -> None:
+        """Take in a v that the driver reports to have applied."""
+        if plausible(v):
+            self.commands.report(v, stamp_ns)
+        else:
+            self.statistics.dropped += 1
+
+    @property
+    def begins(self) -> bool:
+        """Whether the next command is the first one, since the start or an interruption."""
+        return self.silent or not self._begun
+
+    def learn_v(self, stamp_ns: int) -> bool:
+        """Take the v that the driver reports with this output for the one that acts, if it does.
+
+        Returns whether it is known now which one acts.
+        """
+        reported = self.commands.newest_report(stamp_ns)
+        if isfinite(reported):
+            self._go_on_from(reported)
+        return self.knows_v
+
+    def answer(self, output: Output) -> ControlStep | None:
+        """Send v(k) for y(k); None where the message brings no command."""
+        arrival = self.counter.count(output.stamp_ns, output.sequence)
+        return self.step(output, arrival, self.y_m)
+
+    def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
+        """The same for a sample that was counted already, with the reference that belongs to it."""
+        statistics = self.statistics
+        statistics.note_arrival(output.stamp_ns)
+        if self.standing_down:
+            return None
+        if not arrival.is_sample:
+            statistics.extra += 1
+            return None
+        self.commands.note_transit(output.received_ns - output.sent_ns)
+        self._note_missing(arrival)
+        if not plausible(output.y):
+            # A sensor that has nothing to say is as good as silent.
+            statistics.note_bad_output()
+            self._missing += 1
+            return None
+        self.heard_at = time.monotonic()
+        if not plausible(y_m):
+            statistics.without_reference += 1
+            self._missing += 1
+            return None
+        self._interrupt_if_long()
+        step = self._step_core(output.y, y_m, output.stamp_ns)
+        self.send(step.v)
+        statistics.note(
+            output.y, step.v, self.core.inverse.limited, (time.time_ns() - output.sent_ns) * 1e-9
+        )
+        self.last = step
+        return step
+
+    def send(self, v: float) -> None:
+        """Send a command and note when it left; nothing while another controller commands."""
+        if self.standing_down:
+            return
+        self.v, self.knows_v = v, True
+        self._send(v)
+        self.commands.publish(v, self._now_ns())
+
+    @property
+    def zero(self) -> float:
+        """The v nearest to 0 within the limits."""
+        return self.core.limits.zero
+
+    def last_commands(self, action: str) -> Iterator[float]:
+        """Commands that end the loop as on_stop or on_timeout say, from the present v on.
+
+        None where nobody knows v: then this loop has not commanded anything either.
+        """
+        if not self.knows_v:
+            return iter(())
+        return last_commands(action, self.v, lambda: self.core.limits)
+
+    def give_up(self) -> None:
+        """The driver is silent: whenever it comes back, its state will be unknown."""
+        self.silent = True
+        self.renew(self.estimate)
+
+    def stand_down(self) -> None:
+        """Leave the actuator to another controller."""
+        self.standing_down = True
+
+    def hear_other(self, v: float) -> None:
+        """Take in a command of the controller that is in charge."""
+        if self.standing_down and plausible(v):
+            self._go_on_from(v)
+
+    def resume(self) -> None:
+        """Command again, from the newest v that was heard; the state of the plant is unknown."""
+        self.standing_down = self.silent = False
+        self.heard_at = None
+        self.renew(self.estimate)
+
+    def take_up(self, p: Parameters) -> None:
+        """Use other values of the live parameters; what was learned stays."""
+        before, self._p = self._p, p
+        core = self.core
+        core.limits = build_limits(p)
+        core.inverse.set_band(p.real('inverse.direction_band'))
+        core.inverse.take_up = p.real('inverse.take_up_rate') * p.real('sample_period')
+        if isinstance(core.estimator, NormalisedLms):
+            core.estimator.step = p.real('lms.step')
+            core.estimator.step_f = p.real('lms.step_f')
+        if isinstance(core.estimator, MovingHorizon):
+            core.estimator.set_noise(
+                p.real('estimator.output_noise_std'), p.real('estimator.input_noise_std'),
+                np.array(p.triple('estimator.drift_std')) * p.real('sample_period')**0.5,
+            )
+        if any(p[name] != before[name] for name in OF_THE_STRUCTURE):
+            structure = build_structure(p)
+            structure.go_on_from(core.structure)
+            core.structure = structure
+
+    def _go_on_from(self, v: float) -> None:
+        # From a v beyond the limits the commands would begin there.
+        limits = self.core.limits
+        self.v, self.knows_v = min(max(v, limits.low), limits.high), True
+
+    def _note_missing(self, arrival: Arrival) -> None:
+        self._missing += arrival.missing
+        self._unsent += arrival.unsent
+        self._anew = self._anew or arrival.anew
+        # What came before the first sample that is used was not lost: nobody listened.
+        if self._begun and not (self.silent or arrival.anew):
+            self.statistics.lost += arrival.missing
+            self.statistics.unsent += arrival.unsent
+
+    def _interrupt_if_long(self) -> None:
+        """Begin with a new core where there is too much to step over."""
+        timeout = self._p.real('timeout.plant_output')
+        too_long = self._missing > LONGEST_GAP or (
+            not self._lockstep and 0.0 < timeout < self._missing * self._p.real('sample_period')
+        )
+        if self.silent or self._anew or (too_long and self._begun):
+            self.statistics.interruptions += 1
+            self.renew(self.estimate)
+        self.silent = self._anew = False
+
+    def _step_core(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
+        """Step the core over the missing outputs to y, with the v that was really applied."""
+        core, commands = self.core, self.commands
+        lost, self._missing = self._missing, 0
+        unsent, self._unsent = self._unsent, 0
+        if not self._begun:
+            self._begun = True
+            if not self._lockstep:
+                self.learn_v(stamp_ns)
+            core.start_from(self.v)
+            commands.begin(stamp_ns)
+            return core.step(y, y_m)
+        if self._lockstep:
+            return core.step(y, y_m, lost)
+        # Late commands are counted even where the driver says which ones it applied.
+        supposed = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
+        reported = commands.reported_over(lost + 1, stamp_ns, unsent)
+        return core.step(y, y_m, lost, reported) if reported else core.step(
+            y, y_m, lost, *supposed
+        )
+

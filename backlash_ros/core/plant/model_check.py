@@ -1,0 +1,82 @@
+"""Checks of G(z): what cannot be estimated through it is refused, what is hard is said."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+ON_CIRCLE = 1e-6  # distance from the unit circle, or between two roots, that counts as none
+SLOWEST = 1e4  # samples: longer time constants leave too little per sample
+FEWEST, MOST = 10.0, 1e5  # samples per period of the reference
+WORST_CONDITION = 1e9  # of the map between states and outputs
+
+
+def check_model(model: TransferFunction) -> None:
+    """Raise ParameterError where m, c_r, c_l cannot be learned through G, saying why."""
+    poles, zeros = model.poles, model.zeros
+    unstable = [pole for pole in poles if abs(pole) > 1.0 + ON_CIRCLE]
+    if unstable:
+        raise ParameterError(
+            'plant.denominator', model.denominator.tolist(),
+            f'has the unstable pole {_text(unstable[0])}',
+            'close a stabilising loop around the plant first and give its G(z)',
+        )
+    for zero in zeros:
+        near = poles[np.abs(poles - zero) < ON_CIRCLE]
+        if near.size and abs(zero) > 1.0 - ON_CIRCLE:
+            raise ParameterError(
+                'plant.numerator', model.numerator.tolist(),
+                f'cancels the pole {_text(near[0])}, which then cannot be seen in y',
+                'cancel the common factor in numerator and denominator',
+            )
+        if abs(zero - 1.0) < ON_CIRCLE:
+            raise ParameterError(
+                'plant.numerator', model.numerator.tolist(),
+                'has a zero at z = 1: a constant u leaves no trace in y, nor do c_r and c_l',
+                'measure an output that responds to a constant input',
+            )
+
+
+def model_warnings(
+    model: TransferFunction, sample_period: float, frequency: float | None = None,
+) -> list[str]:
+    """Say what makes the estimate ill-conditioned, a sentence each.
+
+    frequency: of the reference [rad/s], if it is known.
+    """
+    poles, zeros = model.poles, model.zeros
+    found = []
+    slow = [pole for pole in poles if ON_CIRCLE < 1.0 - abs(pole) < 1.0 / SLOWEST]
+    if slow:
+        found.append(
+            f'the pole {_text(slow[0])} is slower than {SLOWEST:g} samples: sample_period='
+            f'{sample_period:g} s is short for this plant'
+        )
+    if np.count_nonzero(np.abs(poles - 1.0) < 1e-3) > 1:
+        found.append('G(z) integrates more than once: y drifts fast while u is not yet right')
+    circle = [zero for zero in zeros if abs(abs(zero) - 1.0) < 1e-3]
+    if circle:
+        found.append(
+            f'the zero {_text(circle[0])} lies on the unit circle: motion of u at that '
+            'frequency does not show in y'
+        )
+    if np.linalg.cond(StateModel(model).to_observer) > WORST_CONDITION:
+        found.append(
+            'the coefficients of G(z) determine its states badly: give more digits, or a longer '
+            'sample_period'
+        )
+    if frequency is not None:
+        samples = 2.0 * np.pi / (frequency * sample_period)
+        if not FEWEST <= samples <= MOST:
+            found.append(
+                f'frequency={frequency:g} rad/s has {samples:.3g} samples per period, between '
+                f'{FEWEST:g} and {MOST:g} are sensible: change sample_period'
+            )
+    return found
+
+
+def _text(root: complex) -> str:
+    return f'{root.real:.6g}' if abs(root.imag) < 1e-9 else f'{root:.6g}'

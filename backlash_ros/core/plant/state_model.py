@@ -1,0 +1,61 @@
+"""State space of G(z) in coordinates that suit estimation."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+SHORTEST_MEMORY, LONGEST_MEMORY = 150, 5000  # samples
+
+
+class StateModel:
+    """x(k+1) = A x + B u, y = c x_0 with observability Gramian I over a finite horizon.
+
+    A unit state in any direction then shows with the same energy in y, so that one number tells
+    how unknown x is, and covariances stay well scaled however close the poles of G lie to 1.
+    Only the first state shows in y at once: its factor c is all there is of C.
+    """
+
+    def __init__(self, model: TransferFunction) -> None:
+        self.transfer_function = model
+        a, b, c = model.state_space()
+        self.order = model.order
+        rows, row = [], c
+        for _ in range(_horizon(model)):
+            rows.append(row)
+            row = row @ a
+        # R of the observability matrix: R' R is its Gramian, without squaring the condition.
+        r = linalg.qr(np.array(rows), mode='r')[0][: self.order]
+        # A rotation keeps the Gramian and turns C onto the first axis.
+        rotation, triangle = linalg.qr(linalg.solve(r.T, c)[:, None])
+        self.to_state: Array = rotation.T @ r  # from the observer form, whose first state is y
+        self.to_observer: Array = linalg.inv(self.to_state)
+        self.a: Array = self.to_state @ a @ self.to_observer
+        self.b: Array = self.to_state @ b
+        self.c = float(triangle[0, 0])
+        self.memory = _memory(model)
+        self.equilibrium = self._equilibrium()
+
+    def _equilibrium(self) -> Array:
+        """State x at rest with y = 1, shape (n,): a constant u holds it, none in an integrator."""
+        n = self.order
+        rest = np.zeros((n + 1, n + 1))
+        rest[:n, :n], rest[:n, n], rest[n, 0] = self.a - np.eye(n), self.b, self.c
+        return np.asarray(linalg.lstsq(rest, np.eye(n + 1)[n])[0][:n])
+
+
+def _horizon(model: TransferFunction) -> int:
+    """Samples within which the slow dynamics show, bounded for integrators."""
+    return max(10 * model.order, 50)
+
+
+def _memory(model: TransferFunction) -> int:
+    """Samples after which the slowest stable mode of G has died out, within reason."""
+    stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - 1e-6]
+    slowest = max(stable, default=0.0)
+    return int(min(max(3.0 / (1.0 - slowest), SHORTEST_MEMORY), LONGEST_MEMORY))

@@ -1,0 +1,97 @@
+"""The known linear part G(z) = numerator / denominator, and its state space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.parameters.errors import ParameterError
+
+Array = NDArray[np.float64]
+
+
+class TransferFunction:
+    """G(z) with at least one sample of delay, coefficients in descending powers of z.
+
+    numerator, denominator: plain sequences of floats; leading zeros of the numerator are dropped.
+    group: of parameters that errors speak of. Raises ParameterError for empty, non-finite or zero
+    polynomials and for a G(z) without delay.
+    """
+
+    def __init__(
+        self, numerator: Sequence[float], denominator: Sequence[float], group: str = 'plant',
+    ) -> None:
+        b = _polynomial(f'{group}.numerator', numerator)
+        a = _polynomial(f'{group}.denominator', denominator)
+        if len(b) >= len(a):
+            raise ParameterError(
+                f'{group}.numerator', list(numerator),
+                f'has degree {len(b) - 1}, must be below the degree {len(a) - 1} of '
+                f'{group}.denominator',
+                'a sampled plant has a delay of at least one sample',
+            )
+        self.numerator = np.concatenate([np.zeros(len(a) - len(b)), b]) / a[0]
+        self.denominator = a / a[0]
+
+    @property
+    def order(self) -> int:
+        """Number of states n."""
+        return len(self.denominator) - 1
+
+    @property
+    def poles(self) -> NDArray[np.complex128]:
+        """Roots of the denominator, shape (n,)."""
+        return np.asarray(np.roots(self.denominator), dtype=np.complex128)
+
+    @property
+    def zeros(self) -> NDArray[np.complex128]:
+        """Roots of the numerator."""
+        return np.asarray(np.roots(self.numerator), dtype=np.complex128)
+
+    @property
+    def delay(self) -> int:
+        """Samples between u and its first effect on y."""
+        return int(np.flatnonzero(self.numerator)[0])
+
+    def response(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """G at the points z."""
+        value = np.polyval(self.numerator, z) / np.polyval(self.denominator, z)
+        return np.asarray(value, dtype=np.complex128)
+
+    def without_delay(self) -> tuple[list[float], list[float], int]:
+        """Numerator, denominator and delay [samples] of z^-delay numerator / denominator.
+
+        The whole delay, as far as the rest is still a G(z) that one can be told.
+        """
+        numerator = np.trim_zeros(self.numerator, 'f')
+        at_zero = len(self.denominator) - len(np.trim_zeros(self.denominator, 'b'))
+        delay = min(at_zero, self.delay - 1)
+        denominator = self.denominator[:len(self.denominator) - delay]
+        return numerator.tolist(), denominator.tolist(), delay
+
+    def state_space(self) -> tuple[Array, Array, Array]:
+        """Return A (n, n), B (n,), C (n,) of x(k+1) = A x + B u, y = C x in observer form.
+
+        In observer form the first state is y itself.
+        """
+        n = self.order
+        a = np.zeros((n, n))
+        a[:, 0] = -self.denominator[1:]
+        a[:-1, 1:] = np.eye(n - 1)
+        return a, self.numerator[1:].copy(), np.eye(n)[0]
+
+
+def _polynomial(name: str, coefficients: Sequence[float]) -> Array:
+    values = np.asarray(coefficients, dtype=np.float64)
+    if values.ndim != 1 or values.size == 0:
+        raise ParameterError(name, coefficients, 'must be a list of at least one number')
+    if not np.all(np.isfinite(values)):
+        raise ParameterError(name, coefficients, 'must be finite')
+    nonzero = np.flatnonzero(values)
+    if nonzero.size == 0:
+        raise ParameterError(name, coefficients, 'must not be zero')
+    if name.endswith('.denominator') and nonzero[0] != 0:
+        raise ParameterError(name, coefficients, 'must have a leading coefficient other than 0')
+    return values[nonzero[0]:]

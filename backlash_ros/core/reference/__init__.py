@@ -1,0 +1,1 @@
+"""y_m(t), from a formula or from a file."""

@@ -1,0 +1,1 @@
+"""The whole loop without ROS: simulated, recorded, replayed, and what it achieved."""

@@ -1,0 +1,81 @@
+"""The whole loop in one process: reference, controller and simulated plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import nan
+
+import numpy as np
+
+from backlash_ros.core.assembly import (
+    build_controller,
+    build_model,
+    build_plant,
+    build_reference,
+)
+from backlash_ros.core.control.controller import AdaptiveController
+from backlash_ros.core.estimation.moving_horizon.learned_model import learned_model_of
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
+
+
+@dataclass
+class ClosedLoop:
+    """Controller, plant and reference stepped together; row k holds sample k.
+
+    lose: says of each sample whether y(k) is lost on the way. told: G(z) as the parameters have it.
+    """
+
+    controller: AdaptiveController
+    plant: SimulatedPlant
+    reference: Callable[[float], float]
+    sample_period: float
+    told: TransferFunction
+    lose: Callable[[], bool] = field(default=lambda: False)
+
+    def run(
+        self, samples: int, on_sample: Callable[[int], None] | None = None,
+    ) -> RunRecord:
+        """Simulate and return every signal; on_sample(k) is called after each sample."""
+        rows = np.full((samples, len(COLUMNS)), nan)
+        lost, v = 0, 0.0
+        kept = 0
+        for k in range(samples):
+            t = k * self.sample_period
+            y = self.plant.measure()
+            if k > 0 and self.lose():
+                lost += 1
+                self.plant.step(v)
+            else:
+                step = self.controller.step(y, self.reference(t), lost)
+                self.controller.refine()
+                estimator = self.controller.estimator
+                lost, v = 0, step.v
+                truth = self.plant.backlash
+                u = self.plant.step(v)
+                e = step.estimate
+                rows[kept] = (
+                    t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f,
+                    *stated_deviations(e), estimator.u_hat, estimator.innovation, e.status,
+                    truth.m, truth.c_r, truth.c_l,
+                )
+                kept += 1
+            if on_sample is not None:
+                on_sample(k)
+        return RunRecord(
+            rows[:kept], self.sample_period, self.controller.lost_samples + lost,
+            learned_model_of(self.controller.estimator, self.told),
+        )
+
+
+def build_closed_loop(p: Parameters) -> ClosedLoop:
+    """The loop of the given parameters; the seed also draws which outputs are lost."""
+    loss = p.real('output_loss')
+    rng = np.random.default_rng([p.integer('seed'), 1])
+    return ClosedLoop(
+        build_controller(p), build_plant(p), build_reference(p),
+        p.real('sample_period'), build_model(p), lambda: loss > 0.0 and float(rng.random()) < loss,
+    )

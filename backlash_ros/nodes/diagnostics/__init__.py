@@ -1,0 +1,1 @@
+"""What is wrong, the likeliest cause first, and who else is there."""

@@ -1,0 +1,196 @@
+"""What the controller says about its state in /diagnostics: figures, findings, values."""
+
+from __future__ import annotations
+
+import time
+from math import isfinite, isnan, nan
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimation.storage import was_given
+from backlash_ros.core.loop.causes import (
+    LONGEST_TEXT,
+    Finding,
+    Level,
+    LoopFigures,
+    Peer,
+    findings_of,
+)
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.loop_statistics import Lately
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.simulation.run_record import stated_deviations
+from backlash_ros.nodes.diagnostics.neighbours import publishers_of, subscribers_of
+from backlash_ros.nodes.runtime.driver_io import DriverIo
+
+
+class Diagnosis:
+    """Collects what is known of the loop and its neighbours, and says what is wrong with it.
+
+    output_qos, reference_qos: with which the controller listens.
+    """
+
+    def __init__(
+        self, node: Node, io: DriverIo, output_qos: QoSProfile, reference_qos: QoSProfile,
+    ) -> None:
+        self._node, self._io = node, io
+        self._output_qos, self._reference_qos = output_qos, reference_qos
+        self._lately = Lately()
+        self._consistent_at = time.monotonic()  # the newest look at which it was, or there was none
+
+    def findings(
+        self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
+        rivals: tuple[str, ...],
+    ) -> tuple[list[Finding], dict[str, object]]:
+        """What is to be said of an active loop, the likeliest cause first; details to it.
+
+        reference_at_s: when the newest y_m came, on the steady clock. rivals: who else publishes
+        the command.
+        """
+        figures = self._figures(loop, p, reference_at_s, rivals)
+        findings = [*self._of_messages(p), *findings_of(figures)]
+        return findings, _details(findings, figures)
+
+    def _figures(
+        self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
+        rivals: tuple[str, ...],
+    ) -> LoopFigures:
+        statistics, io, node = loop.statistics, self._io, self._node
+        lately = self._lately.gained({
+            'used': statistics.used, 'without_reference': statistics.without_reference,
+            'lost': statistics.lost, 'unsent': statistics.unsent, 'late': loop.commands.late,
+            'bad_outputs': statistics.bad_outputs,
+            'bad_references': statistics.bad_references, 'limited': statistics.limited,
+            'unreported': loop.commands.unreported,
+        }, time.monotonic())
+        status = None if loop.last is None else loop.last.estimate.status
+        if status != Status.INCONSISTENT:
+            self._consistent_at = time.monotonic()
+        gap = loop.estimate.c_r - loop.estimate.c_l
+        timeout = p.real('timeout.reference')
+        overdue = reference_at_s is not None and not p.flag('lockstep') \
+            and 0.0 < timeout < time.monotonic() - reference_at_s
+        control = io.topics.control
+        estimator = loop.core.estimator
+        unexplained, wrong_sign = (estimator.unexplained, estimator.wrong_sign) \
+            if isinstance(estimator, MovingHorizon) else (nan, False)
+        return LoopFigures(
+            p.real('sample_period'),
+            publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
+            publishers_of(node, topics.REFERENCE, Float64, self._reference_qos),
+            subscribers_of(node, control, io.topics.control_type), rivals,
+            standing_down=loop.standing_down,
+            status=status, inconsistent_s=time.monotonic() - self._consistent_at,
+            unexplained=unexplained, wrong_sign=wrong_sign, adapting=loop.adapting,
+            given=was_given(loop.estimate),
+            silent_s=p.real('timeout.plant_output') if loop.silent else 0.0,
+            on_timeout=p.word('on_timeout'),
+            referred=isfinite(loop.y_m),
+            reference_silent_s=timeout if overdue else 0.0,
+            # In lockstep the outputs come as fast as the machine goes.
+            intervals_s=(nan, nan, nan) if p.flag('lockstep') else statistics.intervals_s(),
+            still=statistics.still,
+            v_swing=statistics.still_swing / gap if gap > 0.0 else 0.0,
+            **lately,
+        )
+
+    def _of_messages(self, p: Parameters) -> list[Finding]:
+        io = self._io
+        if not io.skipped:
+            return []
+        text = (
+            f'{io.topics.output} has no {p.word("io.field")} of joint {p.word("io.joint")!r} but '
+            f'{io.seen}: set io.joint, io.field'
+        )
+        return [Finding(Level.ERROR, 'joint', text[:LONGEST_TEXT])]
+
+
+def _details(findings: list[Finding], figures: LoopFigures) -> dict[str, object]:
+    """All findings, and who is on the topics where that matters."""
+    details: dict[str, object] = {
+        f'finding {i}': finding.text for i, finding in enumerate(findings, start=1)
+    }
+    for topic, what in (
+        (figures.output, 'published by'), (figures.reference, 'published by'),
+        (figures.control, 'heard by'),
+    ):
+        details[f'{topic.name} {what}'] = _names(topic.peers)
+    if figures.rivals:
+        details[f'{figures.control.name} also published by'] = ', '.join(figures.rivals)
+    return details
+
+
+def _names(peers: tuple[Peer, ...]) -> str:
+    return ', '.join(
+        peer.name + (f' ({peer.kind}: does not fit)' if peer.unfit else '') for peer in peers
+    ) or 'nobody'
+
+
+def worst(findings: list[Finding]) -> Finding:
+    """The likeliest cause at the highest level that was found: that of the whole node."""
+    first = next((finding for finding in findings if finding.level != Level.OK), findings[0])
+    return first._replace(level=max(finding.level for finding in findings))
+
+
+def counts_of(loop: ControlLoop) -> dict[str, int]:
+    """Everything that was counted."""
+    statistics, commands = loop.statistics, loop.commands
+    return {
+        'samples': statistics.used, 'lost': statistics.lost,
+        'of these never sent': statistics.unsent, 'late': commands.late,
+        'non-finite dropped': statistics.dropped,
+        'repeated or from a second driver': statistics.extra,
+        'interruptions': statistics.interruptions, 'limits hit': statistics.limited,
+        'before the first reference': statistics.without_reference,
+        'without applied_control': commands.unreported,
+    }
+
+
+def values_of(loop: ControlLoop) -> dict[str, object]:
+    """Counts, estimates and what tells how well the loop runs."""
+    statistics, e = loop.statistics, loop.estimate
+    gap, swing = e.c_r - e.c_l, statistics.swing()
+    _, mean_s, _ = statistics.intervals_s()
+    return {
+        **counts_of(loop),
+        'state': e.status.word if loop.adapting else 'held',
+        **_of_the_fit(loop),
+        'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
+        **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
+        'learning': loop.adapting, 'compensating': loop.compensating,
+        'using applied_control': loop.commands.uses_reports,
+        # Above 1 the gap is crossed, without which nothing can be learned of it.
+        'excitation: swing of v / gap': swing / gap if gap > 0.0 else swing,
+        'rate [Hz]': 0.0 if isnan(mean_s) or mean_s <= 0.0 else 1.0 / mean_s,
+        'latency p50 [ms]': statistics.latency_ms(0.5),
+        'latency p99 [ms]': statistics.latency_ms(0.99),
+    }
+
+
+def _of_the_fit(loop: ControlLoop) -> dict[str, object]:
+    """What the default law knows of its own fit."""
+    estimator = loop.core.estimator
+    if not isinstance(estimator, MovingHorizon):
+        return {}
+    moved = estimator.learned_model.transfer_function
+    return {
+        'noise: learned / told': estimator.noise_ratio,
+        'unexplained motion / (m * gap)': estimator.unexplained,
+        'samples that wait for a fit': estimator.waiting,
+        'outliers': estimator.outliers,
+        'commands found to be late': estimator.reattributed,
+        'failed fits': estimator.failed_fits,
+        'G(z)': 'as told' if _same(moved, loop.told) else 'learned',
+    }
+
+
+def _same(a: TransferFunction, b: TransferFunction) -> bool:
+    return np.array_equal(a.numerator, b.numerator) \
+        and np.array_equal(a.denominator, b.denominator)

@@ -1,0 +1,231 @@
+"""Who else commands the same actuator, and which of them has to stand down."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from math import inf
+from typing import NamedTuple
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from backlash_ros import topics
+from backlash_ros.core.loop.causes import UNNAMED
+from backlash_ros.nodes.diagnostics.presence import Presence
+from backlash_ros.nodes.runtime.spin import ProcessNode
+
+LOOK_S = 0.2  # between two looks at the graph
+# What discovery mostly takes: a publisher that is found so soon after the start of a node was there
+# before it. Controllers of this machine are waited for however long it takes.
+SETTLE_S = 0.7
+HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
+SILENT_S = 3.0  # periods of /diagnostics, after which a controller that has said something is gone
+OWN_S = 1.0  # for the graph to show a publisher of this very process
+# Keys in /diagnostics by which controllers know each other.
+ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
+
+
+class Rival(NamedTuple):
+    """Another publisher of the command, and whether it was active before this controller."""
+
+    name: str
+    was_first: bool
+
+
+class _Claim(NamedTuple):
+    """What a controller says of itself: active since [ns], 0 if it is not, and when [s]."""
+
+    since_ns: int
+    heard_at: float
+
+
+class Rivals:
+    """Tells who of several publishers was first, from what each of them can know.
+
+    Controllers say in /diagnostics since when they are active; equal times are ordered by the
+    identity of the publisher. Whoever says nothing of the kind was first if it was there when this
+    controller became active. A controller that is not active, or has fallen silent, is no rival.
+    All times but since_ns are on the steady clock [s].
+
+    own: identity of the own publisher. settled_at: when the node has found who was there already.
+    """
+
+    def __init__(self, own: str, settled_at: float) -> None:
+        self.own, self.settled_at = own, settled_at
+        self.since_ns = 0
+        self._active_at = inf
+        self._first_seen: dict[str, float] = {}
+        self._claims: dict[str, _Claim] = {}
+
+    def begin(self, since_ns: int, now: float) -> None:
+        """The controller has become active."""
+        self.since_ns, self._active_at = since_ns, now
+
+    def end(self) -> None:
+        """It is not active any more."""
+        self.since_ns, self._active_at = 0, inf
+
+    def hear(self, values: Mapping[str, str], now: float) -> None:
+        """Take in what a node says in /diagnostics."""
+        identity, since = values.get(ENDPOINT, ''), values.get(SINCE, '')
+        if identity and identity != self.own and since.isdecimal():
+            self._claims[identity] = _Claim(int(since), now)
+
+    def among(self, others: Mapping[str, str], now: float) -> tuple[Rival, ...]:
+        """The rivals among the other publishers, given by identity with their names."""
+        self._first_seen = {each: self._first_seen.get(each, now) for each in others}
+        self._claims = {each: c for each, c in self._claims.items() if each in others}
+        if not self.since_ns:
+            return ()
+        found = [
+            Rival(name, self._was_first(each)) for each, name in others.items()
+            if self._is_active(each, now)
+        ]
+        return tuple(sorted(found))
+
+    def _is_active(self, identity: str, now: float) -> bool:
+        claim = self._claims.get(identity)
+        return claim is None or (claim.since_ns > 0 and now < claim.heard_at + SILENT_S)
+
+    def _was_first(self, identity: str) -> bool:
+        claim = self._claims.get(identity)
+        if claim is not None:
+            return (claim.since_ns, identity) < (self.since_ns, self.own)
+        return self._first_seen[identity] <= max(self._active_at, self.settled_at)
+
+
+class RivalWatch:
+    """Looks out for other publishers of the command while the node runs.
+
+    advertise: makes the own publisher. changed: called when there is something new to say.
+    found: the rivals at the newest look.
+    """
+
+    def __init__(
+        self, node: ProcessNode, topic: str, advertise: Callable[[], Publisher],
+        changed: Callable[[], None],
+    ) -> None:
+        self.topic = node.resolve_topic_name(topic)
+        self.found: tuple[Rival, ...] = ()
+        self._node, self._changed = node, changed
+        own = identity_made_by(node, self.topic, advertise)
+        self._rivals = Rivals(own, time.monotonic() + SETTLE_S)
+        self._presence = Presence(node.context.get_domain_id(), self.topic, own)
+        self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
+        self._others: frozenset[str] = frozenset()
+        self._hello_until = -inf
+        self._diagnostics: Subscription | None = None  # listened to only beside others
+        node.create_timer(LOOK_S, self.look, clock=node.steady_clock)
+
+    @property
+    def settled(self) -> bool:
+        """Whether the time is over in which those who were there before the node are found."""
+        return time.monotonic() >= self._rivals.settled_at
+
+    @property
+    def complete(self) -> bool:
+        """Whether all controllers of this machine that were there at activation are found."""
+        return not self._awaited
+
+    @property
+    def claim(self) -> dict[str, object]:
+        """What the node has to say in /diagnostics."""
+        return {ENDPOINT: self._rivals.own, SINCE: self._rivals.since_ns}
+
+    @property
+    def came_first(self) -> bool:
+        """Whether no rival was active before this controller."""
+        return not any(rival.was_first for rival in self.found)
+
+    def begin(self) -> None:
+        """The controller has become active."""
+        # Of two that begin at once the one that is listed later waits for the other at least.
+        self._awaited = self._presence.others()
+        self._rivals.begin(time.time_ns(), time.monotonic())
+        self.look()
+
+    def end(self) -> None:
+        """It is not active any more."""
+        self._awaited = frozenset()
+        self._rivals.end()
+        self.look()
+
+    def look(self) -> None:
+        """Look at the graph."""
+        now, before = time.monotonic(), self.found
+        others = self._other_publishers()
+        if self._awaited:
+            self._awaited = self._awaited & self._presence.others() - others.keys()
+            # Whoever has been found while it was waited for was there before.
+            self._rivals.settled_at = max(self._rivals.settled_at, now)
+        if self._others != others.keys():
+            self._others, self._hello_until = frozenset(others), now + HELLO_S
+        self._listen(bool(others))
+        self.found = self._rivals.among(others, now)
+        if self.found != before or (others and now < self._hello_until):
+            self._changed()
+
+    def _other_publishers(self) -> dict[str, str]:
+        # Counting is ten times cheaper than asking who they are.
+        if self._node.count_publishers(self.topic) < 2:
+            return {}
+        infos = self._node.get_publishers_info_by_topic(self.topic)
+        return {
+            identity: name_of(info) for info in infos
+            if (identity := identity_of(info)) != self._rivals.own
+        }
+
+    def _listen(self, wanted: bool) -> None:
+        if wanted and self._diagnostics is None:
+            self._diagnostics = self._node.create_subscription(
+                DiagnosticArray, topics.DIAGNOSTICS, self._hear, 10
+            )
+        elif not wanted and self._diagnostics is not None:
+            self._node.destroy_subscription(self._diagnostics)
+            self._diagnostics = None
+
+    def _hear(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {each.key: each.value for each in status.values}
+            self._rivals.hear(values, time.monotonic())
+
+
+def name_of(info: TopicEndpointInfo) -> str:
+    """Full name of the node that an endpoint belongs to."""
+    # Names are discovered a little later than topics, and programs without ROS have none.
+    if 'UNKNOWN' in info.node_name:
+        return UNNAMED
+    return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+
+
+def names_of(infos: Iterable[TopicEndpointInfo]) -> str:
+    """The nodes that endpoints belong to, each once."""
+    return ', '.join(sorted({name_of(info) for info in infos}))
+
+
+def identity_of(info: TopicEndpointInfo) -> str:
+    """Identity of an endpoint, one and the same for all who see it."""
+    return bytes(info.endpoint_gid).hex()
+
+
+def identity_made_by(
+    node: Node, topic: str, advertise: Callable[[], Publisher],
+) -> str:
+    """Identity of the publisher that advertise makes; rclpy has no way to ask for it."""
+    def seen() -> list[TopicEndpointInfo]:
+        return list(node.get_publishers_info_by_topic(topic))
+
+    own_name, before = node.get_fully_qualified_name(), set(map(identity_of, seen()))
+    advertise()
+    deadline = time.monotonic() + OWN_S
+    while time.monotonic() < deadline:
+        # A namesake that is discovered at this very moment has no name yet.
+        for info in seen():
+            if identity_of(info) not in before and name_of(info) == own_name:
+                return identity_of(info)
+        time.sleep(1e-3)
+    raise RuntimeError(f'the graph does not show the own publisher of {topic} within {OWN_S:g} s')

@@ -1,0 +1,162 @@
+"""How y comes from the driver and v goes to it: plain numbers, or the messages of ros2_control."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64, Float64MultiArray
+
+from backlash_ros import topics
+from backlash_ros.core.loop.output import Output
+from backlash_ros.core.loop.sample_counter import UNNUMBERED
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.nodes.runtime.messages import DEPTH
+from backlash_ros.nodes.runtime.spin import ProcessNode
+
+
+class DriverTopics(NamedTuple):
+    """Where y comes from and v goes to."""
+
+    output: str
+    output_type: type[Any]
+    control: str
+    control_type: type[Any]
+
+
+STYLES = {
+    'native': DriverTopics(topics.PLANT_OUTPUT, Float64, topics.CONTROL, Float64),
+    'ros2_control': DriverTopics(
+        topics.JOINT_STATES, JointState, topics.JOINT_COMMANDS, Float64MultiArray
+    ),
+}
+
+
+def output_qos(p: Parameters, depth: int) -> QoSProfile:
+    """How y is listened to."""
+    best_effort = p.flag('io.best_effort')
+    return QoSProfile(depth=depth, reliability=(
+        ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+    ))
+
+
+class DriverIo:
+    """What a node says to the driver and hears from it, in the messages that io.style names.
+
+    skipped: messages without the joint. seen: the joints of the newest one of them.
+    simulated_time: whether stamps are those of /clock.
+    """
+
+    def __init__(self, node: ProcessNode, p: Parameters) -> None:
+        self.skipped, self.seen = 0, ''
+        self._node, self._p = node, p
+        self.topics = STYLES[p.word('io.style')]
+        self._joint, self._field = p.word('io.joint'), p.word('io.field')
+        # On simulated time the stamps of the middleware, which are real time, say nothing.
+        self.simulated_time = bool(node.get_parameter('use_sim_time').value)
+        self._publisher: Publisher | None = None
+
+    @property
+    def publisher(self) -> Publisher:
+        """That of v, once it is advertised."""
+        assert self._publisher is not None
+        return self._publisher
+
+    @property
+    def listeners(self) -> int:
+        """How many subscribers v has."""
+        return 0 if self._publisher is None else self._publisher.get_subscription_count()
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether y comes from the plant of this package: no other one tells the truth."""
+        return self._node.count_publishers(topics.TRUTH) > 0
+
+    def now_ns(self) -> int:
+        """Time on the clock of the stamps."""
+        # time.time_ns() is the system clock of ROS, without the detour.
+        return self._node.get_clock().now().nanoseconds if self.simulated_time \
+            else time.time_ns()
+
+    def stamp_ns(self, info: dict[str, Any]) -> int:
+        """When a message left, on the clock of the stamps."""
+        return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
+
+    def listen(self, hear: Callable[[Output], None], depth: int) -> Subscription:
+        """Call hear with every y."""
+        def hear_number(message: Float64, info: dict[str, Any]) -> None:
+            sent_ns = info['source_timestamp']
+            hear(Output(
+                message.data, self.stamp_ns(info), sent_ns, info['received_timestamp'],
+                info['publication_sequence_number'],
+            ))
+
+        def hear_joint(message: JointState, info: dict[str, Any]) -> None:
+            values = getattr(message, self._field)
+            row = self._row(message.name, len(values))
+            if row < 0:
+                self.skipped, self.seen = self.skipped + 1, ', '.join(message.name)
+                return
+            stamp = message.header.stamp
+            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+            # Drivers that leave the header empty are known by the stamp of the middleware.
+            hear(Output(
+                values[row], stamp_ns or info['source_timestamp'], info['source_timestamp'],
+                info['received_timestamp'], UNNUMBERED,
+            ))
+
+        hear_message = hear_joint if self.topics.output_type is JointState else hear_number
+        return self._node.listen(
+            self.topics.output_type, self.topics.output, hear_message, output_qos(self._p, depth)
+        )
+
+    def advertise(self) -> Publisher:
+        """Make the publisher of v."""
+        to = self.topics
+        publisher: Publisher = self._node.create_publisher(to.control_type, to.control, DEPTH)
+        self._message = to.control_type()
+        self._publisher = publisher
+        return publisher
+
+    def listen_to_commands(self, hear: Callable[[float], None]) -> Subscription:
+        """Call hear with every v that anybody sends to the driver."""
+        def hear_number(message: Float64) -> None:
+            hear(message.data)
+
+        def hear_numbers(message: Float64MultiArray) -> None:
+            if len(message.data) == 1:
+                hear(message.data[0])
+
+        several = self.topics.control_type is Float64MultiArray
+        return self._node.create_subscription(
+            self.topics.control_type, self.topics.control,
+            hear_numbers if several else hear_number, 1,
+        )
+
+    def publish(self, v: float) -> None:
+        """Send v to the driver."""
+        assert self._publisher is not None
+        several = self.topics.control_type is Float64MultiArray
+        self._message.data = array('d', (v,)) if several else v
+        self._publisher.publish(self._message)
+
+    def wait_until_received(self, timeout_s: float) -> None:
+        """Wait until the driver has confirmed the newest v, or the timeout is over."""
+        self.publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
+
+    def _row(self, names: list[str], count: int) -> int:
+        """Row of the joint, -1 where it is missing."""
+        if not self._joint:
+            return 0 if count == 1 else -1
+        try:
+            row = names.index(self._joint)
+        except ValueError:
+            return -1
+        return row if row < count else -1

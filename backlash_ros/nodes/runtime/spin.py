@@ -1,0 +1,264 @@
+"""A node as a process: arguments, start-up, work, signals, shutdown, exit code."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NoReturn, cast
+
+import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.exceptions import InvalidHandle, NameValidationException
+from rclpy.executors import ExternalShutdownException
+from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.utilities import remove_ros_args
+
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import PARAMETERS, as_yaml
+from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.nodes.runtime.declare import declare_parameters
+from backlash_ros.nodes.runtime.goodbye import exit_at_the_latest
+from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, make_executor
+from backlash_ros.nodes.runtime.unused_sections import complaints
+
+DONE, FAILED, BAD_INPUT = 0, 1, 2
+LOOK_S = 0.01  # between two looks at a condition of start-up
+AGAIN_S = 0.1  # between two requests to stop, until the node has heard one
+GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node in a second
+REMIND_S = 5.0  # between two lines that say what start-up waits for
+# A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
+NAP_NS = 3_000_000
+
+
+class ProcessNode(Node):
+    """A node that is the purpose of its process: parameters checked, then work until stopped."""
+
+    def __init__(
+        self, executable: str, parameters_of: str = '', reconfigurable: bool = False,
+    ) -> None:
+        """parameters_of: the executable whose parameters it reads. Raises ParameterError.
+
+        reconfigurable: whether parameters may change while the node is unconfigured.
+        """
+        try:
+            super().__init__(executable, automatically_declare_parameters_from_overrides=True)
+        except ValueError:
+            raise ParameterError(
+                executable, None, 'has a parameter without a value', 'give it one or leave it out'
+            ) from None
+        self.log = Node.get_logger(self)
+        self.settings = declare_parameters(
+            self, parameters_of or executable, reconfigurable
+        )
+        self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.stopping = False
+        self.signals = 0  # SIGINT and SIGTERM that have come
+        self.exit_code = DONE
+        self.stop_request = self.create_guard_condition(self._stop)
+
+    def listen(
+        self, message_type: type[Any], topic: str,
+        callback: Callable[[Any, dict[str, Any]], None], qos: QoSProfile | int, raw: bool = False,
+    ) -> Subscription:
+        """Subscribe with a callback that also gets time stamp and number of the message."""
+        # rclpy takes such callbacks but does not say so in its types.
+        plain = cast(Callable[[Any], None], callback)
+        return self.create_subscription(message_type, topic, plain, qos, raw=raw)
+
+    def work(self, executor: NodeExecutor) -> None:
+        """Do what the node is for until `stopping`."""
+        while not self.stopping:
+            executor.spin_once()
+
+    def finish(self) -> None:
+        """Say what there is to say at the end; called once, whatever ended the work."""
+
+    def call_when(
+        self, condition: Callable[[], bool], action: Callable[[], None], awaited: str,
+    ) -> None:
+        """Call action as soon as condition holds; `awaited` says in the log what is missing."""
+        remind = time.monotonic() + REMIND_S
+
+        def look() -> None:
+            nonlocal remind
+            if condition():
+                self.destroy_timer(timer)
+                action()
+            elif time.monotonic() > remind:
+                remind += REMIND_S
+                self.log.info(f'waiting for {awaited}')
+
+        timer = self.create_timer(LOOK_S, look, clock=self.steady_clock)
+
+    def _stop(self) -> None:
+        self.stopping = True
+
+
+def spin_paced(
+    node: ProcessNode, executor: NodeExecutor, period_s: float,
+    tick: Callable[[int, int], bool], idle: Callable[[], bool],
+) -> None:
+    """Call tick(n, due_ns) n periods after the start, until it returns False or the node stops.
+
+    The deadlines are absolute, so that nothing drifts; where the process is held up past a
+    deadline, n jumps. due_ns: the deadline on the monotonic clock. In between messages are
+    served, and all else after a tick. idle: says that none is expected before the next tick.
+    """
+    period_ns = period_s * 1e9
+    start = time.monotonic_ns()
+    n = -1
+    while not node.stopping:
+        now = time.monotonic_ns()
+        remaining = start + (n + 1) * period_ns - now
+        if remaining <= 0:
+            # What has arrived in time counts, even if nobody has looked at it yet.
+            executor.serve_urgent(0)
+            n = max(n + 1, int((time.monotonic_ns() - start) / period_ns))
+            if not tick(n, start + int(n * period_ns)):
+                return
+            executor.look_if_due()
+        elif remaining >= NAP_NS:
+            executor.spin_once(timeout_sec=remaining * 1e-9)
+        elif idle():
+            time.sleep(remaining * 1e-9)
+        else:
+            executor.serve_urgent(int(remaining))
+
+
+def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
+    """Run a node until its work ends, by itself or by SIGINT or SIGTERM; return the exit code.
+
+    That of the node, or 2 for bad input, told in one line on stderr. Any other exception passes.
+    """
+    signals = _SignalPipe()
+    reason = _initialise(args)
+    if reason:
+        return _refuse(executable, reason)
+    try:
+        _parse_plain_arguments(executable, make_node, args)
+        try:
+            node = make_node()
+        except (ParameterError, NameValidationException) as error:
+            return _refuse(executable, str(error))
+        for complaint in complaints(
+            sys.argv[1:] if args is None else args, executable, node.get_fully_qualified_name()
+        ):
+            node.log.warning(complaint)
+        signals.stop_at_arrival(node)
+        code = FAILED  # unless the work comes to its end
+        try:
+            executor = make_executor(node, node.log.warning)
+            # A full collection would look through all of numpy and scipy and cost many samples.
+            gc.collect()
+            gc.freeze()
+            with contextlib.suppress(ExternalShutdownException):
+                node.work(executor)
+            code = DONE
+        finally:
+            node.finish()
+            code = node.exit_code or code
+            with exit_at_the_latest(GOODBYE_S, code):
+                executor.shutdown()
+                Node.destroy_node(node)
+                rclpy.try_shutdown()
+    finally:
+        rclpy.try_shutdown()
+    return code
+
+
+class _SignalPipe:
+    """Turns SIGINT and SIGTERM into a callback of the executor.
+
+    So no callback is torn apart by an exception, and ROS still works when the node says good-bye;
+    the handlers of rclpy would raise KeyboardInterrupt anywhere and shut ROS down beneath it.
+    """
+
+    def __init__(self) -> None:
+        self._read_end, write_end = os.pipe()
+        os.set_blocking(write_end, False)
+        signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, frame: None)
+
+    def stop_at_arrival(self, node: ProcessNode) -> None:
+        """Ask the node to stop when a signal arrives or has arrived since the construction."""
+        def wait() -> None:
+            while os.read(self._read_end, 1):
+                node.signals += 1
+                # The node may be ending by itself.
+                with contextlib.suppress(InvalidHandle):
+                    # An executor that is busy may overlook a single one.
+                    while not node.stopping:
+                        node.stop_request.trigger()
+                        time.sleep(AGAIN_S)
+
+        threading.Thread(target=wait, daemon=True).start()
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports errors in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(BAD_INPUT, f'{self.prog}: {message}: parameters are given as '
+                             '--ros-args -p NAME:=VALUE or --params-file FILE\n')
+
+
+def _parse_plain_arguments(
+    executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None,
+) -> None:
+    """Refuse what is no argument of ROS; print help where asked for."""
+    parser = _Parser(
+        prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
+        description=sys.modules[make_node.__module__].__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter, epilog=_parameter_help(executable),
+    )
+    parser.parse_args(remove_ros_args(sys.argv[1:] if args is None else args))
+
+
+def _parameter_help(executable: str) -> str:
+    used = [p for p in PARAMETERS if executable in p.used_by]
+    return 'parameters, with their defaults (* may change in a running node):\n' + '\n'.join(
+        f'{"*" if p.live else " "} {p.name}: {as_yaml(p.default)}\n      {p.description}'
+        + (f' [{p.unit}]' if p.unit else '')
+        + (f' (one of {", ".join(p.choices)})' if p.choices else '') for p in used
+    )
+
+
+def _initialise(args: list[str] | None) -> str:
+    """Initialise ROS; return why that failed, empty if it did not."""
+    prefer_loopback(os.environ)
+    # rcl would add a line without content to the one that says what is wrong.
+    set_logger_level('rcl', LoggingSeverity.FATAL)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        return _in_one_line(str(error))
+    finally:
+        if get_logger_level('rcl') == LoggingSeverity.FATAL:
+            set_logger_level('rcl', LoggingSeverity.UNSET)
+    return ''
+
+
+def _in_one_line(reason: str) -> str:
+    # Where in the sources of rcl it was found helps nobody.
+    reason = ' '.join(reason.split(', at /')[0].split())
+    if 'Sequence should be of same type' in reason:
+        reason += ': write all numbers of a list with a decimal point'
+    return reason
+
+
+def _refuse(executable: str, reason: str) -> int:
+    print(f'{executable}: {" ".join(reason.split())}', file=sys.stderr)
+    return BAD_INPUT

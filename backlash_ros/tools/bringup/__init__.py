@@ -1,0 +1,1 @@
+"""`bringup`: a whole run as processes."""

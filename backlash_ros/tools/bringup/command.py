@@ -1,0 +1,82 @@
+"""One command for a whole run: start the nodes, watch them, stop them, report."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+from backlash_ros.tools.cli import command_line
+from backlash_ros.tools.cli.command_line import DEFAULT_DURATION_S, DONE, OptionParser
+
+EPILOG = """
+driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
+controller has seen as many samples as the duration holds. {axis} in it is the name of the axis;
+axes whose commands are the same share one driver. --driver none waits for a driver that you start
+yourself. The controller is stopped before the driver, which so hears its last command. As a driver
+moves something real, control.min, control.max and control.rate_max have to be set, or --unlimited
+given.
+
+axes: the parameter axes, in the section /bringup of the file, lists names; each gets nodes of its
+own in the namespace of that name and a folder DIR/NAME. Values stand under /**, /**/NODE,
+/NAME/** or /NAME/NODE; a named node goes before a named axis. If one axis fails, all are stopped.
+
+exit codes: 0 done, 2 bad input, 1 anything else (a process died, nothing moves, interrupted).
+
+A first Ctrl-C (SIGTERM, SIGHUP) stops all processes in order and reports what was recorded, a
+second one kills them at once. It is the regular end of a run without end (--duration inf), which
+then returns 0. If bringup itself is killed, a guardian process stops the others.
+
+environment: the processes inherit it. Unless you set them yourself,
+  ROS_AUTOMATIC_DISCOVERY_RANGE  is LOCALHOST: nothing leaves this machine
+  ROS_DOMAIN_ID                  is one that nobody uses on this machine, so that two runs never
+                                 hear each other, or 0 with --driver none; it is printed, so that
+                                 you can listen in
+  ROS_LOG_DIR                    is DIR/logs/ros
+  OMP_NUM_THREADS and its like   are 1
+"""
+
+
+def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Options of the command line; raises InputError."""
+    parser = OptionParser(
+        prog='bringup', description=__doc__, epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command_line.add_common_options(parser)
+    parser.add_argument(
+        '--duration', type=float, metavar='SECONDS',
+        help=f'length of the run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s); '
+             'inf runs until Ctrl-C',
+    )
+    parser.add_argument(
+        '--driver', metavar='COMMAND',
+        help='start this command instead of the simulated plant; none: it is started elsewhere',
+    )
+    parser.add_argument(
+        '--unlimited', action='store_true',
+        help='let a driver run without control.min, control.max and control.rate_max',
+    )
+    parser.add_argument(
+        '--lockstep', action='store_true',
+        help='as fast as the machine allows, every sample waiting for its control, '
+             'instead of real time',
+    )
+    parser.add_argument(
+        '--record', action=argparse.BooleanOptionalAction, default=True,
+        help='record a bag and write a report from it',
+    )
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    code = DONE
+
+    def bringup() -> None:
+        nonlocal code
+        options = parse_options(arguments)
+        # Loading numpy and scipy takes a second, in which a Ctrl-C is to be heard already.
+        from backlash_ros.tools.bringup.orchestrator import perform, prepare
+        code = perform(prepare(options))
+
+    return command_line.run_tool('bringup', bringup) or code

@@ -1,0 +1,338 @@
+"""A run in progress: what its processes say, how long to wait, when it is over, what went wrong."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from types import FrameType, TracebackType
+from typing import Any
+
+from backlash_ros import topics
+from backlash_ros.tools.bringup.processes import Child, Event, ProcessSupervisor, RunError
+from backlash_ros.tools.bringup.progress import ProgressDisplay, counts, number
+from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
+
+READY_DEADLINE_S = 30.0
+LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
+# Reports without anything that was unheard, after which nothing is to come. The middleware sends
+# again what got lost on the way to a recorder that was held up, with its own settings every 3 s.
+STANDS_STILL = 20
+STALL_DEADLINE_S = 10.0  # without a new sample
+LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
+
+# Where y may come from, as the ends of full names.
+OUTPUTS = (f'/{topics.PLANT_OUTPUT}', f'/{topics.JOINT_STATES}')
+
+# How a driver may end that was told to by a signal; a shell adds 128 to its number.
+TOLD_TO_END = {
+    code for number in (signal.SIGINT, signal.SIGTERM) for code in (-number, 128 + number)
+}
+
+
+class StopRequests:
+    """Counts SIGINT, SIGTERM and SIGHUP as long as the context lasts, instead of dying of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.last = ''
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequests:
+        for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # Under nohup a hang-up stays ignored.
+            if caught != signal.SIGHUP or signal.getsignal(caught) is not signal.SIG_IGN:
+                self._before[caught] = signal.signal(caught, self._note)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for caught, handler in self._before.items():
+            signal.signal(caught, handler)
+
+    def insist(self) -> bool:
+        """Whether there was a second request."""
+        return self.count > 1
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+        self.last = signal.Signals(number).name
+
+
+@dataclass
+class AxisProgress:
+    """How far an axis has come.
+
+    made: samples so far. first: number of the sample that counts as the first one. moved: when
+    the newest sample was heard of, on the monotonic clock [s]. published: samples and messages by
+    topic that can have been heard of a simulated plant, once it is done; heard: those that the
+    recorder has told of.
+    """
+
+    plan: AxisPlan
+    display: ProgressDisplay
+    made: int = 0
+    first: int = 0
+    began: float = 0.0
+    moved: float = 0.0
+    published: Mapping[str, int] | None = None
+    heard: dict[str, int] = field(default_factory=dict)
+    repeats: int = 0  # times in a row that the recorder has told of nothing that was unheard
+    silence_told: bool = False
+
+    @property
+    def patience(self) -> float:
+        """How long to wait for a new sample [s]."""
+        # A plant of long sample periods may take its time.
+        return STALL_DEADLINE_S + 2.0 * self.plan.sample_period
+
+    @property
+    def deadline(self) -> float:
+        """When the last sample must have come, on the monotonic clock [s]."""
+        if self.plan.samples == 0 or self.plan.parameters.flag('lockstep'):
+            return inf
+        return self.began + self.plan.samples * self.plan.sample_period + LATE_DEADLINE_S
+
+    @property
+    def complete(self) -> bool:
+        """Whether all samples were made; a driver does not say so, the recorder hears it."""
+        if self.plan.has_driver:
+            return 0 < self.plan.samples <= self.made
+        return self.published is not None
+
+    @property
+    def unheard(self) -> dict[str, int]:
+        """What is missing of the published ones."""
+        missing = {
+            what: count - self.heard.get(what, 0) for what, count in (self.published or {}).items()
+        }
+        return {what: count for what, count in missing.items() if count > 0}
+
+    def begin(self) -> None:
+        """The time starts to run."""
+        self.began = self.moved = time.monotonic()
+
+    def take(self, progress: Mapping[str, object]) -> None:
+        """Take in what the recorder says."""
+        sample = number(progress, 'sample')
+        if not isfinite(sample):
+            return
+        if self.made == 0:
+            self.begin()
+            # A driver may have been running before; a simulated plant begins with sample 0.
+            self.first = int(sample) if self.plan.has_driver else 0
+        made = int(sample) + 1 - self.first
+        before = self.unheard
+        self.heard = {'samples': made, **counts(progress, 'received')}
+        self.repeats = self.repeats + 1 if self.unheard == before else 0
+        if made > self.made:
+            self.made, self.moved, self.silence_told = made, time.monotonic(), False
+            self.display.show(progress, made)
+
+
+class Run:
+    """Watches the processes of a run from start to end.
+
+    failure: what went wrong, empty as long as nothing did.
+    """
+
+    def __init__(
+        self, plan: RunPlan, supervisor: ProcessSupervisor, requests: StopRequests,
+        displays: Mapping[str, ProgressDisplay],
+    ) -> None:
+        self._plan, self._supervisor, self._requests = plan, supervisor, requests
+        self._axes = {axis.name: AxisProgress(axis, displays[axis.name]) for axis in plan.axes}
+        self._ready: set[str] = set()
+        self.failure = ''
+
+    def has_samples(self, axis: AxisPlan) -> bool:
+        """Whether at least one sample of the axis went round the loop."""
+        return self._axes[axis.name].made > 0
+
+    def execute(self) -> None:
+        """Wait until all samples are made, then stop everything; sets failure."""
+        try:
+            self._wait_until_ready()
+            for axis in self._axes.values():
+                if axis.made == 0:
+                    axis.begin()
+            while not (self._over or all(axis.complete for axis in self._axes.values())):
+                self._listen()
+                for axis in self._axes.values():
+                    self._check_pace(axis)
+            self._catch_up()
+            if self._over:
+                self._say(f'{self._requests.last} ends the run')
+        except RunError as error:
+            # Said before the processes are stopped, which may take a while.
+            self._fail(str(error))
+        for event in self._supervisor.stop():
+            self._note(event)
+        self._judge_exits()
+
+    @property
+    def _over(self) -> bool:
+        """Whether the user ends a run that has no other end."""
+        return (
+            self._requests.count > 0 and self._plan.endless
+            and all(axis.made > 0 for axis in self._axes.values())
+        )
+
+    def _fail(self, message: str) -> None:
+        self.failure = message
+        if message:
+            self._say(message)
+
+    def _say(self, message: str) -> None:
+        for axis in self._axes.values():
+            axis.display.close()
+        complain(message)
+
+    def _wait_until_ready(self) -> None:
+        deadline = time.monotonic() + READY_DEADLINE_S
+        while self._missing():
+            self._listen()
+            late = [child for child in self._missing() if not self._may_wait(child)]
+            if late and time.monotonic() > deadline:
+                names = ', '.join(child.plan.name for child in late)
+                logs = '\n'.join(f'the end of {child.end_of_log()}' for child in late)
+                raise RunError(
+                    f'not ready within {READY_DEADLINE_S:g} s: {names}{self._hint()}\n{logs}'
+                )
+
+    def _hint(self) -> str:
+        if not any(axis.plan.has_driver for axis in self._axes.values()):
+            return ''
+        return ' (a controller waits until the driver subscribes to its command)'
+
+    def _may_wait(self, child: Child) -> bool:
+        """Whether it waits for somebody who may come when he wants."""
+        axis = self._axes[child.plan.axis].plan
+        waiting = []
+        if axis.driver_is_elsewhere or axis.is_managed:
+            waiting.append(axis.process_name('controller'))
+        if axis.is_managed:
+            # The plant begins when the controller listens.
+            waiting.append(axis.process_name('plant'))
+        return child.plan.name in waiting
+
+    def _check_pace(self, axis: AxisProgress) -> None:
+        """Raise RunError for samples that do not come."""
+        now = time.monotonic()
+        plan = axis.plan
+        if plan.has_driver and axis.made == 0:
+            if not plan.driver_is_elsewhere and now > axis.began + READY_DEADLINE_S:
+                raise RunError(plan.titled(
+                    f'no sample within {READY_DEADLINE_S:g} s: does the driver publish its output? '
+                    f'see {plan.logs}; where it needs longer, start it yourself (--driver none)'
+                ))
+            return
+        if now > axis.deadline and not axis.complete:
+            raise RunError(plan.titled(
+                f'only {axis.made} of {plan.samples} samples, '
+                f'{LATE_DEADLINE_S:g} s after the end was due, see {plan.logs}'
+            ))
+        if now > axis.moved + axis.patience and not axis.complete:
+            at = f' after sample {axis.first + axis.made - 1}' if axis.made else ''
+            silence = plan.titled(f'no new sample for {axis.patience:g} s{at}')
+            if not plan.has_driver:
+                raise RunError(f'{silence}, see {plan.logs}')
+            # The controller knows what to do when a real plant falls silent.
+            if not axis.silence_told:
+                axis.silence_told = True
+                axis.display.say(f'bringup: {silence}, waiting for the driver')
+
+    def _catch_up(self) -> None:
+        """Wait until the recorder has told of all that was published, and say what is missing."""
+        for axis in self._axes.values():
+            axis.repeats = 0
+        deadline = time.monotonic() + STALL_DEADLINE_S
+        while not self._over and any(
+            axis.unheard and axis.repeats < STANDS_STILL for axis in self._axes.values()
+        ):
+            self._listen()
+            if time.monotonic() > deadline:
+                raise RunError('the recorder does not catch up')
+        for axis in self._axes.values():
+            if axis.unheard:
+                missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
+                self._say(axis.plan.titled(
+                    f'the plant has said more than the recorder heard: {missing}'
+                ))
+
+    def _listen(self) -> None:
+        for event in self._supervisor.events(LISTEN_S):
+            self._note(event)
+        if self._requests.count and not self._over:
+            raise RunError(f'interrupted by {self._requests.last}, stopping')
+        dead = self._supervisor.ended()
+        if dead:
+            raise RunError('\n'.join(
+                f'{child.plan.name} died ({child.describe_exit()}), the end of '
+                f'{child.end_of_log()}'
+                for child in dead
+            ))
+
+    def _note(self, event: Event) -> None:
+        axis = self._axes[event.plan.axis]
+        if event.kind == 'ready':
+            self._ready.add(event.plan.name)
+        elif event.kind == 'done':
+            axis.published = counts(event.content, 'published')
+        elif event.kind == 'progress':
+            axis.take(event.content)
+        elif event.kind == 'recording_stopped':
+            # The log may lie on the very disk that is full.
+            complain(str(event.content.get('reason', '')))
+        elif event.kind == 'closed' and axis.plan.record and axis.made:
+            self._tell_unheard(event.content)
+
+    def _tell_unheard(self, closed: Mapping[str, object]) -> None:
+        """Say so where the bag holds what the controller made of y, but no y."""
+        if closed.get('failure'):
+            return
+        for topic, count in counts(closed, 'messages').items():
+            if topic.endswith(OUTPUTS) and count == 0:
+                self._say(
+                    f'the bag holds no message of {topic}, which the controller has heard: the '
+                    'recorder did not discover its publisher before the end of the run; let the '
+                    f'driver wait until {topic} has two subscribers, or run longer'
+                )
+
+    def _missing(self) -> list[Child]:
+        return [
+            child for child in self._supervisor.children
+            if not child.plan.foreign and child.plan.name not in self._ready
+        ]
+
+    def _judge_exits(self) -> None:
+        """Look at how the processes have ended that were told to."""
+        unclean = [c for c in self._supervisor.children if c.process.returncode != 0]
+        bad, odd = [], []
+        for child in unclean:
+            code = child.process.returncode
+            if not child.plan.foreign or code == -signal.SIGKILL:
+                bad.append(child)
+            elif code not in TOLD_TO_END:
+                odd.append(child)
+        if self.failure:
+            return
+        for child in odd:
+            # How a program of the user says good-bye is its own affair.
+            self._say(f'{child.plan.name} was stopped and ended with {child.describe_exit()}, '
+                      f'the end of {child.end_of_log()}')
+        self._fail('\n'.join(
+            f'{child.plan.name} did not stop cleanly ({child.describe_exit()}), the end of '
+            f'{child.end_of_log()}'
+            for child in bad
+        ))
+
+
+def complain(message: str) -> None:
+    """Say on stderr what went wrong."""
+    print(f'bringup: {message}', file=sys.stderr, flush=True)

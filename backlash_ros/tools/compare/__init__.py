@@ -1,0 +1,1 @@
+"""`compare`: laws and structures side by side."""

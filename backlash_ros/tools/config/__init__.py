@@ -1,0 +1,1 @@
+"""Parameter files, and the settings of the command line upon them."""

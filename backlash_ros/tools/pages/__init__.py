@@ -1,0 +1,1 @@
+"""What pages and pictures of all tools are made with."""

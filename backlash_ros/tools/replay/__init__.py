@@ -1,0 +1,1 @@
+"""`replay`: a recorded run through the controller once more."""

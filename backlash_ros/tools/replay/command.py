@@ -1,0 +1,214 @@
+"""`replay`: a recorded run through the controller once more, with other parameters if wanted."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import Value
+from backlash_ros.tools.cli.command_line import (
+    OptionParser,
+    add_out_option,
+    add_span_options,
+    format_table,
+    print_warnings,
+    run_tool,
+    span_of,
+)
+from backlash_ros.tools.cli.errors import InputError
+
+if TYPE_CHECKING:
+    from backlash_ros.core.parameters import Parameters
+    from backlash_ros.core.simulation.run_record import RunRecord
+    from backlash_ros.tools.run_files.bag_sections import Span
+
+EXECUTABLE = 'replay'
+FIGURE, TABLE = 'replay.png', 'replays.csv'
+HEADER = ('run', 'changed', 'm', 'c_r', 'c_l', 'std_m', 'std_c_r', 'std_c_l', 'tracking from [s]',
+          'innovation RMS')
+
+
+class _Job(NamedTuple):
+    """One replay. words: what of the parameters was changed. reports: as for core/simulation/replay.py."""
+
+    path: Path
+    recorded: RunRecord
+    parameters: Parameters
+    words: str
+    reports: Sequence[Sequence[float]]
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The options."""
+    parser = OptionParser(EXECUTABLE, description=__doc__)
+    parser.add_argument('runs', type=Path, nargs='+', metavar='RUN',
+                        help='a bag, or a folder of results; several give a table')
+    parser.add_argument('--config', type=Path, metavar='FILE',
+                        help='parameters (default: parameters.yaml beside the run)')
+    parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
+                        dest='settings', help='change one parameter; may be given again')
+    parser.add_argument('--sweep', action='append', default=[], metavar='KEY=V1,V2,...',
+                        help='once for each value; several sweeps: for each combination')
+    parser.add_argument('--axis', default='', metavar='NAME', help='of a bag with several')
+    add_span_options(parser)
+    add_out_option(parser)
+    return parser
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `replay`."""
+    return run_tool(EXECUTABLE, lambda: _replay(args))
+
+
+def _replay(args: Sequence[str] | None) -> None:
+    parser = make_parser()
+    options = parser.parse_args(args)
+    span = span_of(parser, options)
+    from backlash_ros.tools.simulate.batch import combinations, parse_sweep, value_text
+    changes = combinations([parse_sweep(text) for text in options.sweep])
+    runs = [(path, *_opened(path, options, span)) for path in options.runs]
+    jobs = []
+    for path, recorded, parameters, reports in runs:
+        for change in changes:
+            changed = parameters.replaced(change) if change else parameters
+            words = ' '.join(f'{name}={value_text(value)}' for name, value in change.items())
+            jobs.append(_Job(path, recorded, changed, words, reports))
+    if len(jobs) > 1:
+        _several(jobs, options.out)
+    else:
+        _one(jobs[0], options.out)
+
+
+def _opened(
+    path: Path, options: argparse.Namespace, span: Span,
+) -> tuple[RunRecord, Parameters, Sequence[Sequence[float]]]:
+    """The run, the parameters with which it is to be replayed, and what its driver reported."""
+    from backlash_ros.tools.report.command import open_source
+    source = open_source(path.resolve(), options.config, span, options.axis)
+    for text in (source.damage, *source.notes):
+        if text:
+            print(f'{EXECUTABLE}: warning: {text}', file=sys.stderr)
+    if source.run.samples == 0:
+        raise InputError(f'{path}: holds no sample')
+    if source.parameters is None:
+        raise InputError(f'{path}: no parameters.yaml stands beside it: give --config')
+    parameters = _with_settings(source.parameters, options.settings)
+    return source.run, parameters, _reports(path, source.run, parameters, options.axis)
+
+
+def _reports(
+    path: Path, run: RunRecord, parameters: Parameters, axis: str,
+) -> Sequence[Sequence[float]]:
+    """What the driver said to have applied before each row, where the controller uses it."""
+    from backlash_ros.bags.content import is_bag
+    from backlash_ros.tools.report.command import BAG
+    from backlash_ros.tools.run_files.bag_reading import read_reports
+    use = parameters.word('estimator.use_applied_control')
+    delayed = use == 'auto' and parameters.integer('control.delay_samples') > 0
+    if use == 'false' or delayed or parameters.flag('lockstep'):
+        return ()
+    bag = next((folder for folder in (path, path / BAG) if is_bag(folder)), None)
+    reports = [] if bag is None else read_reports(bag, run.column('y'), axis)
+    if not reports and use == 'true':
+        print(f'{EXECUTABLE}: warning: {path}: holds no applied_control: v is that of control',
+              file=sys.stderr)
+    return reports
+
+
+def _with_settings(parameters: Parameters, settings: Sequence[str]) -> Parameters:
+    from backlash_ros.tools.config.configuration import parse_setting
+    changes: dict[str, Value] = {}
+    for text in settings:
+        setting = parse_setting(text)
+        if setting.axis:
+            raise InputError(f'--set {text!r}: leave out the axis: there is one run')
+        changes[setting.name] = setting.value
+    return parameters.replaced(changes) if changes else parameters
+
+
+def _run(job: _Job, title: str) -> RunRecord:
+    from tqdm import tqdm
+
+    from backlash_ros.core.simulation.replay import replay
+    from backlash_ros.tools.cli.errors import BrokenOffError
+    with tqdm(total=job.recorded.samples, file=sys.stderr, disable=None, leave=False, desc=title) \
+            as bar:
+        try:
+            return replay(job.recorded, job.parameters, lambda _: bar.update(), job.reports)
+        except ParameterError:
+            raise
+        except ValueError as error:
+            raise BrokenOffError(f'the replay broke off: {error}') from error
+
+
+def _one(job: _Job, out: Path | None) -> None:
+    """What `simulate` writes, a figure beside it, and where the replay parts from the run."""
+    recorded, parameters = job.recorded, job.parameters
+    print_warnings(EXECUTABLE, parameters)
+    replayed = _run(job, job.path.name)
+    from backlash_ros.atomic_file import write_atomically
+    from backlash_ros.tools.pages.drawing import png
+    from backlash_ros.tools.replay.replay_figure import draw_replay
+    from backlash_ros.tools.report.command import PAGE, report_run
+    from backlash_ros.tools.run_files.results import result_directory
+    directory = result_directory(out)
+    summary = report_run(replayed, directory, parameters)
+    write_atomically(directory / FIGURE, png(draw_replay(recorded, replayed)))
+    print(format_table(('', 'run', 'replay', '±'), _compared(recorded, summary)))
+    print(_parted(recorded, replayed))
+    print(directory / FIGURE)
+    print(directory / PAGE)
+
+
+def _compared(recorded: RunRecord, summary: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    return [
+        (name, f'{recorded.column(name)[-1]:.6g}', f'{summary["final"][name]:.6g}',
+         f'{summary["final_std"][name]:.2g}')
+        for name in ('m', 'c_r', 'c_l')
+    ]
+
+
+def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
+    from backlash_ros.core.simulation.replay import parting
+    parted = parting(recorded, replayed)
+    if parted is None:
+        return 'the estimates are those of the run, to the last bit'
+    return (
+        f'the estimates part from those of the run at t = {parted.t:.4g} s: {parted.name} was '
+        f'{parted.recorded:.6g} and is {parted.replayed:.6g}; by {parted.largest:.3g} standard '
+        'deviations at most'
+    )
+
+
+def _several(jobs: Sequence[_Job], out: Path | None) -> None:
+    """A table with a row for each run and each value."""
+    from backlash_ros.tools.run_files.results import result_directory, write_table
+    rows: list[tuple[object, ...]] = []
+    for job in jobs:
+        replayed = _run(job, f'{job.path.name} {job.words}')
+        rows.append((str(job.path), job.words, *_figures(replayed)))
+    directory = result_directory(out)
+    write_table(directory / TABLE, HEADER, rows)
+    print(format_table(HEADER, [
+        tuple(f'{cell:.4g}' if isinstance(cell, float) and isfinite(cell) else
+              '–' if isinstance(cell, float) else str(cell) for cell in row) for row in rows
+    ]))
+    print(directory / TABLE)
+
+
+def _figures(run: RunRecord) -> tuple[float, ...]:
+    import numpy as np
+
+    from backlash_ros.core.estimation.protocol import Status
+    last = [float(run.column(name)[-1]) for name in HEADER[2:8]]
+    tracking = np.flatnonzero(run.column('status') == Status.TRACKING)
+    begins = float(run.column('t')[tracking[0]]) if len(tracking) else float('nan')
+    innovation = run.column('innovation')[run.samples // 2:]
+    known = innovation[np.isfinite(innovation)]
+    rms = float(np.sqrt(np.mean(known**2))) if len(known) else float('nan')
+    return (*last, begins, rms)

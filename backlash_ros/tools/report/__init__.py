@@ -1,0 +1,1 @@
+"""`report`: from a run to numbers, pictures and a page."""

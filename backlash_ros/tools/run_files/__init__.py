@@ -1,0 +1,1 @@
+"""Files of a run, and runs read back from bags."""

@@ -1,0 +1,1 @@
+"""`simulate`: one run, many seeds, sweeps, in one process."""
