@@ -9,7 +9,7 @@ import numpy as np
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.structure import Situation
+from backlash_ros.core.control.structure import ControlInput
 from backlash_ros.core.estimation.baselines.printed_law import printed_c, printed_f, printed_m
 from backlash_ros.core.estimation.protocol import Bounds, Estimate
 from backlash_ros.core.plant.backlash import Backlash
@@ -47,8 +47,8 @@ class PrintedLoop:
 
     def step(self, y_m: float) -> float:
         """Go on by one sample and return the control error e = u - u_d (3.4)."""
-        situation = Situation(y_m, 0.0, self.estimate, NO_STATE)
-        command = Proportional().control(situation, self._inverse)
+        inputs = ControlInput(y_m, 0.0, self.estimate, NO_STATE)
+        command = Proportional().control(inputs, self._inverse)
         u = self._backlash.step(command.v)
         if u != self._u:
             self._w = self.estimate.c_r if u > self._u else self.estimate.c_l
@@ -113,7 +113,7 @@ def moves_after_the_first() -> dict[str, tuple[float, float]]:
     before = 0.0
     for k in range(round(4.0 * np.pi / 12.6 / PERIOD)):
         y_m = reference(k)
-        u = backlash.step(Proportional().control(Situation(y_m, 0.0, e, NO_STATE), inverse).v)
+        u = backlash.step(Proportional().control(ControlInput(y_m, 0.0, e, NO_STATE), inverse).v)
         moved, before = u - before, u
         if abs(moved) < 1e-9:
             continue
@@ -131,8 +131,8 @@ def error_growth(f: float) -> float:
     backlash, inverse = Backlash(*TRUE), BacklashInverse()
     c, errors = c_r + 1e-6, []
     for y_m in (10.0, 10.1, 10.2):  # rises, so that the right side stays engaged
-        situation = Situation(y_m, 0.0, Estimate(m, c, c_l, f), NO_STATE)
-        command = Proportional().control(situation, inverse)
+        inputs = ControlInput(y_m, 0.0, Estimate(m, c, c_l, f), NO_STATE)
+        command = Proportional().control(inputs, inverse)
         u = backlash.step(command.v)
         errors.append(u - command.u_d)
         c = printed_c(u, y_m, f, m)

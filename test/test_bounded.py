@@ -23,7 +23,7 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.structure import LARGEST_CAREFUL, LARGEST_FEEDBACK, Structure
+from backlash_ros.core.control.structure import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, Structure
 from backlash_ros.core.control.tracking.design import Weights, design
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
@@ -72,7 +72,7 @@ def test_u_d_stays_within_a_stated_multiple_of_what_is_asked(
         return  # refused when it is configured
     controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
     asked = asked_by_the_reference(structure, SENSORS[sensor](0.0, 0))
-    allowed = LARGEST_CAREFUL
+    allowed = LARGEST_IN_ACQUISITION
     for k in range(SAMPLES):
         step = controller.step(SENSORS[sensor](plant.measure(), k), reference(k * 0.01))
         controller.refine()
@@ -94,7 +94,7 @@ def test_a_sign_that_is_wrong_from_the_start_moves_v_no_further_than_that() -> N
         plant.step(step.v)
         v.append(abs(step.v))
     asked = asked_by_the_reference('tracking') / 0.696 + 0.5  # through the first guess
-    assert max(v) <= (1.0 + LARGEST_CAREFUL) * asked
+    assert max(v) <= (1.0 + LARGEST_IN_ACQUISITION) * asked
     assert max(v[600:]) <= 1.01 * max(v[:600])
 
 

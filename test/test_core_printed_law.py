@@ -12,7 +12,7 @@ from strategies import NO_STATE, KnownInput, Play, eighths, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.structure import Command, Situation
+from backlash_ros.core.control.structure import Command, ControlInput
 from backlash_ros.core.estimation.baselines.printed_law import (
     PrintedLaw,
     printed_c,
@@ -35,7 +35,7 @@ def law(initial: Estimate = START, bounds: Bounds = WIDE,
 
 
 def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
-    return Proportional().control(Situation(y_m, 0.0, estimate, NO_STATE), inverse)
+    return Proportional().control(ControlInput(y_m, 0.0, estimate, NO_STATE), inverse)
 
 
 def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:

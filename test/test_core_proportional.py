@@ -12,7 +12,7 @@ from strategies import NO_STATE, Play, signals, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M, Proportional
-from backlash_ros.core.control.structure import Command, Situation
+from backlash_ros.core.control.structure import Command, ControlInput
 from backlash_ros.core.estimation.protocol import Estimate
 
 LARGEST_SHARE = 0.8  # of m that f may have
@@ -24,7 +24,7 @@ def estimate_of(play: Play, f_over_m: float) -> Estimate:
 
 def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
     """The structure looks at the reference and the estimate alone."""
-    return Proportional().control(Situation(y_m, 0.0, estimate, NO_STATE), inverse)
+    return Proportional().control(ControlInput(y_m, 0.0, estimate, NO_STATE), inverse)
 
 
 def tolerance(play: Play, y_m: float, u_d: float) -> float:

@@ -41,7 +41,7 @@ def worst_error(structure: str, told: bool, delay: int = 0) -> tuple[float, int]
     instead: tuple[float, ...] = ()
     for k in range(job.samples):
         t = k * loop.sample_period
-        v = controller.step(plant.measure(), loop.reference(t), instead=instead).v
+        v = controller.step(plant.measure(), loop.reference(t), alternatives=instead).v
         controller.refine()
         plant.step(before if rng.random() < LATE else v)
         instead = (before,) if told else ()

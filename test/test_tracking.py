@@ -14,7 +14,7 @@ from backlash_ros.core.control.tracking.design import Weights, design
 from backlash_ros.core.control.tracking.lq_preview import preview_gains
 from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
 from backlash_ros.core.control.tracking.slope_tolerance import tolerates
-from backlash_ros.core.control.tracking.tracking import cautious_crossings
+from backlash_ros.core.control.tracking.tracking import shrunk_crossings
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.state_model import StateModel
@@ -178,14 +178,14 @@ def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> N
     x = [0.0, 0.0]
     assert rest.decide(0.0, np.zeros(1), x, x, x, 0.0, inverse.side) is Mode.HOLD
     rest.step(estimate, 0.0, x, inverse, begins=True)
-    c_r, c_l = cautious_crossings(estimate, rest.caution, known=True)
+    c_r, c_l = shrunk_crossings(estimate, rest.shrinkage, known=True)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
     assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.01)
     rest.step(estimate, 0.0, x, inverse, begins=False)
     assert not inverse.taking_up, 'nothing more is known, so nothing more is done'
     known = resting(std=0.001)[2]
     rest.step(known, 0.0, x, inverse, begins=False)
-    c_r, c_l = cautious_crossings(known, rest.caution, known=True)
+    c_r, c_l = shrunk_crossings(known, rest.shrinkage, known=True)
     assert inverse.step(rest.u_d, 1.0, c_r, c_l) == pytest.approx(-1.0 + SHORT * 0.001)
 
 

@@ -53,9 +53,9 @@ DIAGNOSTICS_PERIOD_S = 1.0
 # A controller that was held up for so long, or so many samples, still learns from them; after a
 # longer stall it goes on with the newest ones.
 KEPT_S, KEPT_OUTPUTS = 0.1, 20
-# After the command the controller gives way for this share of a period: a busy processor is where
-# the driver, woken by the command, would have to wait.
-GIVE_WAY = 0.05
+# Share of a period for which the controller sleeps after the command: on a busy processor the
+# driver, woken by the command, would have to wait for it otherwise.
+POST_COMMAND_SLEEP = 0.05
 REFINE_SHARE = 0.3  # of a sample period for fits, after the command
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
 AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
@@ -320,7 +320,7 @@ class ControllerNode(ManagedNode):
         behind = 0 < output.received_ns < time.time_ns() - self._period_ns
         self._behind = self._behind + 1 if behind else 0
         if not behind:
-            time.sleep(self._give_way)
+            time.sleep(self._post_command_sleep_s)
         if self._behind % PUT_OFF == 0:
             loop.core.refine(self._refine_budget_s)
         self._follow_up(loop, step, was_silent)
@@ -406,7 +406,7 @@ class ControllerNode(ManagedNode):
     def _set_up(self, p: Parameters, from_zero: bool) -> None:
         """Take up what follows from the sample period."""
         period = p.real('sample_period')
-        self._give_way, self._period_ns = GIVE_WAY * period, period * 1e9
+        self._post_command_sleep_s, self._period_ns = POST_COMMAND_SLEEP * period, period * 1e9
         self._refine_budget_s = REFINE_SHARE * period
         self._counter = SampleCounter(period, from_zero)
 

@@ -9,7 +9,7 @@ from math import inf, isnan
 from typing import NamedTuple, Protocol
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import Adoption, Situation, Structure
+from backlash_ros.core.control.structure import Adoption, ControlInput, Structure
 from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.state_model import StateModel
@@ -108,34 +108,34 @@ class AdaptiveController:
         self._adoption: Adoption | None = None  # of the finished design, until it may take over
         self._waited = 0  # samples for which it could not
         self._interval: Interval | None = None
-        # y(k), the interval before it, samples lost before it and what was applied, as long as
-        # it is still to be learned from.
-        self._lesson: (
+        # The measurement that is still to be learned from: y(k), the interval before it, samples
+        # lost before it and what was applied.
+        self._pending: (
             tuple[float, Interval, int, Sequence[float], Sequence[float]] | None
         ) = None
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
-        instead: Sequence[float] = (),
+        alternatives: Sequence[float] = (),
     ) -> ControlStep:
         """Return the command for sample k.
 
         y, y_m: output and reference, finite. lost: samples that never arrived since the last
         call; the plant went on with the last v through all of them. applied: the v that was
-        really applied in each of the lost + 1 intervals since then, if it is known. instead: what
-        may have been applied in each of them, nan where there is no doubt.
+        really applied in each of the lost + 1 intervals since then, if it is known. alternatives:
+        what may have been applied in each of them, nan where none may.
         """
         if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST):
             raise ValueError(f'y={y!r} and y_m={y_m!r} must be finite and no larger than '
                              f'{LARGEST:g}')
         if lost < 0:
             raise ValueError(f'lost={lost!r} must be >= 0')
-        if applied or instead:
-            _check_intervals(lost + 1, applied, instead)
-        if self._lesson is not None:
+        if applied or alternatives:
+            _check_intervals(lost + 1, applied, alternatives)
+        if self._pending is not None:
             self._learn()
         if self._interval is not None:
-            self._lesson = y, self._interval, lost, applied, instead
+            self._pending = y, self._interval, lost, applied, alternatives
             if self.structure.needs_output:
                 self._learn()
         estimator, inverse = self.estimator, self.inverse
@@ -143,7 +143,7 @@ class AdaptiveController:
         if not self.compensating:
             used = replace(estimate, c_r=0.0, c_l=0.0)
         v_before = inverse.v
-        u_d, v, f = self.structure.control(Situation(y_m, y, used, estimator), inverse)
+        u_d, v, f = self.structure.control(ControlInput(y_m, y, used, estimator), inverse)
         v = self.limits.apply(v, v_before)
         inverse.applied(v)
         self._interval = Interval(v, y_m, u_d, f)
@@ -172,7 +172,7 @@ class AdaptiveController:
         for the gap pauses.
         """
         started = time.perf_counter()
-        if self._lesson is not None:
+        if self._pending is not None:
             self._learn()
         self.estimator.refine(budget_s)
         if self._learner is not None:
@@ -204,23 +204,23 @@ class AdaptiveController:
                 return
 
     def _learn(self) -> None:
-        lesson, self._lesson = self._lesson, None
-        assert lesson is not None
-        y, interval, lost, applied, instead = lesson
+        pending, self._pending = self._pending, None
+        assert pending is not None
+        y, interval, lost, applied, alternatives = pending
         v, y_m, u_d, f, other = interval
         for i in range(lost + 1):
             if applied:
                 v = applied[i]
-            if instead:
-                other = instead[i]
+            if alternatives:
+                other = alternatives[i]
             self.estimator.update(y if i == lost else None, Interval(v, y_m, u_d, f, other))
         self.lost_samples += lost
 
 
-def _check_intervals(count: int, applied: Sequence[float], instead: Sequence[float]) -> None:
-    for values in (applied, instead):
+def _check_intervals(count: int, applied: Sequence[float], alternatives: Sequence[float]) -> None:
+    for values in (applied, alternatives):
         if values and len(values) != count:
-            raise ValueError(f'applied and instead must have lost + 1 = {count!r} values each')
+            raise ValueError(f'applied and alternatives must have lost + 1 = {count!r} values each')
     for v in applied:
         if not -LARGEST <= v <= LARGEST:
             raise ValueError(f'applied={applied!r} must be finite and no larger than {LARGEST:g}')

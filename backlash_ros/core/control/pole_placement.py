@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import (
-    LARGEST_CAREFUL,
     LARGEST_FEEDBACK,
+    LARGEST_IN_ACQUISITION,
     Adoption,
     Command,
-    Situation,
+    ControlInput,
     Structure,
 )
 from backlash_ros.core.estimation.protocol import Estimate, Status
@@ -45,7 +45,7 @@ class PolePlacement:
         # r and what it asks for, newest first.
         self._r: Array = np.zeros(len(blocks.demand[0]))
         self._asked: Array = np.zeros(len(blocks.demand[1]) - 1)
-        self._reach = 0.0  # largest of it so far
+        self._largest_asked = 0.0  # largest of it so far
         self.delay = round(_delay_of(blocks.reference))
 
     @property
@@ -61,19 +61,19 @@ class PolePlacement:
         """Take over what the filters hold."""
         if isinstance(other, PolePlacement) and len(other._w_1) == len(self._w_1):
             self._w_1, self._w_2 = other._w_1, other._w_2
-            self._r, self._asked, self._reach = other._r, other._asked, other._reach
+            self._r, self._asked, self._largest_asked = other._r, other._asked, other._largest_asked
 
-    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
-        blocks, estimate = self._blocks, situation.estimate
+        blocks, estimate = self._blocks, inputs.estimate
         u_d = float(blocks.theta_1 @ self._w_1 + blocks.theta_2 @ self._w_2)
-        u_d += blocks.theta_20 * situation.y + blocks.theta_3 * situation.y_m
-        u_d = self._bounded(u_d, situation.y_m, estimate)
+        u_d += blocks.theta_20 * inputs.y + blocks.theta_3 * inputs.y_m
+        u_d = self._bounded(u_d, inputs.y_m, estimate)
         v = inverse.step(u_d, estimate.m, estimate.c_r, estimate.c_l)
         self._w_1 = self._companion @ self._w_1
         self._w_2 = self._companion @ self._w_2
         self._w_1[:1] += u_d
-        self._w_2[:1] += situation.y
+        self._w_2[:1] += inputs.y
         return Command(u_d, v, 0.0)
 
     def _bounded(self, u_d: float, r: float, estimate: Estimate) -> float:
@@ -84,10 +84,10 @@ class PolePlacement:
         asked = float(numerator @ self._r - denominator[1:] @ self._asked)
         self._asked[1:] = self._asked[:-1]
         self._asked[0] = asked
-        self._reach = max(self._reach, abs(asked))
-        reach = max(self._reach, estimate.m * (estimate.c_r - estimate.c_l))
-        share = LARGEST_FEEDBACK if estimate.status is Status.TRACKING else LARGEST_CAREFUL
-        return min(max(u_d, asked - share * reach), asked + share * reach)
+        self._largest_asked = max(self._largest_asked, abs(asked))
+        scale = max(self._largest_asked, estimate.m * (estimate.c_r - estimate.c_l))
+        share = LARGEST_FEEDBACK if estimate.status is Status.TRACKING else LARGEST_IN_ACQUISITION
+        return min(max(u_d, asked - share * scale), asked + share * scale)
 
 
 def _delay_of(model: TransferFunction) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from math import hypot, inf, isnan
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import Adoption, Command, Situation, Structure
+from backlash_ros.core.control.structure import Adoption, Command, ControlInput, Structure
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.state_model import StateModel
@@ -48,9 +48,9 @@ class Proportional:
         """Nothing here depends on G."""
         yield lambda source: None
 
-    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
-        y_m, estimate = situation.y_m, situation.estimate
+        y_m, estimate = inputs.y_m, inputs.estimate
         m, c_r, c_l, f = estimate.m, estimate.c_r, estimate.c_l, estimate.f
         before, self._estimate = self._estimate, estimate
         if f == 0.0:  # nothing to solve

@@ -16,10 +16,10 @@ from backlash_ros.core.plant.state_model import StateModel
 # Largest feedback, whatever y does, in units of the u that the reference has asked for so far or
 # that the gap takes: while the backlash is unknown, as wrong as a first guess may be; later what
 # leads y back from where it has gone until then.
-LARGEST_CAREFUL, LARGEST_FEEDBACK = 10.0, 100.0
+LARGEST_IN_ACQUISITION, LARGEST_FEEDBACK = 10.0, 100.0
 
 
-class Situation(NamedTuple):
+class ControlInput(NamedTuple):
     """What is known at a sample: reference, output, estimate, and who knows the state of G."""
 
     y_m: float
@@ -72,7 +72,7 @@ class Structure(Protocol):
     def may_change(self) -> bool:
         """Whether a design for a better model may take over at this sample."""
 
-    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""
 
     def design(self, model: StateModel) -> Iterator[Adoption | None]:

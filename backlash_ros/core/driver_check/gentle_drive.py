@@ -34,8 +34,8 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
 
     Raises ParameterError where a limit is missing or the limits exclude each other.
     """
-    reach = inf if amplitude is None else amplitude
-    low, high = max(p.real('control.min'), -reach), min(p.real('control.max'), reach)
+    excursion = inf if amplitude is None else amplitude
+    low, high = max(p.real('control.min'), -excursion), min(p.real('control.max'), excursion)
     speed = min(p.real('control.rate_max'), inf if rate is None else rate)
     for name, value in (('control.min', low), ('control.max', high)):
         if abs(value) == inf:
@@ -49,7 +49,7 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
         )
     if not low < high:
         raise ParameterError(
-            'control.min', low, f'must be < control.max={high!r} within --amplitude={reach:g}'
+            'control.min', low, f'must be < control.max={high!r} within --amplitude={excursion:g}'
         )
     return Range(low, high, speed)
 

@@ -29,7 +29,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import PARAMETERS, as_yaml
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.runtime.declare import declare_parameters
-from backlash_ros.nodes.runtime.goodbye import exit_at_the_latest
+from backlash_ros.nodes.runtime.forced_exit import exit_at_the_latest
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, make_executor
 from backlash_ros.nodes.runtime.unused_sections import complaints
 

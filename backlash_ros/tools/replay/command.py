@@ -34,7 +34,7 @@ HEADER = ('run', 'changed', 'm', 'c_r', 'c_l', 'std_m', 'std_c_r', 'std_c_l', 't
 
 
 class _Job(NamedTuple):
-    """One replay. words: what of the parameters was changed. reports: as for core/simulation/replay.py."""
+    """One replay. words: what of the parameters was changed. reports: as for `replay.replay`."""
 
     path: Path
     recorded: RunRecord

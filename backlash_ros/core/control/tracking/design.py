@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 # Times the input weight of the feedback while v meets its limits or the estimate is new; the last
 # one while the backlash is unknown.
-SOFTER = (1e1, 1e2, 1e3, 1e4)
+SCHEDULE = (1e1, 1e2, 1e3, 1e4)
 # Times the input weight with which feedback around a better G is tried in turn until its loop is
 # as safe as the one it replaces. The trajectory keeps the weight that was asked for.
 SAFER = (1.0, 3.0, 10.0, 30.0, 100.0)
@@ -47,10 +47,10 @@ class Weights:
 class TrackingDesign:
     """Gains of one model of G.
 
-    gains: of the ideal trajectory. feedback: of the deviations from it. softer: gains (n,) to
-    replace that of the state with, step by step, while v meets its limits, where full feedback
-    would cycle between them, and while the estimate is new.
-    careful: gain (n,) while the backlash is unknown; None where no feedback is better.
+    gains: of the ideal trajectory. feedback: of the deviations from it. schedule: gains (n,), each
+    with less feedback than the one before, for the time while v meets its limits, where full
+    feedback would cycle between them, and while the estimate is new.
+    acquisition: gain (n,) while the backlash is unknown; None where no feedback is better.
     gentle: gain (n,) that leads y back while the reference rests. push: |x| after REST_HORIZON
     samples of u = 1.
     """
@@ -58,36 +58,36 @@ class TrackingDesign:
     model: StateModel
     gains: PreviewGains
     feedback: Feedback
-    softer: tuple[Array, ...]
-    careful: Array | None
+    schedule: tuple[Array, ...]
+    acquisition: Array | None
     gentle: Array
     push: float
 
 
 def design_in_pieces(
-    model: StateModel, weights: Weights, softness: float = 1.0,
+    model: StateModel, weights: Weights, weight_factor: float = 1.0,
 ) -> Generator[None, None, TrackingDesign]:
     """Return the design; stops after each Riccati equation.
 
-    softness: see `feedback_around`. Raises ParameterError where no gains exist.
+    weight_factor: see `feedback_around`. Raises ParameterError where no gains exist.
     """
     rho = input_weight(model, weights)
     gains = lq_gains(model, rho, weights.integral_weight, weights.preview)
     yield
-    feedback = feedback_around(model, weights, softness)
+    feedback = feedback_around(model, weights, weight_factor)
     yield
-    softer = []
-    for more in SOFTER:
-        softer.append(lq_gains(model, max(more, softness) * rho).state)
+    schedule = []
+    for more in SCHEDULE:
+        schedule.append(lq_gains(model, max(more, weight_factor) * rho).state)
         yield
-    bears_wrong_slope = _bears_wrong_slope(model, SOFTER[-1] * rho)
+    bears_wrong_slope = _bears_wrong_slope(model, SCHEDULE[-1] * rho)
     yield
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
     gentle = lq_gains(model, power_gain(model.transfer_function, REST_BANDWIDTH)).state
     yield
     push = float(np.linalg.norm(powers(model.a, model.b, REST_HORIZON).sum(axis=0)))
-    careful = softer[-1] if bears_wrong_slope else None
-    return TrackingDesign(model, gains, feedback, tuple(softer), careful, gentle, push)
+    acquisition = schedule[-1] if bears_wrong_slope else None
+    return TrackingDesign(model, gains, feedback, tuple(schedule), acquisition, gentle, push)
 
 
 def better_design_in_pieces(
@@ -97,14 +97,15 @@ def better_design_in_pieces(
 
     It replaces the present one where its loop around the better G keeps a modulus margin that is
     usual (SAFE_MARGIN), or at least as large as that of the present loop around the G it was made
-    for or around the better one; feedback is made as soft as this takes. A loop that is unstable
-    around the better G is replaced by any stable one; an unstable one replaces none.
+    for or around the better one; the weight of its input is raised as far as this takes. A loop
+    that is unstable around the better G is replaced by any stable one; an unstable one replaces
+    none.
     """
     needed = SAFE_MARGIN
     compared = False
-    for softness in SAFER:
+    for weight_factor in SAFER:
         try:
-            feedback = feedback_around(model, weights, softness)
+            feedback = feedback_around(model, weights, weight_factor)
         except ParameterError:
             return None
         yield
@@ -115,7 +116,7 @@ def better_design_in_pieces(
                 theirs = yield from margin_in_pieces(plant, present.feedback)
                 needed = min(needed, theirs)
         if margin > 0.0 and margin >= needed:
-            return (yield from design_in_pieces(model, weights, softness))
+            return (yield from design_in_pieces(model, weights, weight_factor))
     return None
 
 
@@ -169,12 +170,12 @@ def powers(a: Array, b: Array, count: int) -> Array:
     return stack[:count]
 
 
-def feedback_around(model: StateModel, weights: Weights, softness: float) -> Feedback:
-    """Of deviations from the trajectory, as if the input weighed `softness` times as much.
+def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> Feedback:
+    """Of deviations from the trajectory, as if the input weighed `weight_factor` times as much.
 
     Raises ParameterError where no gains exist.
     """
-    rho = softness * input_weight(model, weights)
+    rho = weight_factor * input_weight(model, weights)
     gains = lq_gains(model, rho, weights.integral_weight)
     return Feedback(model, gains.state, gains.integral)
 
@@ -189,7 +190,7 @@ def power_gain(model: TransferFunction, frequency: float) -> float:
     return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
 
 
-# What follows is remembered: a controller that begins anew does so in the middle of a loop.
+# What follows is cached: a controller restarts in the middle of a loop.
 @lru_cache(maxsize=64)
 def lq_gains(
     model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,

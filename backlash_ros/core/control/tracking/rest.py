@@ -1,7 +1,7 @@
 """What v does while the reference rests: as little as keeps y where it belongs.
 
-Feedback through a gap that is not known to the last digit would cross it for ever. So v is held
-while y is within a tolerance of the trajectory, and otherwise moves in single steps:
+Feedback through a gap that is not known to the last digit would limit-cycle. So v is held while y
+is within a tolerance of the trajectory, and otherwise moves in single steps:
 
 - to the u that holds G at rest, stopping short of it by what is uncertain about the crossing. What
   is left of u shows in y. Once it is known it is taken away by going on in the same direction,
@@ -33,7 +33,7 @@ TOLERANCE = 21.0
 # The same for the first samples of a rest, in which y is brought as close as the noise allows.
 # Later only a drift is worth a step.
 CLOSE, SETTLING = 7.0, 200
-DOUBT = 2.0  # the same in standard deviations of x, where that is more
+UNCERTAIN = 2.0  # the same in standard deviations of x, where that is more
 SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
 ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
 TURNS = 2  # while the trajectory rests, after which feedback goes on in single steps
@@ -65,10 +65,10 @@ class Rest:
     def __init__(self, design: TrackingDesign, noise_std: float) -> None:
         self.mode = Mode.HOLD
         self.u_d = 0.0  # where v rests
-        self.caution = 0.0  # standard deviations by which the crossings are shrunk for it
+        self.shrinkage = 0.0  # standard deviations by which the crossings are shrunk for it
         self._noise_std = noise_std
         self.use(design)
-        self._reach = 0.0  # square of the largest |x*| so far
+        self._largest_square = 0.0  # square of the largest |x*| so far
         self._limit = 0.0  # tolerance in use
         self._rested = 0  # samples for which the trajectory has rested
         self._turns, self._side = 0, Region.GAP  # since x* rests; line in use the sample before
@@ -83,8 +83,9 @@ class Rest:
 
     def go_on_from(self, other: Rest) -> None:
         """Take over where another one of the same model rests."""
-        self.mode, self.u_d, self.caution = other.mode, other.u_d, other.caution
-        self._reach, self._limit, self._pull = other._reach, other._limit, other._pull
+        self.mode, self.u_d, self.shrinkage = other.mode, other.u_d, other.shrinkage
+        self._largest_square, self._limit = other._largest_square, other._limit
+        self._pull = other._pull
         self._rested, self._near = other._rested, other._near
         self._turns, self._side = other._turns, other._side
 
@@ -97,8 +98,8 @@ class Rest:
         window: r from now on. x, onward: x* now and at the next sample. deviation: x_hat - x*.
         x_std: standard deviation of x_hat, None where it is unknown. side: line in use.
         """
-        self._reach = max(self._reach, dot(x, x))
-        least = SHARE * sqrt(self._reach)
+        self._largest_square = max(self._largest_square, dot(x, x))
+        least = SHARE * sqrt(self._largest_square)
         tolerance = max(TOLERANCE * self._noise_std, least)
         motion = 0.0
         for now, then in zip(x, onward, strict=True):
@@ -115,7 +116,7 @@ class Rest:
             self._rested += 1
             if self._rested < SETTLING:
                 tolerance = max(CLOSE * self._noise_std, least)
-            self._limit = max(tolerance, DOUBT * x_std)
+            self._limit = max(tolerance, UNCERTAIN * x_std)
             if self.mode is Mode.FOLLOW and side is not self._side:
                 self._turns += 1
             self.mode = self._mode_for(deviation)
@@ -158,7 +159,7 @@ class Rest:
 
     def stay(self, u_d: float) -> None:
         """Rest at this u."""
-        self.u_d, self.caution = u_d, 0.0
+        self.u_d, self.shrinkage = u_d, 0.0
 
     def step(
         self, estimate: Estimate, ideal: float, deviation: Sequence[float],
@@ -187,6 +188,6 @@ class Rest:
     def _pull_back(self, deviation: Sequence[float]) -> float:
         return -dot(self._gain, deviation)
 
-    def _aim(self, u_d: float, u: float, caution: float, inverse: BacklashInverse) -> None:
-        self.u_d, self.caution = u_d, caution
+    def _aim(self, u_d: float, u: float, shrinkage: float, inverse: BacklashInverse) -> None:
+        self.u_d, self.shrinkage = u_d, shrinkage
         inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import (
-    LARGEST_CAREFUL,
     LARGEST_FEEDBACK,
+    LARGEST_IN_ACQUISITION,
     Adoption,
     Command,
-    Situation,
+    ControlInput,
     Structure,
     dot,
 )
@@ -34,7 +34,7 @@ from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
-HARDEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
+STIFFEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
 FADING = 0.8  # per sample, of what u_d of a new design differs by from that of the one before
 WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is unknown
 # Samples for which an estimate has to hold before it gets full feedback: one that is confidently
@@ -60,9 +60,9 @@ class Tracking:
     The trajectory is what the LQ preview controller does without backlash, for the reference r,
     which is y_m delayed by the preview window: the delay is what the preview costs. Before the
     first reference has passed the window r is the output at the start, so that nothing jumps.
-    While the backlash is unknown, the careful gain of the design replaces K: the trajectory itself
-    excites the backlash. With the first estimate it gives way to softer gains, then to K.
-    caution: standard deviations by which the crossings are shrunk before they are inverted.
+    While the backlash is unknown, the acquisition gain of the design replaces K: the trajectory
+    itself excites the backlash. From the first estimate on the gains are those of its schedule, up
+    to K. shrinkage: standard deviations by which the crossings are shrunk before they are inverted.
     noise_std: of y.
 
     x_cov is only looked into when it is another array than the sample before.
@@ -71,10 +71,10 @@ class Tracking:
     needs_output = True
 
     def __init__(
-        self, beginning: TrackingDesign, weights: Weights, caution: float, noise_std: float = 0.0,
+        self, beginning: TrackingDesign, weights: Weights, shrinkage: float, noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
-        self._weights, self._caution, self._noise_std = weights, caution, noise_std
+        self._weights, self._shrinkage, self._noise_std = weights, shrinkage, noise_std
         self._references = ReferenceWindow(self.delay, beginning.model.memory)
         self._rest = Rest(beginning, noise_std)
         self._use(beginning)
@@ -83,16 +83,16 @@ class Tracking:
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
         self._asked = 0.0  # largest |u*| so far
-        self._reach = 0.0  # that, or the u that the gap takes
+        self._scale = 0.0  # that, or the u that the gap takes
         self._bounded_before = False  # whether feedback has met its bound the sample before
-        self._width = 1.0  # bound on feedback in reaches, while the backlash is unknown
+        self._width = 1.0  # bound on feedback in scales, while the backlash is unknown
         self._known = False  # whether the estimate comes from data
         self._slope: float | None = None  # that of the newest estimate that the law stood by
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
         self._in_use_for = 0  # samples since an estimate is known
         self._engaged_for = 0  # samples since v has crossed the gap
-        self._level = self._free = 0  # softer while v does not follow, samples since it last did
-        self._softness = 0  # of the gain in use
+        self._level = self._free = 0  # in the schedule, while v does not follow; samples since
+        self._scheduled = 0  # place of the gain in use
         self._u_d = 0.0  # of the sample before
         self._resumes = False  # whether this goes on from an interruption
         self._blind_for = 1  # samples from now on in which x_hat cannot be known
@@ -117,10 +117,10 @@ class Tracking:
         self._a: list[list[float]] = model.a.tolist()
         self._b: list[float] = model.b.tolist()
         self._k: list[float] = gains.state.tolist()
-        self._soft: list[list[float]] = [gain.tolist() for gain in (feedback, *chosen.softer)]
+        self._schedule: list[list[float]] = [gain.tolist() for gain in (feedback, *chosen.schedule)]
         # What an error of y calls for that would not matter at rest: never too much feedback.
         self._tolerated = TOLERANCE * self._noise_std * float(np.linalg.norm(feedback))
-        self._careful = None if chosen.careful is None else chosen.careful.tolist()
+        self._acquisition_gain = None if chosen.acquisition is None else chosen.acquisition.tolist()
         self._x_cov: Array | None = None
         self._x_std = self._feedback_std = 0.0  # of x_hat and of K x_hat, as in x_cov
 
@@ -133,7 +133,7 @@ class Tracking:
             self._rest.use(self._design)
         self._references, self._x, self._q = other._references, other._x, other._q
         self._integral, self._ideal, self._u_d = other._integral, other._ideal, other._u_d
-        self._level, self._free, self._softness = other._level, other._free, other._softness
+        self._level, self._free, self._scheduled = other._level, other._free, other._scheduled
         self._handover, self._sharp_counts = other._handover, other._sharp_counts
         self._rest.go_on_from(other._rest)
         if state_known:
@@ -145,36 +145,36 @@ class Tracking:
             # However well the backlash is known, the first x_hat are full of noise.
             self._resumes, self._blind_for, self._sharp_counts = True, self.model.order, 1
 
-    def control(self, situation: Situation, inverse: BacklashInverse) -> Command:
+    def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
-        estimate, gains = situation.estimate, self._design.gains
+        estimate, gains = inputs.estimate, self._design.gains
         first = self._references.empty
         if first:
-            self._begin(situation)
+            self._begin(inputs)
         elif self._resumes:
-            self._references.lead_to(situation.y_m)
-        window = self._references.append(situation.y_m)
+            self._references.lead_to(inputs.y_m)
+        window = self._references.append(inputs.y_m)
         x = self._x
         ideal, onward = self._trajectory(x, window)
         if self._blind_for:
             self._blind_for -= 1
             deviation = [0.0] * len(x)
         else:
-            deviation = list(map(sub, situation.x_hat, x))
-        x_cov = situation.x_cov
+            deviation = list(map(sub, inputs.x_hat, x))
+        x_cov = inputs.x_cov
         if x_cov is not self._x_cov:
             self._note_covariance(x_cov)
         self._asked = max(self._asked, abs(ideal))
-        self._reach = max(self._asked, estimate.m * (estimate.c_r - estimate.c_l))
+        self._scale = max(self._asked, estimate.m * (estimate.c_r - estimate.c_l))
         trusted = self._is_trusted(estimate, first)
         if self._trusted_for > 0:
             held_back = self._bounded_before or inverse.limited or inverse.taking_up
             feedback = dot(self._gain(held_back), deviation)
         else:
-            feedback = self._careful_feedback(deviation)
+            feedback = self._acquisition_feedback(deviation)
         if trusted and gains.integral:
             feedback += self._design.feedback.integral * (self._integral - self._q)
-        most = LARGEST_FEEDBACK * max(self._reach, self._tolerated)
+        most = LARGEST_FEEDBACK * max(self._scale, self._tolerated)
         self._bounded_before = bounded = not -most <= feedback <= most
         if bounded:
             feedback = min(max(feedback, -most), most) if feedback == feedback else 0.0
@@ -190,10 +190,10 @@ class Tracking:
             u_d = faded
         before = rest.mode
         mode = rest.decide(
-            situation.y, window, x, onward, deviation,
+            inputs.y, window, x, onward, deviation,
             None if x_cov is None else self._x_std, inverse.side,
         )
-        caution = self._caution
+        shrinkage = self._shrinkage
         if mode is Mode.FOLLOW:
             inverse.widen_band(self._noise_band(ideal, inverse))
         else:
@@ -201,16 +201,16 @@ class Tracking:
                 rest.step(estimate, ideal, deviation, inverse, mode is not before)
             elif before is Mode.FOLLOW:
                 rest.stay(ideal)
-            u_d, caution = rest.u_d, rest.caution
+            u_d, shrinkage = rest.u_d, rest.shrinkage
             inverse.widen_band(0.0)
         self._ideal, self._x, self._u_d = ideal, onward, u_d
-        c_r, c_l = cautious_crossings(estimate, caution, self._known)
+        c_r, c_l = shrunk_crossings(estimate, shrinkage, self._known)
         side = inverse.side
         v = inverse.step(u_d, self._slope_of(estimate), c_r, c_l)
         crosses = inverse.taking_up or inverse.side is not side
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         if gains.integral:
-            self._integrate(window.item(0), situation.y, x[0], trusted, bounded or inverse.limited)
+            self._integrate(window.item(0), inputs.y, x[0], trusted, bounded or inverse.limited)
         return Command(u_d, v, 0.0)
 
     def design(self, model: StateModel) -> Iterator[Adoption | None]:
@@ -237,7 +237,7 @@ class Tracking:
         ideal, onward = self._trajectory(x, window)
         deviation = list(map(sub, source.x_hat, x))
         if self._trusted_for > 0:
-            feedback = dot(self._soft[self._softness], deviation)
+            feedback = dot(self._schedule[self._scheduled], deviation)
         else:
             feedback = self._bounded(deviation)
         if self._trusted_for >= TRUSTED_AFTER:
@@ -255,53 +255,54 @@ class Tracking:
             ideal -= gains.integral * self._q
         return ideal, [dot(row, x) + b * ideal for row, b in zip(self._a, self._b, strict=True)]
 
-    def _begin(self, situation: Situation) -> None:
-        start, noise = situation.y, OFF * self._noise_std
+    def _begin(self, inputs: ControlInput) -> None:
+        start, noise = inputs.y, OFF * self._noise_std
         # What may be noise is no distance to go: a loop at rest stays at rest.
-        near = abs(start - situation.y_m) <= noise
-        r = situation.y_m if near else start
+        near = abs(start - inputs.y_m) <= noise
+        r = inputs.y_m if near else start
         self._references.fill(r)
         # No v has acted yet, so nobody knows the state better than rest at y.
         self._x = (self._design.model.equilibrium * r).tolist()
 
     def _gain(self, limited: bool) -> list[float]:
-        """K, or a softer one: the longer v does not follow, and the newer the estimate.
+        """K, or the less of it the longer v does not follow, and the newer the estimate.
 
         limited: whether v met its limits, was on its way across the gap, or feedback at its bound.
         """
         self._free = 0 if limited else self._free + 1
         if limited:
-            self._level = min(self._level + 1, len(self._soft) - 1)
-        elif self._level > 0 and self._free % HARDEN_AFTER == 0:
+            self._level = min(self._level + 1, len(self._schedule) - 1)
+        elif self._level > 0 and self._free % STIFFEN_AFTER == 0:
             self._level -= 1
-        levels = len(self._soft)
+        levels = len(self._schedule)
         unproven = levels - 1 - self._trusted_for * levels // TRUSTED_AFTER
-        self._softness = max(self._level, unproven)
-        return self._soft[self._softness]
+        self._scheduled = max(self._level, unproven)
+        return self._schedule[self._scheduled]
 
-    def _careful_feedback(self, deviation: Sequence[float]) -> float:
+    def _acquisition_feedback(self, deviation: Sequence[float]) -> float:
         """Feedback while the backlash is unknown: no larger than the trajectory or the gap asks.
 
         A wrong slope may make the loop unstable, which bounded feedback slows down. The bound
-        widens while it is met, up to LARGEST_CAREFUL: a gap wider than the first guess has to be
-        crossed some day.
+        widens while it is met, up to LARGEST_IN_ACQUISITION: a gap wider than the first guess has
+        to be crossed some day.
         """
         feedback = self._bounded(deviation)
-        if abs(feedback) == self._width * self._reach:
-            self._width = min(WIDENING * self._width, LARGEST_CAREFUL)
+        if abs(feedback) == self._width * self._scale:
+            self._width = min(WIDENING * self._width, LARGEST_IN_ACQUISITION)
         return feedback
 
     def _bounded(self, deviation: Sequence[float]) -> float:
-        """Careful feedback within its bound."""
-        if self._careful is None:
+        """Feedback of the acquisition within its bound."""
+        if self._acquisition_gain is None:
             return 0.0
-        bound = self._width * self._reach
-        return min(max(dot(self._careful, deviation), -bound), bound)
+        bound = self._width * self._scale
+        return min(max(dot(self._acquisition_gain, deviation), -bound), bound)
 
     def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
         """Whether the estimate gets full feedback; counts the samples for which it has held.
 
-        Without deviations nobody knows how far it may be relied on, and feedback stays careful.
+        Without deviations nobody knows how far it may be relied on, and feedback stays that of the
+        acquisition.
         """
         self._known = _is_known(estimate, self._known)
         if not (self._known and estimate.learned):
@@ -311,7 +312,7 @@ class Tracking:
         if first:
             self._trusted_for = TRUSTED_AFTER
         if self._trusted_for < TRUSTED_AFTER:
-            sharp = _is_sharp(estimate, self._width * self._reach)
+            sharp = _is_sharp(estimate, self._width * self._scale)
             self._trusted_for += self._sharp_counts if sharp else 1
         return self._trusted_for >= TRUSTED_AFTER
 
@@ -331,7 +332,7 @@ class Tracking:
             self._x_std = self._feedback_std = 0.0
             return
         rows: list[list[float]] = x_cov.tolist()
-        gain = self._soft[0]
+        gain = self._schedule[0]
         variance = dot(gain, [dot(row, gain) for row in rows])
         self._feedback_std = sqrt(max(variance, 0.0))
         self._x_std = sqrt(max(sum(row[i] for i, row in enumerate(rows)), 0.0))
@@ -360,14 +361,14 @@ def _is_known(estimate: Estimate, before: bool) -> bool:
     return before or estimate.learned or status is Status.TRACKING
 
 
-def _is_sharp(estimate: Estimate, u_reach: float) -> bool:
+def _is_sharp(estimate: Estimate, u_scale: float) -> bool:
     # Beside far larger u even a gap that is hardly known makes little difference.
-    large = max(estimate.c_r - estimate.c_l, u_reach / estimate.m)
+    large = max(estimate.c_r - estimate.c_l, u_scale / estimate.m)
     std_gap = estimate.std_c_r + estimate.std_c_l
     return estimate.std_m < SHARP * estimate.m and std_gap < SHARP * large
 
 
-def cautious_crossings(
+def shrunk_crossings(
     estimate: Estimate, deviations: float, known: bool,
 ) -> tuple[float, float]:
     """Crossings shrunk towards each other by their uncertainty; both 0 while nothing is known.

@@ -18,7 +18,7 @@ from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
-STATE_REACH = 1e3  # prior of x in units of the first output and of the noise
+STATE_SCALE = 1e3  # prior of x in units of the first output and of the noise
 
 
 class FixedBacklash:
@@ -86,8 +86,8 @@ class FixedBacklash:
             self.innovation = nan
         else:
             if not self._started:
-                reach = STATE_REACH * (abs(y) + self._noise_var**0.5)
-                p[:-1, :-1] += reach**2 * np.eye(len(x) - 1)
+                x_scale = STATE_SCALE * (abs(y) + self._noise_var**0.5)
+                p[:-1, :-1] += x_scale**2 * np.eye(len(x) - 1)
                 self._started = True
             cross = self._c * p[:, 0]
             variance = self._c * cross[0] + self._noise_var

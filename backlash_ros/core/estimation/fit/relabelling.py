@@ -80,10 +80,10 @@ def fitted(
 ) -> Generator[None, None, Fitted]:
     """Fit v (N,) and y (N,), nan where lost, from labels for `start` on; yields between pieces."""
     weights = weights_of(y)
-    reach = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
+    extent = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
     best: Fitted | None = None
     for _ in range(RELABELLINGS):
-        fit = WindowFit(around, start, slope, reach, int(GROWTH * len(v)))
+        fit = WindowFit(around, start, slope, extent, int(GROWTH * len(v)))
         while fit.length < len(v):
             part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
             fit.take(fit.columns(v[part], y[part]), y[part], weights[part])

@@ -56,8 +56,8 @@ def search(
     gaps: Array = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
     coarse = yield from comparison.best_per_gap(gaps, STARTS, pace)
     best = max(coarse)
-    reach, count = ZOOM
-    close = np.asarray(best.gap * np.linspace(1.0 - reach, 1.0 + reach, count))
+    width, count = ZOOM
+    close = np.asarray(best.gap * np.linspace(1.0 - width, 1.0 + width, count))
     fine = yield from comparison.best_per_gap(
         close[close <= top], 2 * STARTS - 1, pace
     )

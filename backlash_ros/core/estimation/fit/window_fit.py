@@ -40,15 +40,15 @@ NO_RESIDUAL = 1e-10  # share of the largest y below which a residual is rounding
 class WindowFit:
     """Takes in samples and solves for all unknowns.
 
-    slope: about m, for the prior of the error of G. reach: largest |y| and |v|. samples: how many
+    slope: about m, for the prior of the error of G. extent: largest |y| and |v|. samples: how many
     are expected, for a walk.
     """
 
     def __init__(
-        self, around: Around, start: Start, slope: float, reach: tuple[float, float],
+        self, around: Around, start: Start, slope: float, extent: tuple[float, float],
         samples: int = 0,
     ) -> None:
-        self.around, self.start, self.slope, self.reach = around, start, slope, reach
+        self.around, self.start, self.slope, self.extent = around, start, slope, extent
         self.model = around.model
         ramp = max(-(-samples // RAMPS), SLOW) if around.walk > 0.0 else 0
         past = start.past
@@ -63,7 +63,7 @@ class WindowFit:
         self._highest, self._lowest = -inf, inf
         self._rows: Array = np.empty((0, self.layout.unknowns))
         self._y: Array = np.empty(0)
-        self._triangle = Triangle(self._vague(*reach))
+        self._triangle = Triangle(self._vague(*extent))
 
     @property
     def swing(self) -> float:
@@ -154,7 +154,7 @@ class WindowFit:
 
     def restarted(self, around: Around, start: Start) -> WindowFit:
         """A fit of samples yet to come, with the prior of `around`, after a break."""
-        return WindowFit(around, start, self.slope, self.reach)
+        return WindowFit(around, start, self.slope, self.extent)
 
     def unexplained(self, solution: Solution) -> float:
         """Motion of u behind the correlated part of the residual, over m times the gap."""
@@ -190,7 +190,7 @@ class WindowFit:
         squares = float(residual @ residual)
         count = self._triangle.count
         correlation = 0.0
-        if squares > count * (NO_RESIDUAL * self.reach[0]) ** 2 and count > 1.0:
+        if squares > count * (NO_RESIDUAL * self.extent[0]) ** 2 and count > 1.0:
             lag = float(residual[1:] @ residual[:-1]) / squares
             correlation = max(0.0, lag - BY_CHANCE / sqrt(count))
         inflation = 1.0 - correlation + count * correlation
