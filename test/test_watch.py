@@ -15,7 +15,12 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.nodes.watch_publisher import LOOK_S, PERIOD_S, WatchPublisher, watched_values
+from backlash_ros.nodes.control.watch_publisher import (
+    LOOK_S,
+    PERIOD_S,
+    WatchPublisher,
+    watched_values,
+)
 
 SIGNALS = tuple(float(i) for i, _ in enumerate(topics.SIGNAL_LABELS))
 ESTIMATES = (1.3, 3.0, -2.0, 0.2, 0.1, 0.2, 0.3, nan, 7.0)

@@ -7,11 +7,9 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from math import isfinite, nan
 from typing import Any
 
 from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
@@ -25,15 +23,17 @@ from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.output import Output
 from backlash_ros.core.loop.sample_counter import SampleCounter
-from backlash_ros.core.parameters import NOISE, Parameters, missing_limits
+from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.core.simulation.run_record import stated_deviations
-from backlash_ros.nodes.controller_services import offer_services
+from backlash_ros.nodes.control.estimate_saver import EstimateSaver
+from backlash_ros.nodes.control.first_command import FirstCommand
+from backlash_ros.nodes.control.last_command_sender import LastCommandSender
+from backlash_ros.nodes.control.model_publisher import ModelPublisher
+from backlash_ros.nodes.control.services import offer_services
+from backlash_ros.nodes.control.step_publisher import StepPublisher
 from backlash_ros.nodes.diagnostics.diagnosis import Diagnosis, counts_of, values_of, worst
 from backlash_ros.nodes.diagnostics.rivals import RivalWatch
-from backlash_ros.nodes.estimate_saver import EstimateSaver
-from backlash_ros.nodes.model_publisher import ModelPublisher
 from backlash_ros.nodes.runtime.declare import LiveParameters
 from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
 from backlash_ros.nodes.runtime.events import emit
@@ -43,11 +43,9 @@ from backlash_ros.nodes.runtime.messages import (
     DEPTH,
     KEPT,
     DiagnosticsPublisher,
-    LabelledArrayPublisher,
     stamp_ns_of,
 )
 from backlash_ros.nodes.runtime.spin import run
-from backlash_ros.nodes.watch_publisher import WatchPublisher
 
 DIAGNOSTICS_PERIOD_S = 1.0
 # A controller that was held up for so long, or so many samples, still learns from them; after a
@@ -58,10 +56,7 @@ KEPT_S, KEPT_OUTPUTS = 0.1, 20
 POST_COMMAND_SLEEP = 0.05
 REFINE_SHARE = 0.3  # of a sample period for fits, after the command
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
-AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
 LOOK_S = 0.05  # between two looks for a silent plant_output or reference
-SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
-LAST_WORD_S = 0.1  # longest wait for the driver to confirm the last command
 
 
 class ControllerNode(ManagedNode):
@@ -95,19 +90,13 @@ class ControllerNode(ManagedNode):
         self._reference_at: float | None = None  # on the steady clock [s]
         self._told: Status | None = None  # the newest one that /diagnostics has
         self._driver: Subscription | None = None  # plant_output, once it may begin
-        self._to_zero: Timer | None = None  # sends the commands of on_timeout
+        self._last_commands = LastCommandSender(self, self._io)
         self._rivals = RivalWatch(
             self, self._io.topics.control, self._io.advertise, self._mind_rivals
         )
         self._told_rivals = self._rivals.found
         self._commands_of_rivals: Subscription | None = None  # heard while standing down
-        self._signals = LabelledArrayPublisher(
-            self, topics.of_node(topics.SIGNALS), topics.SIGNAL_LABELS
-        )
-        self._estimates = LabelledArrayPublisher(
-            self, topics.of_node(topics.ESTIMATES), topics.ESTIMATE_LABELS
-        )
-        self._watch = WatchPublisher(self)
+        self._steps = StepPublisher(self)
         self._model = ModelPublisher(self)
         self._diagnostics = DiagnosticsPublisher(
             self, p.word('io.joint') or self._io.publisher.topic_name
@@ -120,9 +109,7 @@ class ControllerNode(ManagedNode):
         self._reports = (
             None if self._lockstep else Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
         )
-        self._last_v: float | None = None  # before a cleanup
-        self._warned: set[str] = set()  # texts
-        self._unanswered = 0  # outputs that were not answered because v was not known yet
+        self._first_command = FirstCommand(self, self._io, self._reports)
         self._diagnosis = Diagnosis(
             self, self._io, output_qos(p, DEPTH), self._reference.qos_profile
         )
@@ -165,7 +152,8 @@ class ControllerNode(ManagedNode):
         p = self._live.parameters
         inherited = load_estimate(p)
         self.loop = ControlLoop(
-            p, self._io.publish, self._io.now_ns, inherited, self._counter, self._v_at_start(p)
+            p, self._io.publish, self._io.now_ns, inherited, self._counter,
+            self._first_command.v_at_start(p),
         )
         self._model.publish(self.loop)
         if inherited is not None:
@@ -173,14 +161,6 @@ class ControllerNode(ManagedNode):
                 f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
                 f'c_r={inherited.c_r:.6g}, c_l={inherited.c_l:.6g}'
             )
-
-    def _v_at_start(self, p: Parameters) -> float | None:
-        """The v that acts as far as this node can know, None if it cannot."""
-        if self._last_v is not None:
-            return self._last_v
-        initial = p.real('control.initial')
-        # In lockstep there is the simulated plant alone, which begins at 0.
-        return initial if isfinite(initial) and not self._lockstep else None
 
     def activate(self) -> None:
         assert self.loop is not None
@@ -216,36 +196,20 @@ class ControllerNode(ManagedNode):
         """Send the last command as on_stop says, and save what was learned."""
         loop, p = self.loop, self._live.parameters
         assert loop is not None
-        self._end_ramp()
+        self._last_commands.end()
         if loop.last is not None:
             if not loop.standing_down:
-                self._send_last_commands(loop, p.word('on_stop'), p.real('timeout.ramp'))
+                self._last_commands.send_all(
+                    loop, p.word('on_stop'), p.real('timeout.ramp'), self._diagnose
+                )
             self._save(loop)
             self._model.publish(loop)
         self._rivals.end()
         self._diagnose()
 
-    def _send_last_commands(self, loop: ControlLoop, action: str, longest_s: float) -> None:
-        told, deadline = time.monotonic(), time.monotonic() + longest_s
-        step_s = max(self.settings.real('sample_period'), SHORTEST_STEP_S)
-        for v in loop.last_commands(action):
-            loop.send(v)
-            if v == loop.zero:
-                break
-            if time.monotonic() + step_s > deadline:
-                self.log.warning(
-                    f'v={v:.6g} is held: it did not reach zero within timeout.ramp={longest_s:g} s'
-                )
-                break
-            time.sleep(step_s)
-            if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
-                told = time.monotonic()
-                self._diagnose()  # whoever stands down must not take this one for gone
-        self._io.wait_until_received(LAST_WORD_S)
-
     def cleanup(self) -> None:
         if self.loop is not None and self.loop.knows_v:
-            self._last_v = self.loop.v
+            self._first_command.before = self.loop.v
         self.loop = None
         self._diagnose()
 
@@ -266,7 +230,7 @@ class ControllerNode(ManagedNode):
         return [
             lambda: self._io.listeners >= wanted,
             # Beside the driver, those who listen want to hear everything.
-            lambda: min(self._signals.listeners, self._estimates.listeners) >= wanted - 1,
+            lambda: self._steps.listeners >= wanted - 1,
             (lambda: self._reference.get_publisher_count() > 0) if self._lockstep
             else (lambda: self._reference_at is not None),
         ]
@@ -308,12 +272,15 @@ class ControllerNode(ManagedNode):
             self._outputs.append(output)
             self._pair()
             return
-        if loop.begins and not loop.standing_down and not self._may_begin(loop, output):
+        if loop.begins and not loop.standing_down and not (
+            self._knows_rivals()
+            and self._first_command.may_follow(loop, output, self._live.parameters)
+        ):
             return
         was_silent = loop.silent
         step = loop.answer(output)
         if was_silent and not loop.silent:
-            self._end_ramp()
+            self._last_commands.end()
         if step is None:
             return
         # Where the next output is waiting already, there is no time for what may be put off.
@@ -324,34 +291,6 @@ class ControllerNode(ManagedNode):
         if self._behind % PUT_OFF == 0:
             loop.core.refine(self._refine_budget_s)
         self._follow_up(loop, step, was_silent)
-
-    def _may_begin(self, loop: ControlLoop, output: Output) -> bool:
-        """Whether it is known from which v the first command goes on, or waiting is in vain."""
-        if not self._knows_rivals():
-            return False
-        if self._io.is_simulated:
-            return True
-        if missing := missing_limits(self._live.parameters):
-            self._warn_once(
-                f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
-                'bears: set them'
-            )
-        if loop.learn_v(output.stamp_ns):
-            return True
-        reported = self._reports is not None and self._reports.publishers > 0
-        self._unanswered += 1
-        if reported and self._unanswered <= AWAITED_REPORTS:
-            return False
-        self._warn_once(
-            'nobody says which v acts now, so the first command goes on from 0: publish '
-            f'{topics.APPLIED_CONTROL}, or set control.initial'
-        )
-        return True
-
-    def _warn_once(self, text: str) -> None:
-        if text not in self._warned:
-            self._warned.add(text)
-            self.log.warning(text)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
@@ -365,23 +304,11 @@ class ControllerNode(ManagedNode):
 
     def _follow_up(self, loop: ControlLoop, step: ControlStep, was_silent: bool) -> None:
         """Tell of a step."""
-        self._publish_rows(loop, step)
+        self._steps.publish(loop, step)
         self._model.follow(loop, self.settings.real('sample_period'))
         if was_silent or step.estimate.status != self._told:
             self._told = step.estimate.status
             self._diagnose()
-
-    def _publish_rows(self, loop: ControlLoop, step: ControlStep) -> None:
-        e, sample = step.estimate, float(loop.counter.index)
-        estimator = loop.core.estimator
-        signals = (
-            step.y_m, step.y, step.u_d, step.v, estimator.u_hat, estimator.innovation,
-            float(e.status), sample, loop.statistics.latencies[-1],
-        )
-        estimates = (e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample)
-        self._signals.publish(signals)
-        self._estimates.publish(estimates)
-        self._watch.follow(signals, estimates, time.monotonic())
 
     def _check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loop cannot take up."""
@@ -417,7 +344,7 @@ class ControllerNode(ManagedNode):
         stand_down = on_rival == 'stand_down' and not self._rivals.came_first
         if loop is not None and stand_down != loop.standing_down:
             if stand_down:
-                self._end_ramp()
+                self._last_commands.end()
                 loop.stand_down()
                 self._commands_of_rivals = self._io.listen_to_commands(loop.hear_other)
             else:
@@ -440,27 +367,8 @@ class ControllerNode(ManagedNode):
             return
         if time.monotonic() > loop.heard_at + timeout:
             loop.give_up()
-            self._begin_ramp(loop, self._live.parameters.word('on_timeout'))
+            self._last_commands.begin(loop, self._live.parameters.word('on_timeout'))
             self._diagnose()
-
-    def _begin_ramp(self, loop: ControlLoop, action: str) -> None:
-        commands = loop.last_commands(action)
-
-        def send_next() -> None:
-            v = next(commands, None)
-            if v is None:
-                self._end_ramp()
-            else:
-                loop.send(v)
-
-        self._end_ramp()
-        period = max(self.settings.real('sample_period'), SHORTEST_STEP_S)
-        self._to_zero = self.create_timer(period, send_next, clock=self.steady_clock)
-
-    def _end_ramp(self) -> None:
-        if self._to_zero is not None:
-            self.destroy_timer(self._to_zero)
-            self._to_zero = None
 
     def _save_now_and_then(self, loop: ControlLoop) -> None:
         period = self._live.parameters.real('estimates.save_period')

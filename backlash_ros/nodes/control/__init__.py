@@ -1,0 +1,1 @@
+"""Parts of the controller node: its first and last commands, what it publishes and serves."""

@@ -1,0 +1,62 @@
+"""Which v the first command goes on from, and what has to be known before it."""
+
+from __future__ import annotations
+
+from math import isfinite
+
+from backlash_ros import topics
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.output import Output
+from backlash_ros.core.parameters import Parameters, missing_limits
+from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.runtime.inbox import Inbox
+from backlash_ros.nodes.runtime.spin import ProcessNode
+
+AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
+
+
+class FirstCommand:
+    """Decides when the loop may begin.
+
+    reports: those of the driver, None in lockstep. before: v before a cleanup, None without one.
+    """
+
+    def __init__(self, node: ProcessNode, io: DriverIo, reports: Inbox | None) -> None:
+        self._node, self._io, self._reports = node, io, reports
+        self.before: float | None = None
+        self._warned: set[str] = set()  # texts
+        self._unanswered = 0  # outputs that were not answered because v was not known yet
+
+    def v_at_start(self, p: Parameters) -> float | None:
+        """The v that acts as far as this node can know, None if it cannot."""
+        if self.before is not None:
+            return self.before
+        initial = p.real('control.initial')
+        # In lockstep there is the simulated plant alone, which begins at 0.
+        return initial if isfinite(initial) and self._reports is not None else None
+
+    def may_follow(self, loop: ControlLoop, output: Output, p: Parameters) -> bool:
+        """Whether it is known from which v the first command goes on, or waiting is in vain."""
+        if self._io.is_simulated:
+            return True
+        if missing := missing_limits(p):
+            self._warn_once(
+                f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
+                'bears: set them'
+            )
+        if loop.learn_v(output.stamp_ns):
+            return True
+        reported = self._reports is not None and self._reports.publishers > 0
+        self._unanswered += 1
+        if reported and self._unanswered <= AWAITED_REPORTS:
+            return False
+        self._warn_once(
+            'nobody says which v acts now, so the first command goes on from 0: publish '
+            f'{topics.APPLIED_CONTROL}, or set control.initial'
+        )
+        return True
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            self._node.log.warning(text)

@@ -1,0 +1,75 @@
+"""How v comes to its end in real time: while the driver is silent, and when the node stops."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from rclpy.timer import Timer
+
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.runtime.spin import ProcessNode
+
+SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
+CONFIRMED_WITHIN_S = 0.1  # longest wait for the driver to confirm the last command
+TOLD_EVERY_S = 1.0  # at least, while a ramp takes its time
+
+
+class LastCommandSender:
+    """Sends the commands that `on_timeout` and `on_stop` name, one every sample period."""
+
+    def __init__(self, node: ProcessNode, io: DriverIo) -> None:
+        self._node, self._io = node, io
+        self._ramp: Timer | None = None
+
+    @property
+    def _step_s(self) -> float:
+        return max(self._node.settings.real('sample_period'), SHORTEST_STEP_S)
+
+    def begin(self, loop: ControlLoop, action: str) -> None:
+        """Send them from a timer while the node goes on."""
+        commands = loop.last_commands(action)
+
+        def send_next() -> None:
+            v = next(commands, None)
+            if v is None:
+                self.end()
+            else:
+                loop.send(v)
+
+        self.end()
+        self._ramp = self._node.create_timer(
+            self._step_s, send_next, clock=self._node.steady_clock
+        )
+
+    def end(self) -> None:
+        """Send no more of them."""
+        if self._ramp is not None:
+            self._node.destroy_timer(self._ramp)
+            self._ramp = None
+
+    def send_all(
+        self, loop: ControlLoop, action: str, longest_s: float, tell: Callable[[], None],
+    ) -> None:
+        """Send them now, and hold v where that takes longer than longest_s [s].
+
+        tell: called at least every second, so that who stands down does not take this node for
+        gone.
+        """
+        told = time.monotonic()
+        deadline, step_s = told + longest_s, self._step_s
+        for v in loop.last_commands(action):
+            loop.send(v)
+            if v == loop.zero:
+                break
+            if time.monotonic() + step_s > deadline:
+                self._node.log.warning(
+                    f'v={v:.6g} is held: it did not reach zero within timeout.ramp={longest_s:g} s'
+                )
+                break
+            time.sleep(step_s)
+            if time.monotonic() > told + TOLD_EVERY_S:
+                told = time.monotonic()
+                tell()
+        self._io.wait_until_received(CONFIRMED_WITHIN_S)
