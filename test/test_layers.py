@@ -14,7 +14,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = 'backlash_ros'
 SHARED = {
     PACKAGE,
-    *(f'{PACKAGE}.{name}' for name in ('atomic_file', 'middleware.loopback', 'shipped', 'topics')),
+    *(f'{PACKAGE}.{name}' for name in (
+        'atomic_file', 'middleware.installed', 'middleware.loopback', 'shipped', 'topics',
+    )),
 }
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.

@@ -5,7 +5,9 @@ import signal
 import sys
 from types import FrameType
 
-EXECUTABLES = ('controller', 'plant', 'reference', 'recorder', 'check_driver')
+from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
+
+EXECUTABLES = ('controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor')
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -16,3 +18,5 @@ def _end(number: int, frame: FrameType | None) -> None:
 if sys.argv and (sys.argv[0] == '-m' or os.path.basename(sys.argv[0]) in EXECUTABLES):
     for _number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(_number, _end)
+    if ros_is_missing():
+        sys.exit(ROS_MISSING)

@@ -13,6 +13,7 @@ from backlash_ros.core.assembly import build_controller, build_plant, build_refe
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import BY_NAME, PLANT
+from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.tools.bringup import processes
 from backlash_ros.tools.bringup.processes import ProcessSupervisor, RunError
 from backlash_ros.tools.bringup.progress import ProgressDisplay
@@ -33,7 +34,7 @@ from backlash_ros.tools.cli.command_line import (
     print_warnings,
     whole_samples,
 )
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli.errors import BrokenOffError, InputError
 from backlash_ros.tools.config.configuration import Configuration, read_configuration, write_config
 from backlash_ros.tools.run_files.results import CONFIG, result_directory
 
@@ -43,7 +44,12 @@ ESTIMATES = 'estimates.file'
 
 
 def prepare(options: argparse.Namespace) -> RunPlan:
-    """Check all input, then make the result folders; raises ParameterError or InputError."""
+    """Check all input, then make the result folders; raises ParameterError or InputError.
+
+    Raises BrokenOffError where there is no ROS 2 to run the nodes with.
+    """
+    if ros_is_missing():
+        raise BrokenOffError(ROS_MISSING)
     configuration = read_configuration(options.config, options.settings, options.seed)
     names = (options.axis,) if options.axis else configuration.axes or ('',)
     if len(names) > MOST_AXES:

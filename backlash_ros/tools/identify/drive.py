@@ -25,6 +25,7 @@ from backlash_ros.core.identification.identification import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import Value
+from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.tools.bringup.supervision import StopRequests
 from backlash_ros.tools.cli.command_line import BAD_INPUT
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
@@ -45,8 +46,11 @@ def drive(
 ) -> MeasuredRecord:
     """Move the actuator and return the record.
 
-    Raises InputError where it was refused, BrokenOffError where it was interrupted or nothing came.
+    Raises InputError where it was refused, BrokenOffError where it was interrupted, where nothing
+    came, or without ROS 2.
     """
+    if ros_is_missing():
+        raise BrokenOffError(ROS_MISSING)
     with tempfile.TemporaryDirectory() as folder, StopRequests() as stop:
         path, config = Path(folder) / 'messages.csv', Path(folder) / 'parameters.yaml'
         path.touch()
