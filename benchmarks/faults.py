@@ -2,6 +2,7 @@
 
     python benchmarks/faults.py --sequences 20000
     python benchmarks/faults.py --seed 45       what happens in one of them
+    python benchmarks/faults.py --results FILE  add to FILE, and go on from what it holds
 
 Each sequence is a loop of a random plant, law, structure, limits and noise, in simulated time: the
 core, the bookkeeping of samples and commands, and what the node decides around them; no middleware.
@@ -10,6 +11,7 @@ core, the bookkeeping of samples and commands, and what the node decides around 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import re
 import sys
@@ -17,6 +19,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import nullcontext
 from multiprocessing import Pool
 from pathlib import Path
 from typing import NamedTuple
@@ -59,6 +62,13 @@ class Result(NamedTuple):
     commands: int
     claimed: bool
     found: dict[str, str]
+
+
+def read_results(path: Path | None) -> list[Result]:
+    """What a file of results holds, a line of JSON each; nothing where there is none yet."""
+    if path is None or not path.exists():
+        return []
+    return [Result(*json.loads(line)) for line in path.read_text(encoding='utf-8').splitlines()]
 
 
 def play(seed: int) -> Result:
@@ -148,6 +158,8 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument('--processes', type=int, default=processors())
     parser.add_argument('--seconds', type=float, default=float('inf'),
                         help='begin no further sequence after so long')
+    parser.add_argument('--results', type=Path, metavar='FILE',
+                        help='append what comes out; what it holds already is not played again')
     parser.add_argument('--write', action='store_true',
                         help=f'write the table into {DOCUMENT.relative_to(ROOT)}')
     return parser.parse_args()
@@ -160,11 +172,16 @@ def main() -> int:
         return show(arguments.seed)
     first = arguments.first_seed
     deadline = time.monotonic() + arguments.seconds
-    results: list[Result] = []
-    with Pool(arguments.processes) as pool:
-        seeds = range(first, first + arguments.sequences)
+    wanted = range(first, first + arguments.sequences)
+    results = [result for result in read_results(arguments.results) if result.seed in wanted]
+    known = {result.seed for result in results}
+    target = arguments.results.open('a', encoding='utf-8') if arguments.results else nullcontext()
+    with Pool(arguments.processes) as pool, target as file:
+        seeds = [seed for seed in wanted if seed not in known]
         for result in pool.imap(play, seeds, chunksize=4):
             results.append(result)
+            if file is not None:
+                print(json.dumps(result), file=file, flush=True)
             for kind, text in result.found.items():
                 print(f'{result.seed} ({result.loop}) {kind}: {text}', flush=True)
             if time.monotonic() > deadline:
