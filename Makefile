@@ -35,7 +35,7 @@ help:
 	@echo 'make test    run ruff, mypy and all tests'
 	@echo 'make bench   measure the controller step, the loop latency and the simulation speed'
 	@echo 'make lint    run ruff and mypy only'
-	@echo 'make docs    draw the figures of the documents anew'
+	@echo 'make docs    regenerate the figures of the documents'
 	@echo 'make clean   remove everything that make created, except results/'
 	@echo "options: PYTHON=python3.12 (interpreter for .venv), ARGS='...' (passed on by demo, test, bench)"
 

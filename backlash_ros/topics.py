@@ -17,7 +17,7 @@ DIAGNOSTICS = '/diagnostics'
 
 
 # `sample` counts the plant outputs, lost or not, and joins rows of different topics. It begins with
-# 0, or with the time in sample periods where the controller may have been started anew. std_f is
+# 0, or with the time in sample periods where the controller may have been restarted. std_f is
 # always nan: f is given, or adapted by a law that knows no deviations.
 ESTIMATE_LABELS = ('m', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l', 'std_f', 'sample')
 # latency_s is the time from the departure of y(k) at the driver to that of v(k) at the controller.

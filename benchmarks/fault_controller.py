@@ -34,9 +34,9 @@ class Controller:
         self.stalled_until = 0
         self.active = True
         self._ramp: Iterator[float] = iter(())
-        self.start_anew(inherited, None)
+        self.restart(inherited, None)
 
-    def start_anew(self, inherited: Estimate | None, v: float | None) -> None:
+    def restart(self, inherited: Estimate | None, v: float | None) -> None:
         """Another process takes over. v: control.initial, None where it is not set."""
         self._counter = SampleCounter(self.p.real('sample_period'), from_zero=False)
         self._configure(inherited, v)

@@ -154,7 +154,7 @@ class Sequence:
         v = 0.0 if rng.random() < 0.5 else None
         self.controller = Controller(p, self.driver, inherited, self._sent, self._answered)
         if v is not None:
-            self.controller.start_anew(inherited, v)
+            self.controller.restart(inherited, v)
         told(f'{p.word("estimator.law")}, {p.word("structure")}, truth {self.truth}')
 
     def run(self) -> Findings:
@@ -232,7 +232,7 @@ class Sequence:
             self._foreign = True
         self._told(f'    with {estimate}')
         # Where the driver does not say which v acts, whoever starts the controller does.
-        controller.start_anew(estimate, None if self.driver.reports else self.actuator.v)
+        controller.restart(estimate, None if self.driver.reports else self.actuator.v)
         self._forget()
 
     def _cycle(self, tick: int) -> None:
@@ -455,9 +455,9 @@ EVENTS_BY_NAME: dict[str, Callable[[Sequence, int], None]] = {
     'the sensor fails': Sequence._fail_sensor, 'outputs are lost': Sequence._lose,
     'reports are lost': Sequence._lose_reports, 'outputs are repeated': Sequence._repeat,
     'the controller is held up': Sequence._stall,
-    'the driver is started anew': Sequence._restart_driver,
+    'the driver is restarted': Sequence._restart_driver,
     'the clock is set': Sequence._step_clock,
-    'the controller is started anew': Sequence._restart_controller,
+    'the controller is restarted': Sequence._restart_controller,
     'deactivated and activated': Sequence._cycle, 'limits change': Sequence._change_limits,
     'live parameters change': Sequence._change_live, 'a service is called': Sequence._call_service,
     'a rival takes over for a while': Sequence._meet_rival,

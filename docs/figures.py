@@ -1,4 +1,4 @@
-"""Makes every picture and every number of the documents anew: `make docs`.
+"""Regenerates every picture and every number of the documents: `make docs`.
 
 Pictures go to docs/images. Numbers go between the marks `<!-- name: made by docs/figures.py -->`
 and `<!-- end -->` of the pages, and docs/parameters.md is written as a whole.

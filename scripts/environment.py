@@ -74,7 +74,7 @@ def check_python(ros: str) -> None:
                 f'apt install python{version}-venv) or name another Python (make ... PYTHON=...)'
             )
     if Path(sys.prefix).resolve() == VENV.resolve():
-        raise MissingError('.venv must be made anew, but it is active: call deactivate, then make')
+        raise MissingError('.venv must be rebuilt, but it is active: call deactivate, then make')
 
 
 def fingerprint(level: str) -> str:

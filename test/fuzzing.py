@@ -139,7 +139,7 @@ class Fuzzer:
             self._untyped._on_reference(Float64(data=self._number_of_any_kind()))
         elif kind == 2:
             # Where a command must not move further than the rate allows, the driver is honest
-            # about v: whoever begins anew goes on from what it says.
+            # about v: whoever restarts goes on from what it says.
             honest = isfinite(self._move)
             report = Float64(data=loop.v if honest else self._number_of_any_kind())
             self._untyped._on_applied_control(report, {'source_timestamp': self._stamp})
@@ -197,7 +197,7 @@ def fuzz(seed: int, sequences: int) -> int:
     values = parameters_of(rng)
     rate = values['control.rate_max']
     assert isinstance(rate, float)
-    # A loop that begins anew goes on from the v that the driver says it applies.
+    # A loop that restarts goes on from the v that the driver says it applies.
     move = rate * PERIOD_S if values['estimator.use_applied_control'] == 'false' else inf
     with free_domain() as domain, node_with(values, domain) as node:
         fuzzer = Fuzzer(node, rng, move)

@@ -75,7 +75,7 @@ def test_a_controller_that_was_held_up_answers_what_waits_and_counts_the_rest() 
     assert (world.statistics.used, world.statistics.lost) == (150, 0)
 
 
-def test_a_driver_that_is_started_anew_is_an_interruption() -> None:
+def test_a_driver_that_is_restarted_is_an_interruption() -> None:
     world = World()
     world.run(100)
     world.driver.down_until = 150

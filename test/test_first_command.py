@@ -100,7 +100,7 @@ def test_a_controller_that_was_active_before_goes_on_from_its_last_command(
         assert controller.stop() == 0
 
 
-def test_a_killed_controller_that_is_started_anew_makes_no_jump(tmp_path: Path) -> None:
+def test_a_killed_controller_that_is_restarted_makes_no_jump(tmp_path: Path) -> None:
     keep = {'estimates.file': str(tmp_path / 'e.json'), 'estimates.load': True,
             'estimates.save_period': 0.1, 'estimator.law': 'kalman'}
     with ros_world(tmp_path) as world:

@@ -56,7 +56,7 @@ def test_inherited_estimate_holds_from_the_first_sample_on(structure: str, noise
     assert errors(after[-1:])[0] < 0.005
 
 
-def test_backlash_that_changed_meanwhile_is_learned_anew() -> None:
+def test_backlash_that_changed_meanwhile_is_learned_again() -> None:
     p = Parameters({**EXACT, 'output_noise_std': 1e-3})
     wrong = Estimate(2.0, 5.0, -1.0, 0.22, 1e-4, 1e-4, 1e-4, Status.TRACKING)
     after = Loop(p).run(build_controller(p, wrong), 1500)

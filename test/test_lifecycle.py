@@ -260,7 +260,7 @@ def test_noise_is_not_changed_live_for_a_law_that_would_not_take_it_up(tmp_path:
         assert not refused.successful
         assert 'estimator.output_noise_std=0.002' in refused.reason
         assert 'not taken up live by lms' in refused.reason
-        # Whoever begins anew takes it up.
+        # Whoever restarts takes it up.
         assert asked.change(Transition.TRANSITION_DEACTIVATE)
         assert asked.change(Transition.TRANSITION_CLEANUP)
         assert asked('set_parameters_atomically', kind, request).result.successful

@@ -89,10 +89,10 @@ def test_a_sender_with_a_slightly_wrong_clock_loses_nothing(ratio: float) -> Non
     assert sum(counter.count(stamp, 1 + k).missing for k, stamp in enumerate(stamps)) == 0
 
 
-def test_a_sender_that_was_started_anew_is_counted_by_time() -> None:
+def test_a_sender_that_was_restarted_is_counted_by_time() -> None:
     counter = SampleCounter(PERIOD_S)
     counter.count(START_NS, 500)
-    assert counter.count(START_NS + 5 * PERIOD_NS, 1) == Arrival(True, 4, anew=True)
+    assert counter.count(START_NS + 5 * PERIOD_NS, 1) == Arrival(True, 4, restarted=True)
 
 
 def over(
@@ -336,11 +336,11 @@ def test_two_senders_in_turn_are_not_taken_both(ahead: int, phase: float) -> Non
 
 
 @given(st.integers(10, 10**7))
-def test_sender_that_begins_anew_after_a_silence_is_taken_up(silence: int) -> None:
+def test_sender_that_restarts_after_a_silence_is_taken_up(silence: int) -> None:
     counter, due = paced_counter(100)
     start = due + silence * PERIOD_NS
     arrivals = [counter.count(start + k * PERIOD_NS, 1 + k) for k in range(20)]
-    assert sum(arrival.anew for arrival in arrivals) == 1
+    assert sum(arrival.restarted for arrival in arrivals) == 1
     assert all(arrival.is_sample for arrival in arrivals[5:])
 
 
@@ -352,7 +352,7 @@ def test_clock_that_is_set_back_is_believed_after_some_samples(jump: int) -> Non
     start = START_NS * 10 + (40 + jump) * PERIOD_NS
     arrivals = [counter.count(start + k * PERIOD_NS) for k in range(20)]
     assert all(arrival.is_sample for arrival in arrivals[5:])
-    assert sum(arrival.anew for arrival in arrivals) == 1
+    assert sum(arrival.restarted for arrival in arrivals) == 1
 
 
 def test_sender_that_answers_at_once_is_counted_by_number() -> None:

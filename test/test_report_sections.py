@@ -86,7 +86,7 @@ def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
     assert same(read_bag(bag).run, second)
     assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
     (line,) = capsys.readouterr().err.splitlines()
-    assert 'began its count anew 1 time: this is what follows the last time, 1.5 s after' in line
+    assert 'restarted its count 1 time: this is what follows the last time, 1.5 s after' in line
     assert '--from and --to' in line
     assert (tmp_path / 'out' / 'report.html').is_file()
 
@@ -101,7 +101,7 @@ def test_from_and_to_choose_the_other_part(
     assert np.array_equal(part.column('y'), first.column('y')[20:70])
     assert part.column('t')[0] == 0.0
     assert report.main([str(bag), '--to', '1.5', '--out', str(tmp_path / 'out')]) == 0
-    assert 'began its count anew' not in capsys.readouterr().err
+    assert 'restarted its count' not in capsys.readouterr().err
     assert report.main([str(bag), '--from', '9', '--out', str(tmp_path / 'none')]) == 2
     assert 'holds no sample between --from and --to' in capsys.readouterr().err
     assert report.main([str(bag), '--from', '2', '--to', '1']) == 2

@@ -1,4 +1,4 @@
-"""Processes that die, begin anew, are reconfigured or stopped while the loop runs."""
+"""Processes that die, restart, are reconfigured or stopped while the loop runs."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ def _catches(node: NodeProcess, number: signal.Signals) -> bool:
     return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
 
 
-def test_no_sample_number_is_used_twice_whoever_is_started_anew(tmp_path: Path) -> None:
+def test_no_sample_number_is_used_twice_whoever_is_restarted(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
         # They are never sent, so that the count is ahead of the numbers of the driver.

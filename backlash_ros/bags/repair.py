@@ -1,4 +1,4 @@
-"""Makes a damaged bag readable for everyone: what is left of it, written anew and closed."""
+"""Makes a damaged bag readable for everyone: what is left of it, rewritten and closed."""
 
 from __future__ import annotations
 

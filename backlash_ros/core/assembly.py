@@ -227,7 +227,7 @@ def _tracking(p: Parameters) -> Structure:
     )
 
 
-# Remembered: a controller that begins anew does so in the middle of a loop.
+# Remembered: a controller that restarts does so in the middle of a loop.
 @lru_cache(maxsize=16)
 def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> StateModel:
     return StateModel(TransferFunction(numerator, denominator))

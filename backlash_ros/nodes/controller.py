@@ -79,7 +79,7 @@ class ControllerNode(ManagedNode):
         self._lockstep = p.flag('lockstep')
         self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
-        # Whoever waits for the others begins with them; who does not may have been started anew.
+        # Whoever waits for the others begins with them; who does not may have been restarted.
         self._set_up(
             p, from_zero=not self._lockstep and p.integer('wait_for_subscribers') > 0
         )

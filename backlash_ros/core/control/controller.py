@@ -89,7 +89,7 @@ class AdaptiveController:
     before v(k) only where the structure feeds y back; else v(k) need not wait for it.
 
     compensating: False inverts the slope alone, as if there were no gap.
-    learner: who proposes better models of G, for the structure to be designed anew; None where
+    learner: who proposes better models of G, for the structure to be redesigned; None where
     that of the beginning is kept.
     """
 

@@ -1,4 +1,4 @@
-"""Estimates in a file, so that a controller that is started anew need not learn from nothing."""
+"""Estimates in a file, so that a controller that is restarted need not learn from nothing."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ GAPS = 48  # that the whole swing of v is searched with
 SMALLEST = 2e-3  # of them, in swings of v
 NEAR, NEAR_GAPS = 0.2, 13  # reach around a minimum, relative, and gaps that it is searched with
 STARTS = (0.0, 0.5, 1.0)  # places in the gap at which p may begin
-AFRESH = 4  # every so many gaps a model is looked for anew
+AFRESH = 4  # every so many gaps a model is searched for from scratch
 STEPS = 3  # of the model per gap; it goes on from that of the gap before
 MINIMA = 3  # that are set free
 

@@ -60,7 +60,7 @@ class ControlLoop:
         self._lockstep = p.flag('lockstep')
         self._missing = 0  # outputs since the newest one that was used
         self._unsent = 0  # those of them that were never published
-        self._anew = False  # whether sender or clock began anew since then
+        self._restarted = False  # whether sender or clock restarted since then
         self._begun = False  # whether the present core has taken a step
         self.core = build_controller(p, inherited)
         self.told = build_model(p)
@@ -235,9 +235,9 @@ class ControlLoop:
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
         self._unsent += arrival.unsent
-        self._anew = self._anew or arrival.anew
+        self._restarted = self._restarted or arrival.restarted
         # What came before the first sample that is used was not lost: nobody listened.
-        if self._begun and not (self.silent or arrival.anew):
+        if self._begun and not (self.silent or arrival.restarted):
             self.statistics.lost += arrival.missing
             self.statistics.unsent += arrival.unsent
 
@@ -247,10 +247,10 @@ class ControlLoop:
         too_long = self._missing > LONGEST_GAP or (
             not self._lockstep and 0.0 < timeout < self._missing * self._p.real('sample_period')
         )
-        if self.silent or self._anew or (too_long and self._begun):
+        if self.silent or self._restarted or (too_long and self._begun):
             self.statistics.interruptions += 1
             self.renew(self.estimate)
-        self.silent = self._anew = False
+        self.silent = self._restarted = False
 
     def _step_core(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
         """Step the core over the missing outputs to y, with the v that was really applied."""

@@ -26,7 +26,7 @@ class LoopStatistics:
     bad_outputs: int = 0  # of these, the ones of y
     bad_references: int = 0  # and of y_m
     extra: int = 0  # outputs that were repeated, too early, old or of a second driver
-    interruptions: int = 0  # times that the driver was silent or began anew
+    interruptions: int = 0  # times that the driver was silent or restarted
     without_reference: int = 0  # outputs before the first y_m
     limited: int = 0  # commands that met a limit
     still: int = 0  # newest values of y in a row that are equal

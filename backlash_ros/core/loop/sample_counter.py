@@ -29,13 +29,13 @@ class Arrival(NamedTuple):
 
     is_sample: False for repetitions, floods, old messages and second senders. missing: samples
     that never came before this one. unsent: those of them that the sender cannot have published,
-    for it has not numbered them. anew: sender or clock began anew, so nothing is known of what the
-    plant did in between.
+    for it has not numbered them. restarted: sender or clock did, so nothing is known of what
+    the plant did in between.
     """
 
     is_sample: bool
     missing: int = 0
-    anew: bool = False
+    restarted: bool = False
     unsent: int = 0
 
 
@@ -46,14 +46,14 @@ class SampleCounter:
     """Counts samples by two witnesses: sequence numbers and time stamps.
 
     Sequence numbers tell what the middleware lost; they cannot tell what was never published, or
-    what a relay that numbers anew has lost. Time stamps can: sample k is due one period after
+    what a relay that renumbers has lost. Time stamps can: sample k is due one period after
     sample k-1. The larger count is believed. A sender that does not keep time, like one that
     answers each control at once, is counted by number alone as long as it is not late.
 
     index: of the newest sample, -1 before the first. due_ns: when that sample was due at the
     sender. from_zero: the first index is the count of the sender, which begins with 1, where
     messages are numbered, else 0. Otherwise it is the time of the first sample in periods, so that
-    who is started anew goes on where the one before has ended, and no index is used twice.
+    who is restarted goes on where the one before has ended, and no index is used twice.
     """
 
     def __init__(self, sample_period_s: float, from_zero: bool = True) -> None:
@@ -91,8 +91,8 @@ class SampleCounter:
                 silent = stamp_ns - self._stamp_ns > SILENCE * period
                 if keeps_time and not silent:
                     return NO_SAMPLE
-                # Two senders in turn must not each look like one that began anew.
-                begin = self._stranger if keeps_time or not silent else self._anew
+                # Two senders in turn must not each look like one that restarted.
+                begin = self._stranger if keeps_time or not silent else self._restarted
                 return begin(stamp_ns, sequence, by_time)
             if keeps_time and by_number > late + 1.0 + NUMBER_SLACK:
                 # A second sender, or a flood of which the middleware has dropped a part.
@@ -117,12 +117,12 @@ class SampleCounter:
         self._strange += 1
         if self._strange < STRANGERS:
             return NO_SAMPLE
-        return self._anew(stamp_ns, sequence, missing)
+        return self._restarted(stamp_ns, sequence, missing)
 
-    def _anew(self, stamp_ns: int, sequence: int, missing: int) -> Arrival:
+    def _restarted(self, stamp_ns: int, sequence: int, missing: int) -> Arrival:
         self.index += 1 + missing
         self._begin(stamp_ns, sequence)
-        return Arrival(is_sample=True, missing=missing, anew=True)
+        return Arrival(is_sample=True, missing=missing, restarted=True)
 
     def _begin(self, stamp_ns: int, sequence: int) -> None:
         self._sequence = self._repeated = sequence

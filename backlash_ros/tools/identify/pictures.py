@@ -59,7 +59,7 @@ def draw(found: Identification) -> Iterator[Picture]:
     )
     yield Picture(
         'gap.png', 'Misfit over the gap',
-        'What is left over for each width of the gap, everything else fitted anew. One narrow '
+        'What is left over for each width of the gap, everything else refitted. One narrow '
         'valley: the gap is known. Two valleys of one depth: it is not.',
         png(draw_profile(found, details)),
     )

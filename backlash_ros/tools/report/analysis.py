@@ -91,7 +91,7 @@ def moving_rms(values: Array, samples: int) -> Array:
     if values.size == 0:
         return values
     known = np.isfinite(values)
-    # Each sum anew: a running one would keep the rounding errors of large values long past.
+    # Each sum from scratch: a running one would keep the rounding errors of large values long past.
     window = np.ones(samples)
     with np.errstate(over='ignore'):  # of a law that diverges
         squares = np.convolve(np.where(known, values, 0.0) ** 2, window)[:len(values)]

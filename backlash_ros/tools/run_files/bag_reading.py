@@ -77,7 +77,7 @@ def read_bag(
 
     t = (sample - first) * sample_period; None takes the median distance of the stamps. A gap in
     the count is a lost sample. Of a bag that was never closed, or is damaged, what is left is
-    read, and nothing is changed. Where the controller was started anew, it is what the last one
+    read, and nothing is changed. Where the controller was restarted, it is what the last one
     did within the span. axis: of several, empty for the first one. Raises InputError, in one line,
     for a bag that cannot be read or holds no run.
     """

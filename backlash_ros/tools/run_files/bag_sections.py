@@ -59,7 +59,7 @@ class Table:
 def choose(
     signals: Table, others: Mapping[str, Table], span: Span,
 ) -> tuple[Table, dict[str, Table], str]:
-    """The rows of the span, and of its last run if the controller began its count anew in it.
+    """The rows of the span, and of its last run if the controller restarted its count in it.
 
     Returns the signals, the others, and in one sentence what was left out, empty for nothing.
     """
@@ -74,7 +74,7 @@ def choose(
     elif falls.size:
         cut_ns = float(signals.stamps[falls[-1]])
         note = (
-            f'the controller began its count anew {falls.size} time'
+            f'the controller restarted its count {falls.size} time'
             f'{"s" if falls.size > 1 else ""}: this is what follows the last time, '
             f'{(cut_ns - begin_ns) * 1e-9:.1f} s after the beginning; --from and --to choose '
             'another part'

@@ -1,4 +1,4 @@
-"""The fit of a record: labels, least squares, gap; labels anew with that gap, until it stands.
+"""The fit of a record: labels, least squares, gap; new labels with that gap, until it stands.
 
 Every solve is a Gauss-Newton step in the gap and the start of the play output, as window_fit.py
 explains. The G that is fitted around moves as well: to the one of low order that does what

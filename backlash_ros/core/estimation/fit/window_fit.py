@@ -2,7 +2,7 @@
 
 The labels of the play operator hold for the gap they were made with. The solution has a gap of its
 own, (m c_r - m c_l) / m, because the column of m c_l is free: it carries the derivative of y by the
-gap, so that labels made anew with it are a Gauss-Newton step (relabelling.py).
+gap, so that labels made once more with it are a Gauss-Newton step (relabelling.py).
 """
 
 from __future__ import annotations

@@ -69,10 +69,10 @@ class Learning:
     told: around what the first fit is made, with G as told. told_walk: of u, a first guess. drift:
     random walk of m, c_r, c_l per square root of a sample, shape (3,). around: what the next fit is
     made around. current: the fit, None while it is searched for. reason: why there is no estimate.
-    refit_at: length of the record at which all of it is fitted anew; moved_at: from which a gap
+    refit_at: length of the record at which all of it is refitted; moved_at: from which a gap
     that moved is reason to do so. contradicted_from: sample from which the fit does not hold;
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
-    again. changed: what theta seems to have become. refitted: whether it was fitted anew since the
+    again. changed: what theta seems to have become. refitted: whether it was refitted since the
     record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
     do not deny it.
     """

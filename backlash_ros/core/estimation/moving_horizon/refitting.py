@@ -1,4 +1,4 @@
-"""How new samples come into the fit: block by block, and now and then all of the record anew."""
+"""How new samples come into the fit: block by block, and now and then by a refit of all."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def take_block(learning: Learning) -> Task:
 
 
 def refit(learning: Learning) -> Task:
-    """Fit the whole record anew; a long one loses its oldest third first."""
+    """Refit the whole record; a long one loses its oldest third first."""
     current = learning.fit
     yield from _attribute(learning, current)
     around, start, first = yield from _shortened(learning, current)
