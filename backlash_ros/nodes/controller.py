@@ -215,6 +215,7 @@ class ControllerNode(ManagedNode):
 
     def finish(self) -> None:
         super().finish()
+        self._rivals.close()
         self._saver.close()
         if self.loop is not None:
             self.log.info(', '.join(

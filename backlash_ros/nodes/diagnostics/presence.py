@@ -19,7 +19,7 @@ LISTED = Path('/proc/net/unix')
 
 
 class Presence:
-    """Makes a publisher of a topic known to all of this machine until the process ends.
+    """Makes a publisher of a topic known to all of this machine until it is closed.
 
     domain: ROS_DOMAIN_ID. topic: its full name. identity: of the publisher, in letters and digits.
     """

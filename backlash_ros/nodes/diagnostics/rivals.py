@@ -154,6 +154,10 @@ class RivalWatch:
         self._rivals.end()
         self.look()
 
+    def close(self) -> None:
+        """Nothing is commanded any more: nobody has to wait for this node."""
+        self._presence.close()
+
     def look(self) -> None:
         """Look at the graph."""
         now, before = time.monotonic(), self.found
