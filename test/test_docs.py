@@ -182,7 +182,7 @@ def check_tool(program: str, arguments: list[str]) -> None:
         assert config is None or (ROOT / config).is_file()
         return
     options = (
-        simulate._parser().parse_args(arguments) if program == 'simulate'
+        simulate.make_parser().parse_args(arguments) if program == 'simulate'
         else bringup.parse_options(arguments)
     )
     build_controller(effective_parameters(options.config, options.settings, options.seed))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from math import isfinite
+from math import inf, isfinite
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.loop.causes import TROUBLE, Finding, Level
+from backlash_ros.core.loop.held_control import HeldControl
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import PLANT
@@ -59,8 +60,7 @@ class PlantNode(ProcessNode):
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.integer('seed'), 1])
         self._started = False
-        self._v = self._v_before = 0.0
-        self._arrived_ns = 0  # of v, on the monotonic clock
+        self._held = HeldControl()  # times of arrival on the monotonic clock
         self._heard = False  # a first v has come
         self._expecting = False  # no v has come since the newest output
         self._tick = 0
@@ -132,18 +132,18 @@ class PlantNode(ProcessNode):
         if not isfinite(v):
             self._counts[NOT_FINITE] += 1
             return
-        self._v_before, self._v, self._heard = self._v, v, True
-        self._arrived_ns = arrival_ns(info['received_timestamp'])
+        self._held.take(v, arrival_ns(info['received_timestamp']))
+        self._heard = True
         if self._expecting:
             self._expecting = False
             if self._lockstep:
-                self._advance(self._v)
+                self._advance(v)
                 self._offer()
 
     def _offer(self) -> None:
         """Lockstep: go on to the next output that is not lost on purpose."""
         while not self._complete and not self._publish_output():
-            self._advance(self._v)
+            self._advance(self._held.newest)
         self._publish_truth()
         self._report_completion()
 
@@ -157,9 +157,9 @@ class PlantNode(ProcessNode):
         self._latest_ns = due_ns + int(LATEST * self._sample_period * 1e9)
         # Of the intervals that ended while the process was held up, some were over before v came.
         for missed in reversed(range(passed)):
-            over_ns = due_ns - missed * self._sample_period * 1e9
-            in_time = missed == 0 or self._arrived_ns < over_ns
-            self._advance(self._v if in_time else self._v_before)
+            # All that has come so far came within the newest interval.
+            over_ns = due_ns - missed * self._sample_period * 1e9 if missed else inf
+            self._advance(self._held.over(over_ns))
         if not self._complete:
             self._publish_output()
         self._publish_truth()

@@ -21,7 +21,8 @@ def main(args: Sequence[str] | None = None) -> int:
     return command_line.run_tool('compare', lambda: _compare(args))
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The options of `compare`."""
     parser = command_line.OptionParser('compare', description=__doc__)
     command_line.add_common_options(parser)
     parser.add_argument('--duration', type=float, default=10.0, metavar='SECONDS',
@@ -30,7 +31,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _compare(args: Sequence[str] | None) -> None:
-    options = _parser().parse_args(args)
+    options = make_parser().parse_args(args)
     scenario = effective_parameters(
         options.config, options.settings, options.seed, options.axis
     )

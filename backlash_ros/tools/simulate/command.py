@@ -38,7 +38,8 @@ def main(args: Sequence[str] | None = None) -> int:
     return command_line.run_tool('simulate', lambda: _simulate(args))
 
 
-def _parser() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
+    """The options of `simulate`."""
     parser = command_line.OptionParser('simulate', description=__doc__)
     command_line.add_common_options(parser)
     parser.add_argument(
@@ -57,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _simulate(args: Sequence[str] | None) -> None:
-    options = _parser().parse_args(args)
+    options = make_parser().parse_args(args)
     parameters = effective_parameters(
         options.config, options.settings, options.seed, options.axis
     )
