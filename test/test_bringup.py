@@ -178,8 +178,14 @@ def test_ctrl_c_is_heard_before_the_libraries_are_loaded() -> None:
         'import sys, backlash_ros.tools.bringup.command as b; b.parse_options([]);'
         'sys.exit(bool({"numpy", "scipy", "rosbags"} & set(sys.modules)))'
     )
-    root = Path(bringup.__file__).resolve().parents[2]
+    root = Path(bringup.__file__).resolve().parents[3]
     assert subprocess.run([sys.executable, '-c', code], cwd=root).returncode == 0
+
+
+def test_processes_find_this_package_behind_what_the_user_has_set() -> None:
+    user, source = processes.with_source({'PYTHONPATH': '/of/the/user'})['PYTHONPATH'].split(':')
+    assert user == '/of/the/user'
+    assert (Path(source) / 'backlash_ros' / '__init__.py').is_file()
 
 
 def test_folder_that_holds_a_bag_is_not_written_over(

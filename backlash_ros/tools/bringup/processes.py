@@ -25,6 +25,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO
 
+import backlash_ros
 from backlash_ros.middleware.loopback import prefer_loopback
 
 LOG_LINES = 10  # of a log that an error message quotes
@@ -323,7 +324,7 @@ def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
 
 def with_source(environment: Mapping[str, str]) -> dict[str, str]:
     """A copy in which Python finds this package, which need not be installed."""
-    source = str(Path(__file__).resolve().parents[2])
+    source = str(Path(backlash_ros.__file__).resolve().parents[1])
     # Behind the user's own entries it shadows nothing.
     paths = [entry for entry in environment.get('PYTHONPATH', '').split(os.pathsep) if entry]
     return {**environment, 'PYTHONPATH': os.pathsep.join([*paths, source])}
