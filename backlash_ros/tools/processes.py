@@ -56,7 +56,8 @@ class ProcessPlan:
     name: in messages. axis: that its events are about. foreign: no node of this package: all
     that it prints goes to its log. spectator: the run goes on without it. linger_s: the time that
     it is left alone when its turn to be stopped has come, because what was stopped before still
-    has an effect on it. farewell_s: the time that it needs for its end beyond what any process gets.
+    has an effect on it. farewell_s: the time that it needs for its end beyond what any process
+    gets.
     """
 
     name: str

@@ -18,7 +18,7 @@ from backlash_ros.nodes.spin import ProcessNode
 
 EXECUTABLE = 'live'
 REFRESH_S = 0.1
-SHOWN_S = 20.0  # width of the curves
+SHOWN_S = 10.0  # width of the curves
 # A machine that is held up for a second loses no point.
 DEPTH = 30
 LABELS = (
