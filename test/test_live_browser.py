@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(
     executable() is None, reason='Chromium is not installed: apt-get install chromium'
 )
 
-PICTURES = 'gap output loop slope command'.split()
+PICTURES = ['gap', 'output', 'loop', 'slope', 'command']
 WHOLE_RUN = ('--config', 'geared_motor.yaml', '--duration', 'inf', '--no-record', '--live')
 
 

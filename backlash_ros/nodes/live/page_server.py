@@ -18,12 +18,13 @@ GOODBYE_S = 0.2  # for browsers that do not take what they are sent
 
 
 def bound_socket(port: int) -> socket.socket:
-    """A socket on this port of this machine, 0 for a free one; raises OSError."""
+    """A socket that listens on this port of this machine, 0 for a free one; raises OSError."""
     bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     try:
         # A port that was used a minute ago is free.
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         bound.bind((HOST, port))
+        bound.listen()
     except OSError:
         bound.close()
         raise
