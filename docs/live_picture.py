@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import io
 import re
 import signal
 import subprocess
@@ -16,17 +15,18 @@ import tempfile
 from pathlib import Path
 
 from browser import chromium
-from PIL import Image
 
 PICTURE = Path(__file__).resolve().parent / 'images' / 'live.png'
 ADDRESS = re.compile(r'^live: (http://\S+)$')
 WIDTH, HEIGHT = 1280, 800
-COLOURS = 128  # of the picture; more would only make it larger
-SHOWN_S = 10.0  # until the curves are as long as the page is wide
-PATIENCE_S = 300.0
+AFTERWARDS_S = 6.0  # so that the curves still show how the backlash was learned
+PATIENCE_S = 60.0
 RUN = (
     sys.executable, '-m', 'backlash_ros.tools.bringup', '--config', 'geared_motor.yaml',
     '--duration', 'inf', '--no-record', '--live',
+    # All of it four times as slow, for machines that have other work, and a swing of a few gaps.
+    '--set', 'sample_period=0.02', '--set', 'frequency=0.8', '--set', 'amplitude=0.3',
+    '--set', 'inverse.take_up_rate=25.0', '--set', 'control.rate_max=75.0',
 )
 
 
@@ -34,7 +34,7 @@ async def picture(address: str, scheme: str) -> bytes:
     """The page as it is once the backlash has been known for a while."""
     async with chromium() as browser, browser.open(address) as tab:
         await tab.wait_until("document.getElementById('word').textContent.endsWith('tracking')")
-        await asyncio.sleep(SHOWN_S)
+        await asyncio.sleep(AFTERWARDS_S)
         # A machine that is held up is not what the page is about.
         await tab.wait_until(
             "document.getElementById('word').className === 'level0'", PATIENCE_S
@@ -43,7 +43,7 @@ async def picture(address: str, scheme: str) -> bytes:
 
 
 def main() -> None:
-    """Run the geared motor, and take the picture."""
+    """Run the loop, and take the picture."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--out', type=Path, default=PICTURE, metavar='FILE')
     parser.add_argument('--scheme', choices=('light', 'dark'), default='light')
@@ -57,9 +57,7 @@ def main() -> None:
         finally:
             run.send_signal(signal.SIGINT)
             run.communicate()
-    Image.open(io.BytesIO(taken)).quantize(COLOURS, dither=Image.Dither.NONE).save(
-        options.out, optimize=True
-    )
+    options.out.write_bytes(taken)
 
 
 if __name__ == '__main__':
