@@ -35,7 +35,7 @@ def bound_socket(port: int) -> socket.socket:
 async def for_this_machine(request: web.Request, handler: Handler) -> web.StreamResponse:
     """Refuse whoever came here by another name."""
     # A page from elsewhere may let a name of its own point here, and read along.
-    if request.url.host not in (HOST, 'localhost'):
+    if request.host.partition(':')[0] not in (HOST, 'localhost'):
         raise web.HTTPForbidden(text=f'only {HOST} is served\n')
     return await handler(request)
 
