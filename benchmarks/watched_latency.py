@@ -20,7 +20,7 @@ from loop_latency import RATES_HZ, Latencies, measure_latency, node_command
 from reporting import machine, markdown_table
 
 LAW = 'moving_horizon'
-ON_A_TERMINAL = 'import pty, sys; pty.spawn(sys.argv[1:])'
+BESIDE = Path(__file__).resolve().parent
 BROWSER = 'browser'
 HEADER = (
     'rate', '', 'nobody watches', 'monitor and page are open', 'the same over the echo',
@@ -32,11 +32,12 @@ def watchers() -> dict[str, list[str]]:
     """Commands of all who watch."""
     with socket.create_server(('127.0.0.1', 0)) as found:
         port = found.getsockname()[1]
+    monitor = node_command('monitor.command', {})
     return {
-        'monitor': [sys.executable, '-c', ON_A_TERMINAL, *node_command('monitor.command', {})],
+        'monitor': [sys.executable, str(BESIDE / 'on_terminal.py'), *monitor],
         'live': [*node_command('live.command', {}), '--port', str(port)],
         BROWSER: [
-            sys.executable, str(Path(__file__).with_name('open_page.py')),
+            sys.executable, str(BESIDE / 'open_page.py'),
             f'http://127.0.0.1:{port}',
         ],
     }
