@@ -15,7 +15,9 @@ setup(
     maintainer_email='maintainers@example.org',
     license='Apache-2.0',
     packages=find_packages(exclude=['test*']),
-    package_data={f'{PACKAGE}.middleware': ['loopback.xml']},
+    package_data={
+        f'{PACKAGE}.middleware': ['loopback.xml'], f'{PACKAGE}.nodes.live': ['page.html'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -29,7 +31,9 @@ setup(
     zip_safe=False,
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
-    install_requires=['matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm'],
+    install_requires=[
+        'aiohttp', 'matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm',
+    ],
     extras_require={'test': [
         'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-rerunfailures', 'pytest-timeout',
     ]},
@@ -47,6 +51,7 @@ setup(
             f'identify = {PACKAGE}.tools.identify.command:main',
             f'replay = {PACKAGE}.tools.replay.command:main',
             f'monitor = {PACKAGE}.nodes.monitor.command:main',
+            f'live = {PACKAGE}.nodes.live.command:main',
         ],
     },
 )

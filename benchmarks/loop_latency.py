@@ -203,8 +203,12 @@ def node_command(name: str, values: Mapping[str, object]) -> list[str]:
 
 def measure_latency(
     rate: float, law: str, duration_s: float, changes: Mapping[str, object] | None = None,
+    beside: Mapping[str, Sequence[str]] | None = None, awaited: str = '',
 ) -> Latencies:
-    """Latency of the controller process with this law at this rate."""
+    """Latency of the controller process with this law at this rate.
+
+    beside: commands that run in the same domain. awaited: the one of these that is to be ready.
+    """
     # The same waves per sample at every rate: G is given in samples, not in seconds. While the
     # echo is asked the controller hears nothing, which is no silence of the driver.
     parameters = Parameters({
@@ -215,11 +219,14 @@ def measure_latency(
     commands = {
         'controller': node_command('controller', _values_of(CONTROLLER, parameters)),
         'echo': [sys.executable, str(Path(__file__).with_name('echo_node.py'))],
+        **(beside or {}),
     }
     with processes(commands) as (supervisor, domain):
         driver = Driver(domain, parameters)
         try:
             driver.connect()
+            if awaited:
+                wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', awaited))
             result = driver.measure(duration_s)
         finally:
             driver.close()

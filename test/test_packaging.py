@@ -24,7 +24,7 @@ import backlash_ros
 ROOT = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
     'controller', 'plant', 'reference', 'recorder', 'bringup', 'simulate', 'report', 'compare',
-    'check_driver', 'identify', 'replay', 'monitor',
+    'check_driver', 'identify', 'replay', 'monitor', 'live',
 }
 ROS_PREFIXES = ('rclpy', 'ament_')
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
@@ -85,6 +85,8 @@ def test_installation_holds_what_ros2_run_and_the_tools_look_for(installation: P
     ):
         beside = {path.name for path in (share / 'backlash_ros' / folder).glob(pattern)}
         assert beside == {path.name for path in (ROOT / folder).glob(pattern)} != set()
+    beside_modules = {path.name for path in installation.rglob('lib/python*/**/*.[hx]*ml')}
+    assert beside_modules == {'loopback.xml', 'page.html'}
     executables = installation / 'lib' / 'backlash_ros'
     assert {path.name for path in executables.iterdir()} == EXECUTABLES
     assert all(os.access(path, os.X_OK) for path in executables.iterdir())

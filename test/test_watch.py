@@ -92,8 +92,26 @@ def test_every_topic_keeps_to_the_lesser_of_its_bound_and_the_sampling_rate(
         publisher.listeners = 1
     run(watch, rate_hz, 4.0)
     for publisher in publishers.values():
-        assert 0.99 * 4.0 * min(rate_hz, 1.0 / PERIOD_S) <= len(publisher.sent)
+        # At the end those that follow v still wait for the sample after it.
+        assert 0.99 * 4.0 * min(rate_hz, 1.0 / PERIOD_S) - 1 <= len(publisher.sent)
         assert len(publisher.sent) <= 4.0 * min(rate_hz, 1.0 / PERIOD_S) + 1
+
+
+@pytest.mark.parametrize('rate_hz', [10.0, 100.0, 450.0, 1000.0])
+@pytest.mark.parametrize('others', [True, False])
+def test_u_is_the_one_that_the_v_before_it_led_to(rate_hz: float, others: bool) -> None:
+    watch, publishers = watch_of()
+    for topic, publisher in publishers.items():
+        publisher.listeners = int(others or topic in ('~/watch/v', '~/watch/u_hat'))
+    v, u = publishers['~/watch/v'].sent, publishers['~/watch/u_hat'].sent
+    row = list(SIGNALS)
+    for k in range(1000):
+        # y(k) shows the u of the interval before it, over which v(k - 1) acted.
+        row[topics.SIGNAL_LABELS.index('v')], row[topics.SIGNAL_LABELS.index('u_hat')] = k, k - 1
+        before = len(u)
+        watch.follow(row, ESTIMATES, k / rate_hz)
+        assert u[before:] == v[before:len(u)]
+    assert len(u) > 900 * min(1.0, 1.0 / PERIOD_S / rate_hz)
 
 
 def test_in_a_fast_loop_no_command_is_followed_by_more_than_one_message() -> None:

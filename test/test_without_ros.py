@@ -79,7 +79,7 @@ def test_the_core_is_there_for_scripts(libraries: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('module', [
     'nodes.controller', 'nodes.plant', 'nodes.reference', 'nodes.recorder', 'nodes.check_driver',
-    'nodes.monitor.command', 'tools.bringup',
+    'nodes.monitor.command', 'nodes.live.command', 'tools.bringup',
 ])
 def test_what_needs_ros_says_so_in_one_line(
     libraries: Path, tmp_path: Path, module: str,

@@ -7,7 +7,7 @@ from types import FrameType
 
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 
-EXECUTABLES = ('controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor')
+EXECUTABLES = ('controller', 'plant', 'reference', 'recorder', 'check_driver', 'monitor', 'live')
 
 
 def _end(number: int, frame: FrameType | None) -> None:

@@ -15,6 +15,7 @@ from backlash_ros.nodes.runtime.messages import without_events
 PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
 LOOK_S = 0.5  # between two looks at who listens
 DEPTH = 10  # messages that may wait for a subscriber
+U_INDEX = topics.SIGNAL_LABELS.index('u_hat')
 BAND = 2.0  # half width of the band around an estimate, in standard deviations
 
 
@@ -22,6 +23,7 @@ class WatchPublisher:
     """Publishes `controller/watch/<label>` for each label of which there is a subscriber.
 
     The topics take turns, so that after a command of a fast loop one message leaves, not all.
+    After v(k) comes the u that it led to, which is known with y(k+1): points of their loop.
     """
 
     def __init__(self, node: Node) -> None:
@@ -33,8 +35,10 @@ class WatchPublisher:
         }
         self._message = Float64()
         self._heard: list[str] = []  # labels with a subscriber
-        self._turn = 0  # whose turn it is among these
+        self._turn = -1  # whose turn it was among these
         self._looked_at_s = self._sent_at_s = -inf
+        self._v_sent = False  # with the newest sample, so that its u is that of the next one
+        self._u_of_v: float | None = None  # u that belongs to the v that was sent last
 
     def follow(self, signals: Sequence[float], estimates: Sequence[float], now_s: float) -> None:
         """Publish what is due of a sample.
@@ -49,6 +53,8 @@ class WatchPublisher:
             ]
         if not self._heard:
             return
+        if self._v_sent:
+            self._v_sent, self._u_of_v = False, signals[U_INDEX]
         spacing = PERIOD_S / len(self._heard)
         # After a pause each is due once.
         self._sent_at_s = max(self._sent_at_s, now_s - PERIOD_S)
@@ -56,12 +62,18 @@ class WatchPublisher:
         due = int((now_s - self._sent_at_s) / spacing + 1e-6)
         if not due:
             return
-        self._sent_at_s += due * spacing
         values = watched_values(signals, estimates)
         for _ in range(due):
-            self._turn = (self._turn + 1) % len(self._heard)
-            label = self._heard[self._turn]
+            turn = (self._turn + 1) % len(self._heard)
+            label = self._heard[turn]
+            if label == 'u_hat' and self._v_sent:
+                return
+            self._turn = turn
+            self._sent_at_s += spacing
             self._message.data = values[label]
+            if label == 'u_hat' and self._u_of_v is not None:
+                self._message.data, self._u_of_v = self._u_of_v, None
+            self._v_sent = self._v_sent or label == 'v'
             self._publishers[label].publish(self._message)
 
 

@@ -9,54 +9,25 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, TextIO
 
-from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 from rich.console import Console
 from rich.live import Live
-from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros import topics
+from backlash_ros.nodes.monitor.followed import FollowedControllers, time_of_day
 from backlash_ros.nodes.monitor.keys import pressed_keys
 from backlash_ros.nodes.monitor.state import NAMES, ControllerState
 from backlash_ros.nodes.monitor.view import ASCII_BLOCKS, BLOCKS, plain_line, screen
-from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.spin import DONE, ProcessNode
 
 EXECUTABLE = 'monitor'
-LOOK_S = 1.0  # between two looks for further controllers
 REFRESH_S = 0.2  # of the screen
 LINE_S = 1.0  # between two plain lines
 CONFIRM_S = 3.0  # within which a second r resets
 ANSWER_S = 5.0  # longest wait for a service
 NOTICE_S = 3.0
-MARK = topics.of_node(topics.watched(NAMES[0])).removeprefix('~')  # of a controller
-
-
-class Watched:
-    """What the node has of one controller: state, newest estimates, clients of its services."""
-
-    def __init__(self, node: ProcessNode, name: str) -> None:
-        self.state = ControllerState(name)
-        # Messages are taken when the screen is drawn: nothing wakes up for each of them.
-        self._inboxes = {
-            estimate: Inbox(node, Float64, name + topics.of_node(topics.watched(estimate))[1:], 1)
-            for estimate in NAMES
-        }
-        self.clients: dict[str, Client] = {
-            service: node.create_client(kind, f'{name}/{service}') for service, kind in (
-                ('freeze_adaptation', SetBool), ('enable_compensation', SetBool),
-                ('reset_estimates', Trigger), ('save_estimates', Trigger),
-            )
-        }
-
-    def refresh(self) -> None:
-        """Take in the estimates that have come."""
-        for estimate, inbox in self._inboxes.items():
-            for message, _ in inbox.take_all():
-                self.state.take_estimate(estimate, message.data)
 
 
 @dataclass
@@ -78,15 +49,12 @@ class MonitorNode(ProcessNode):
 
     def __init__(self, wanted: Sequence[str]) -> None:
         super().__init__(EXECUTABLE)
-        self._wanted = ['/' + name.strip('/') for name in wanted]
-        self._watched: dict[str, Watched] = {}
+        self._followed = FollowedControllers(self, wanted, NAMES, depth=1)
+        self._service_clients: dict[str, dict[str, Client]] = {}  # of controllers, by service
         self._selected = 0
         self._notice, self._notice_ends_s = '', 0.0
         self._confirmed_until_s = 0.0  # a second r resets
         self._pending: list[Asked] = []
-        self.create_subscription(DiagnosticArray, topics.DIAGNOSTICS, self._on_diagnostics, 10)
-        self.create_timer(LOOK_S, self._look_for_controllers, clock=self.steady_clock)
-        self._look_for_controllers()
 
     def work(self, executor: SingleThreadedExecutor) -> None:
         """Show controllers until a key or a signal ends it."""
@@ -120,7 +88,7 @@ class MonitorNode(ProcessNode):
                     due_s = time.monotonic() + REFRESH_S
                     self._refresh()
                     live.update(screen(
-                        self._states(), self._selected, self._text_below(), time.monotonic(),
+                        self._states, self._selected, self._text_below(), time.monotonic(),
                         console.width, console.height, blocks,
                     ), refresh=True)
 
@@ -131,74 +99,58 @@ class MonitorNode(ProcessNode):
             if time.monotonic() >= due_s:
                 due_s += LINE_S
                 self._refresh()
-                for state in self._states():
+                for state in self._states:
                     print(plain_line(state, time.monotonic()), file=stream)
-                if not self._watched:
-                    print(self._awaited(), file=stream)
+                if not self._states:
+                    print(self._followed.awaited, file=stream)
                 stream.flush()
 
     def _refresh(self) -> None:
-        for watched in self._watched.values():
-            watched.refresh()
+        self._followed.take_diagnostics()
+        for name, followed in self._followed.by_name.items():
+            # Here already: it takes a moment until a client has found its service.
+            self._clients_of(name)
+            for _ in followed.take():
+                pass  # the state has it
 
-    def _states(self) -> list[ControllerState]:
-        return [watched.state for watched in self._watched.values()]
+    def _clients_of(self, name: str) -> dict[str, Client]:
+        """Clients of the services of a controller, by the last part of their names."""
+        if name not in self._service_clients:
+            self._service_clients[name] = {
+                service: self.create_client(kind, f'{name}/{service}') for service, kind in (
+                    ('freeze_adaptation', SetBool), ('enable_compensation', SetBool),
+                    ('reset_estimates', Trigger), ('save_estimates', Trigger),
+                )
+            }
+        return self._service_clients[name]
 
     def _text_below(self) -> str:
         if time.monotonic() < self._notice_ends_s:
             return self._notice
-        return '' if self._watched else self._awaited()
+        return '' if self._states else self._followed.awaited
 
-    def _awaited(self) -> str:
-        which = ' of ' + ', '.join(self._wanted) if self._wanted else ''
-        return (
-            f'waiting for a controller{which} in ROS_DOMAIN_ID={self.context.get_domain_id()}: '
-            'bringup prints which one it uses'
-        )
-
-    def _is_wanted(self, name: str) -> bool:
-        return not self._wanted or any(
-            name == wanted or name.startswith(f'{wanted.rstrip("/")}/') for wanted in self._wanted
-        )
-
-    def _look_for_controllers(self) -> None:
-        """Whoever publishes what a controller publishes is one."""
-        found = sorted(
-            topic.removesuffix(MARK) for topic, _ in self.get_topic_names_and_types()
-            if topic.endswith(MARK)
-        )
-        for name in found:
-            if name not in self._watched and self._is_wanted(name):
-                self._watched[name] = Watched(self, name)
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            watched = self._watched.get(f'/{status.name}')
-            if watched is not None:
-                watched.state.take_diagnostics(
-                    ord(status.level), status.message,
-                    {pair.key: pair.value for pair in status.values}, time.monotonic(), _clock(),
-                )
+    @property
+    def _states(self) -> list[ControllerState]:
+        return self._followed.states
 
     def _on_key(self, key: str) -> None:
         if key == 'q':
             self.exit_code, self.stopping = DONE, True
-        elif key == '\t' and self._watched:
-            self._selected = (self._selected + 1) % len(self._watched)
+        elif key == '\t' and self._states:
+            self._selected = (self._selected + 1) % len(self._states)
             self._confirmed_until_s = 0.0
-        elif key in ACTIONS and self._watched:
-            self._act(key, list(self._watched.values())[self._selected])
+        elif key in ACTIONS and self._states:
+            self._act(key, self._states[self._selected])
 
-    def _act(self, key: str, watched: Watched) -> None:
+    def _act(self, key: str, state: ControllerState) -> None:
         """Call the service behind a key."""
         service, switch = ACTIONS[key]
-        state = watched.state
         if key == 'r' and time.monotonic() > self._confirmed_until_s:
             self._confirmed_until_s = time.monotonic() + CONFIRM_S
             self._say(f'press r once more to reset the estimates of {state.name}')
             return
         self._confirmed_until_s = 0.0
-        client = watched.clients[service]
+        client = self._clients_of(state.name)[service]
         if not client.service_is_ready():
             self._say(f'{state.name}/{service} is not there')
             return
@@ -226,7 +178,7 @@ class MonitorNode(ProcessNode):
             else:
                 continue
             self._pending.remove(asked)
-            asked.state.note(_clock(), text)
+            asked.state.note(time_of_day(), text)
             self._say(f'{asked.state.name}: {text}')
 
     def _say(self, text: str) -> None:
@@ -238,7 +190,3 @@ ACTIONS = {
     'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
     'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
 }
-
-
-def _clock() -> str:
-    return time.strftime('%H:%M:%S')

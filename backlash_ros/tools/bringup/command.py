@@ -65,6 +65,13 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         '--record', action=argparse.BooleanOptionalAction, default=True,
         help='record a bag and write a report from it',
     )
+    parser.add_argument(
+        '--live', action='store_true',
+        help='show the loop on a page in the browser; its address is printed',
+    )
+    parser.add_argument(
+        '--live-port', type=int, metavar='PORT', help='the same on this port (default: a free one)',
+    )
     return parser.parse_args(arguments)
 
 

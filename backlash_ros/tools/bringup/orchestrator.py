@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import socket
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -41,6 +42,7 @@ from backlash_ros.tools.run_files.results import CONFIG, result_directory
 # Each node takes one of the places that discovery on one machine has; some stay for listeners.
 MOST_AXES = 7
 ESTIMATES = 'estimates.file'
+LARGEST_PORT = 65535
 
 
 def prepare(options: argparse.Namespace) -> RunPlan:
@@ -57,6 +59,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     parameters = {name: _parameters(configuration, name, options) for name in names}
     if options.unlimited and not any(values.word(DRIVER) for values in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
+    live_port = _live_port(options)
     _check_files(parameters)
     for name, values in parameters.items():
         print_warnings(f'bringup: {name}' if name else 'bringup', values)
@@ -71,7 +74,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     out = result_directory(options.out).resolve()
     plan = RunPlan(tuple(
         AxisPlan(name, values, out / name, options.record) for name, values in parameters.items()
-    ), out)
+    ), out, live_port)
     try:
         for axis in plan.axes:
             axis.logs.mkdir(parents=True, exist_ok=True)
@@ -108,6 +111,24 @@ def _parameters(
         error.args = (f'{axis}: {error}' if axis else str(error),)
         raise
     return parameters
+
+
+def _live_port(options: argparse.Namespace) -> int | None:
+    """Port of the page, None without one; raises InputError where it cannot be had."""
+    if options.live_port is None:
+        return 0 if options.live else None
+    port: int = options.live_port
+    if not 0 <= port <= LARGEST_PORT:
+        raise InputError(f'--live-port={port}: must be from 0 (a free one) to {LARGEST_PORT}')
+    try:
+        # As the page will do it.
+        socket.create_server(('127.0.0.1', port)).close()
+    except OSError as error:
+        reason = os.strerror(error.errno or 0)
+        raise InputError(
+            f'--live-port={port}: {reason}: choose another one, or leave it out'
+        ) from None
+    return port
 
 
 def _check_files(parameters: Mapping[str, Parameters]) -> None:

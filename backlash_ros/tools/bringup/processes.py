@@ -55,9 +55,10 @@ class ProcessPlan:
     """What to start.
 
     name: in messages. axis: that its events are about. foreign: no node of this package: all
-    that it prints goes to its log. linger_s: the time that it is left alone when its turn to be
-    stopped has come, because what was stopped before still has an effect on it. farewell_s: the
-    time that it needs for its end beyond what any process gets.
+    that it prints goes to its log. spectator: the run goes on without it. linger_s: the time that
+    it is left alone when its turn to be stopped has come, because what was stopped before still
+    has an effect on it. farewell_s: the time that it needs for its end beyond what any process
+    gets.
     """
 
     name: str
@@ -66,6 +67,7 @@ class ProcessPlan:
     environment: Mapping[str, str]
     axis: str = ''
     foreign: bool = False
+    spectator: bool = False
     linger_s: float = 0.0
     farewell_s: float = 0.0
 

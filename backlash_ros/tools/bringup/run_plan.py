@@ -16,6 +16,7 @@ from backlash_ros.tools.run_files.results import CONFIG
 
 BAG, LOGS = 'bag', 'logs'
 DRIVER, ELSEWHERE = 'driver', 'none'
+LIVE = 'live'
 AXIS_MARK = '{axis}'
 # The last command of the controller acts from the next sample of the driver on.
 LAST_COMMAND_PERIODS, LONGEST_LINGER_S = 2.0, 1.0
@@ -79,10 +80,14 @@ class AxisPlan:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """All that runs together: one loop without a name, or one for each axis."""
+    """All that runs together: one loop without a name, or one for each axis.
+
+    live_port: of the page in the browser, 0 for a free one, None without a page.
+    """
 
     axes: tuple[AxisPlan, ...]
     out: Path
+    live_port: int | None = None
 
     @property
     def endless(self) -> bool:
@@ -142,7 +147,22 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
             if name in nodes:
                 stage.append(nodes[name])
     stages[1] += _drivers(plan, domain)
+    if plan.live_port is not None:
+        stages[-1].append(_page(plan, plan.live_port, domain))
     return stages
+
+
+def _page(plan: RunPlan, port: int, domain: int | None) -> ProcessPlan:
+    """The page in the browser, which shows all axes."""
+    logs = plan.axes[0].logs
+    shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
+    command = (
+        sys.executable, '-m', 'backlash_ros.nodes.live.command', '--port', str(port), *shown
+    )
+    return ProcessPlan(
+        LIVE, command, logs / f'{LIVE}.log', processes.child_environment(logs, domain),
+        plan.axes[0].name, spectator=True,
+    )
 
 
 def _nodes(axis: AxisPlan, environment: Mapping[str, str]) -> dict[str, ProcessPlan]:

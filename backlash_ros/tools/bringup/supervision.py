@@ -148,6 +148,7 @@ class Run:
         self._plan, self._supervisor, self._requests = plan, supervisor, requests
         self._axes = {axis.name: AxisProgress(axis, displays[axis.name]) for axis in plan.axes}
         self._ready: set[str] = set()
+        self._gone: set[str] = set()  # spectators that have died
         self.failure = ''
 
     def has_samples(self, axis: AxisPlan) -> bool:
@@ -270,7 +271,7 @@ class Run:
             self._note(event)
         if self._requests.count and not self._over:
             raise RunError(f'interrupted by {self._requests.last}, stopping')
-        dead = self._supervisor.ended()
+        dead = [child for child in self._supervisor.ended() if not self._may_end(child)]
         if dead:
             raise RunError('\n'.join(
                 f'{child.plan.name} died ({child.describe_exit()}), the end of '
@@ -278,10 +279,25 @@ class Run:
                 for child in dead
             ))
 
+    def _may_end(self, child: Child) -> bool:
+        """Whether the run goes on without it, which is said once."""
+        name = child.plan.name
+        if not child.plan.spectator or name not in self._ready:
+            return False
+        if name not in self._gone:
+            self._gone.add(name)
+            self._axes[child.plan.axis].display.say(
+                f'bringup: {name} died ({child.describe_exit()}), the run goes on without it; the '
+                f'end of {child.end_of_log()}'
+            )
+        return True
+
     def _note(self, event: Event) -> None:
         axis = self._axes[event.plan.axis]
         if event.kind == 'ready':
             self._ready.add(event.plan.name)
+            if 'address' in event.content:
+                print(f'{event.plan.name}: {event.content["address"]}', flush=True)
         elif event.kind == 'done':
             axis.published = counts(event.content, 'published')
         elif event.kind == 'progress':
@@ -312,7 +328,10 @@ class Run:
 
     def _judge_exits(self) -> None:
         """Look at how the processes have ended that were told to."""
-        unclean = [c for c in self._supervisor.children if c.process.returncode != 0]
+        unclean = [
+            c for c in self._supervisor.children
+            if c.process.returncode != 0 and c.plan.name not in self._gone
+        ]
         bad, odd = [], []
         for child in unclean:
             code = child.process.returncode

@@ -1,0 +1,1 @@
+"""`live`: running controllers on a page in the browser."""

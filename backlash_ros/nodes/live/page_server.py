@@ -1,0 +1,103 @@
+"""Serves the page and its stream of server-sent events, to browsers of this machine alone."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+from aiohttp import web
+from aiohttp.typedefs import Handler
+
+PAGE = Path(__file__).with_name('page.html')
+HOST = '127.0.0.1'
+LARGEST_PORT = 65535
+MOST_READERS = 16
+GOODBYE_S = 0.2  # for browsers that do not take what they are sent
+
+
+def bound_socket(port: int) -> socket.socket:
+    """A socket that listens on this port of this machine, 0 for a free one; raises OSError."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    try:
+        # A port that was used a minute ago is free.
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind((HOST, port))
+        bound.listen()
+    except OSError:
+        bound.close()
+        raise
+    return bound
+
+
+@web.middleware
+async def for_this_machine(request: web.Request, handler: Handler) -> web.StreamResponse:
+    """Refuse whoever came here by another name."""
+    # A page from elsewhere may let a name of its own point here, and read along.
+    if request.host.partition(':')[0] not in (HOST, 'localhost'):
+        raise web.HTTPForbidden(text=f'only {HOST} is served\n')
+    return await handler(request)
+
+
+class PageServer:
+    """Sends every reader what is new, at the pace that it takes it.
+
+    Nothing is queued for a reader: it has its place in the history, and when it has taken one
+    frame it gets the next with all that has been added, as far back as the history goes.
+
+    frame: what a reader gets that has everything before a portion, and the number of the portion
+    that it needs next.
+    """
+
+    def __init__(self, bound: socket.socket, frame: Callable[[int], tuple[str, int]]) -> None:
+        self._socket, self._frame = bound, frame
+        self._renewed = asyncio.Condition()
+        self._readers = 0
+        application = web.Application(middlewares=[for_this_machine])
+        application.router.add_get('/', self._page)
+        application.router.add_get('/events', self._events)
+        self._runner = web.AppRunner(
+            application, access_log=None, handle_signals=False, shutdown_timeout=GOODBYE_S
+        )
+
+    async def start(self) -> None:
+        """Begin to serve."""
+        await self._runner.setup()
+        await web.SockSite(self._runner, self._socket).start()
+
+    async def renew(self) -> None:
+        """Send every reader that waits what is new."""
+        async with self._renewed:
+            self._renewed.notify_all()
+
+    async def stop(self) -> None:
+        """End all streams."""
+        await self._runner.cleanup()
+
+    async def _page(self, request: web.Request) -> web.StreamResponse:
+        return web.Response(
+            text=PAGE.read_text(encoding='utf-8'), content_type='text/html',
+            headers={'Cache-Control': 'no-store'},
+        )
+
+    async def _events(self, request: web.Request) -> web.StreamResponse:
+        if self._readers >= MOST_READERS:
+            raise web.HTTPServiceUnavailable(text=f'{MOST_READERS} pages are open already\n')
+        response = web.StreamResponse(
+            headers={'Content-Type': 'text/event-stream', 'Cache-Control': 'no-store'}
+        )
+        self._readers += 1
+        try:
+            await response.prepare(request)
+            known = 0
+            while True:
+                text, known = self._frame(known)
+                # Waits here, and here alone, for a browser that is slow.
+                await response.write(f'data: {text}\n\n'.encode())
+                async with self._renewed:
+                    await self._renewed.wait()
+        except ConnectionResetError:
+            return response  # the page was closed
+        finally:
+            self._readers -= 1

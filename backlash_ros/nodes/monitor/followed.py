@@ -1,0 +1,105 @@
+"""Controllers that are there: found by what they publish, their state, their newest messages."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+
+from diagnostic_msgs.msg import DiagnosticArray
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.nodes.monitor.state import NAMES, ControllerState
+from backlash_ros.nodes.runtime.inbox import Inbox
+from backlash_ros.nodes.runtime.spin import ProcessNode
+
+LOOK_S = 1.0  # between two looks for further controllers
+STATUSES = 100  # of all nodes of the domain that may wait: some robots have many
+MARK = topics.of_node(topics.watched(NAMES[0])).removeprefix('~')  # of a controller
+
+
+class Followed:
+    """State of one controller, and its messages below `controller/watch`.
+
+    labels: which of these, m, c_r and c_l among them. depth: how many of each may wait.
+    """
+
+    def __init__(self, node: ProcessNode, name: str, labels: Sequence[str], depth: int) -> None:
+        self.state = ControllerState(name)
+        self._inboxes = {
+            label: Inbox(node, Float64, name + topics.of_node(topics.watched(label))[1:], depth)
+            for label in labels
+        }
+
+    def take(self) -> Iterator[tuple[str, int, float]]:
+        """What has come: label, time of arrival [ns], value; m, c_r and c_l go to the state."""
+        for label, inbox in self._inboxes.items():
+            for message, info in inbox.take_all():
+                if label in NAMES:
+                    self.state.take_estimate(label, message.data)
+                yield label, info['received_timestamp'], message.data
+
+
+class FollowedControllers:
+    """Every controller of the domain, or those of some namespaces, by name.
+
+    wanted: names of controllers or namespaces, none for all. labels, depth: see Followed.
+    Messages are taken when somebody looks: nothing wakes up for each of them.
+    """
+
+    def __init__(
+        self, node: ProcessNode, wanted: Sequence[str], labels: Sequence[str], depth: int,
+    ) -> None:
+        self._node, self._labels, self._depth = node, labels, depth
+        self._wanted = ['/' + name.strip('/') for name in wanted]
+        self.by_name: dict[str, Followed] = {}
+        self._diagnostics = Inbox(node, DiagnosticArray, topics.DIAGNOSTICS, STATUSES)
+        node.create_timer(LOOK_S, self._look, clock=node.steady_clock)
+        self._look()
+
+    @property
+    def states(self) -> list[ControllerState]:
+        """What is known of each."""
+        return [followed.state for followed in self.by_name.values()]
+
+    @property
+    def awaited(self) -> str:
+        """What is waited for while there is none."""
+        which = ' of ' + ', '.join(self._wanted) if self._wanted else ''
+        domain = self._node.context.get_domain_id()
+        return (
+            f'waiting for a controller{which} in ROS_DOMAIN_ID={domain}: '
+            'bringup prints which one it uses'
+        )
+
+    def take_diagnostics(self) -> None:
+        """Take in what has been said of the controllers."""
+        for message, _ in self._diagnostics.take_all():
+            for status in message.status:
+                followed = self.by_name.get(f'/{status.name}')
+                if followed is not None:
+                    followed.state.take_diagnostics(
+                        ord(status.level), status.message,
+                        {pair.key: pair.value for pair in status.values},
+                        time.monotonic(), time_of_day(),
+                    )
+
+    def _look(self) -> None:
+        """Whoever publishes what a controller publishes is one."""
+        found = sorted(
+            topic.removesuffix(MARK) for topic, _ in self._node.get_topic_names_and_types()
+            if topic.endswith(MARK)
+        )
+        for name in found:
+            if name not in self.by_name and self._is_wanted(name):
+                self.by_name[name] = Followed(self._node, name, self._labels, self._depth)
+
+    def _is_wanted(self, name: str) -> bool:
+        return not self._wanted or any(
+            name == wanted or name.startswith(f'{wanted.rstrip("/")}/') for wanted in self._wanted
+        )
+
+
+def time_of_day() -> str:
+    """Hours, minutes and seconds, for events."""
+    return time.strftime('%H:%M:%S')
