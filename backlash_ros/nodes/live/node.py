@@ -75,8 +75,9 @@ class LiveNode(ProcessNode):
             for name, followed in self._followed.by_name.items()
         })
         now_s = time.monotonic()
+        states = sorted(self._followed.states, key=lambda state: state.name)
         self._states = json.dumps(
-            [content_of(state, now_s) for state in self._followed.states],
+            [content_of(state, now_s) for state in states],
             separators=(',', ':'), allow_nan=False,
         )
 
