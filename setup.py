@@ -15,7 +15,7 @@ setup(
     maintainer_email='maintainers@example.org',
     license='Apache-2.0',
     packages=find_packages(exclude=['test*']),
-    package_data={PACKAGE: ['loopback.xml']},
+    package_data={PACKAGE: ['loopback.xml', 'network.xml']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
@@ -30,7 +30,10 @@ setup(
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
     install_requires=['matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm'],
-    extras_require={'test': ['hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout']},
+    extras_require={
+        'cluster': ['distributed'],
+        'test': ['distributed', 'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout'],
+    },
     entry_points={
         'console_scripts': [
             f'controller = {PACKAGE}.nodes.controller:main',

@@ -75,7 +75,7 @@ def main() -> None:
         parser.add_argument(f'--{name}', type=float, default=0.0)
     options = parser.parse_args()
     with contextlib.suppress(PermissionError):  # a cable does not wait for a processor
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(2))
     chance = random.Random(0)
     first, second = map(tap, ENDS)
     lanes = [

@@ -22,6 +22,8 @@ ADDRESSES = ('10.77.0.1', '10.77.0.2')  # known within the two namespaces alone
 COMMAND_S = 20.0  # for a command of `ip`
 # Each host has its own memory, too: Fast DDS takes what is shared for the same host.
 OWN_MEMORY = ('sh', '-c', 'mount -t tmpfs tmpfs /dev/shm && exec "$@"', 'sh')
+# What else runs here is no part of the network: as docs/deployment.md says under Priority.
+FIRST = ('chrt', '-f', '1')
 
 
 class Cable(NamedTuple):
@@ -41,7 +43,7 @@ class Host(NamedTuple):
 
     def command(self, *command: str) -> list[str]:
         """The command as one that runs on this host."""
-        return ['ip', 'netns', 'exec', self.namespace, *OWN_MEMORY, *command]
+        return ['ip', 'netns', 'exec', self.namespace, *FIRST, *OWN_MEMORY, *command]
 
     def set_link(self, state: str) -> None:
         """Pull the cable, 'down', or plug it in again, 'up'."""

@@ -22,7 +22,7 @@ from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
-from linked_hosts import Cable, Host, linked_hosts, why_not
+from linked_hosts import FIRST, Cable, Host, linked_hosts, why_not
 from reporting import ROOT, machine, markdown_table, text_table
 
 from backlash_ros.tools.processes import free_domain, with_source
@@ -109,7 +109,7 @@ def driver(host: Host | None, domain: int, log: Path) -> Iterator[None]:
     command = [sys.executable, str(DRIVER)]
     with log.open('wb') as out:
         process = subprocess.Popen(
-            command if host is None else host.command(*command), stdin=subprocess.DEVNULL,
+            [*FIRST, *command] if host is None else host.command(*command), stdin=subprocess.DEVNULL,
             stdout=out, stderr=out, env=environment(domain, host.peer if host else ''),
         )
         try:
@@ -141,7 +141,7 @@ def run(case: Case, duration_s: float, folder: Path) -> Row:
         here = hosts[1]
         with (folder / 'bringup.log').open('wb') as log:
             process = subprocess.Popen(
-                command if here is None else here.command(*command), stdin=subprocess.DEVNULL,
+                [*FIRST, *command] if here is None else here.command(*command), stdin=subprocess.DEVNULL,
                 stdout=log, stderr=log, cwd=folder,
                 env=environment(domain, here.peer if here else ''),
             )

@@ -16,6 +16,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.files import write_atomically
 from backlash_ros.tools import batch, command_line
 from backlash_ros.tools.batch import Job, Outcome
+from backlash_ros.tools.cluster import run_on_cluster
 from backlash_ros.tools.command_line import (
     DEFAULT_DURATION_S,
     format_table,
@@ -52,6 +53,11 @@ def _parser() -> argparse.ArgumentParser:
         '--sweep', action='append', default=[], metavar='KEY=v1,v2,...',
         help='run every value of a parameter; given again, every combination',
     )
+    parser.add_argument(
+        '--cluster', metavar='ADDRESS',
+        help='let the workers of this Dask scheduler (tcp://HOST:PORT) do the runs of --seeds and '
+             "--sweep; needs pip install 'backlash_ros[cluster]'",
+    )
     return parser
 
 
@@ -63,6 +69,8 @@ def _simulate(args: Sequence[str] | None) -> None:
     if options.seeds is not None and options.seeds < 1:
         raise InputError(f'--seeds={options.seeds} must be >= 1')
     if options.seeds is None and not options.sweep:
+        if options.cluster is not None:
+            raise InputError('--cluster does many runs: give --seeds or --sweep as well')
         _once(parameters, options.duration, options.out)
     else:
         _many(parameters, options)
@@ -114,7 +122,8 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     seeds = range(first, first + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
     _refuse_bad(options.out)
-    outcomes = batch.run_jobs(jobs, label='simulate')
+    outcomes = batch.run_jobs(jobs, label='simulate') if options.cluster is None \
+        else run_on_cluster(jobs, options.cluster, label='simulate')
     directory = result_directory(options.out)
     write_config(parameters, directory / CONFIG)
     csv = directory / (SWEEP if swept else SEEDS)
