@@ -1,4 +1,4 @@
-"""`simulate --cluster`: the same runs on the workers of a Dask cluster, whatever becomes of them."""
+"""`simulate --cluster`: the same runs on a Dask cluster, whatever becomes of its workers."""
 
 from __future__ import annotations
 
