@@ -16,7 +16,8 @@ setup(
     license='Apache-2.0',
     packages=find_packages(exclude=['test*']),
     package_data={
-        f'{PACKAGE}.middleware': ['loopback.xml'], f'{PACKAGE}.nodes.live': ['page.html'],
+        f'{PACKAGE}.middleware': ['loopback.xml', 'network.xml'],
+        f'{PACKAGE}.nodes.live': ['page.html'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
@@ -34,9 +35,13 @@ setup(
     install_requires=[
         'aiohttp', 'matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm',
     ],
-    extras_require={'test': [
-        'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-rerunfailures', 'pytest-timeout',
-    ]},
+    extras_require={
+        'cluster': ['distributed'],
+        'test': [
+            'distributed', 'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-rerunfailures',
+            'pytest-timeout',
+        ],
+    },
     entry_points={
         'console_scripts': [
             f'controller = {PACKAGE}.nodes.controller:main',

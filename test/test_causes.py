@@ -44,6 +44,10 @@ CASES: list[tuple[dict[str, Any], Level, str]] = [
     ({'intervals_s': (0.02, 0.02, 0.02)}, Level.WARN,
      'plant_output comes at 50 Hz, sample_period is 0.005 s (200 Hz): correct one of them'),
     ({'intervals_s': (0.0001, 0.0025, 0.0026)}, Level.WARN, 'plant_output comes at 400 Hz'),
+    ({'age_s': 0.05}, Level.WARN,
+     'plant_output comes 50 ms after its stamp: set both clocks (chrony, PTP) or shorten the way'),
+    ({'age_s': -0.05}, Level.WARN,
+     'plant_output comes 50 ms before its stamp: set both clocks (chrony, PTP)'),
     ({'late': 60}, Level.WARN, '10 % of control came too late: relieve the machine'),
     ({'lost': 66}, Level.WARN, '9.91 % of plant_output was lost on its way'),
     ({'lost': 66, 'unsent': 66}, Level.WARN, '9.91 % of plant_output was never sent'),
@@ -233,3 +237,7 @@ def test_texts_with_names_of_usual_length_are_complete() -> None:
     for changes, *_ in CASES:
         for finding in findings_of(replace(WELL, **changes)):
             assert not finding.text.endswith('…')
+
+
+def test_messages_that_are_under_way_for_a_moment_are_no_matter() -> None:
+    assert first(replace(WELL, age_s=0.0004)).kind == 'learned'

@@ -10,7 +10,13 @@ from ros_processes import ros_world
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.middleware.loopback import OF_THE_FOLDER, PROFILE, VARIABLE, prefer_loopback
+from backlash_ros.middleware.loopback import (
+    NETWORK_PROFILE,
+    OF_THE_FOLDER,
+    PROFILE,
+    VARIABLE,
+    prefer_loopback,
+)
 from backlash_ros.tools.bringup.processes import DOMAIN_0_PORT, PORTS_PER_DOMAIN
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
@@ -30,9 +36,12 @@ def test_profile_is_taken_where_nobody_else_is_to_be_met() -> None:
     assert PROFILE.is_file()
 
 
-@pytest.mark.parametrize('environment', [
-    {}, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, {**HERE, 'ROS_STATIC_PEERS': '192.168.0.2'},
-])
+def test_named_machines_are_reached_with_the_profile_of_the_network() -> None:
+    assert chosen({**HERE, 'ROS_STATIC_PEERS': '192.168.0.2'}) == str(NETWORK_PROFILE)
+    assert NETWORK_PROFILE.is_file()
+
+
+@pytest.mark.parametrize('environment', [{}, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}])
 def test_other_machines_stay_within_reach(environment: dict[str, str]) -> None:
     assert chosen(environment) is None
 

@@ -20,10 +20,14 @@ from backlash_ros.tools.report import command as report
 class StandIn:
     """Speaks the topics of ros2_control in front of a PacedDriver.
 
-    Every state is stamped with the time of the sample and leaves some time later.
+    Every state is stamped with the time of the sample and leaves some time later. clock_ns: by how
+    much its clock is ahead.
     """
 
-    def __init__(self, world: RosWorld, field: str, names: list[str], best_effort: bool) -> None:
+    def __init__(
+        self, world: RosWorld, field: str, names: list[str], best_effort: bool, clock_ns: int = 0,
+    ) -> None:
+        self._clock_ns = clock_ns
         probe = world.probe()
         self.driver = driver = PacedDriver(probe)
         probe.node.create_subscription(
@@ -51,7 +55,7 @@ class StandIn:
         self.driver.controls.append(Float64(data=v))
 
     def _send(self, k: int, y: float) -> list[float]:
-        now_ns = self.driver.probe.node.get_clock().now().nanoseconds
+        now_ns = self.driver.probe.node.get_clock().now().nanoseconds + self._clock_ns
         message = JointState(header=Header(stamp=Time(
             sec=now_ns // 10**9, nanosec=now_ns % 10**9
         )), name=self._names)
@@ -103,6 +107,17 @@ def test_the_loop_through_ros2_control_is_recorded_and_reported(tmp_path: Path) 
     assert report.main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) == 0
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
     assert summary['final']['m'] == pytest.approx(1.3, rel=0.02)
+
+
+@pytest.mark.parametrize(('clock_ms', 'said'), [(50, 'before its stamp'), (-50, 'after its stamp')])
+def test_a_driver_with_another_clock_is_told(tmp_path: Path, clock_ms: int, said: str) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {'io.style': 'ros2_control'})
+        stand_in = StandIn(world, 'position', ['axle'], False, clock_ns=clock_ms * 10**6)
+        stand_in.meet()
+        driver = stand_in.driver
+        driver.run_until(lambda: driver.says(said), 'a word about the clock')
+        assert controller.stop() == 0
 
 
 def test_a_joint_that_is_not_there_is_told(tmp_path: Path) -> None:

@@ -2,8 +2,11 @@
 
 By itself Fast DDS 2.14 takes shared memory, which a process that is killed may leave in disorder:
 others do not hear its successor, or end with a segmentation fault. What a reader misses it sends
-again after 3 s only. With the profile beside this file messages go by UDP over the loopback
-device, which a killed process cannot damage, and are soon repeated.
+again after 3 s only. With loopback.xml messages go by UDP over the loopback device, which a killed
+process cannot damage, and are soon repeated.
+
+With ROS_STATIC_PEERS, where other machines take part, network.xml has lost messages repeated within
+milliseconds.
 """
 
 from __future__ import annotations
@@ -12,18 +15,17 @@ from collections.abc import MutableMapping
 from pathlib import Path
 
 PROFILE = Path(__file__).with_suffix('.xml')
+NETWORK_PROFILE = PROFILE.with_stem('network')
 VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 OF_THE_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'  # read by Fast DDS from the working directory
 
 
 def prefer_loopback(environment: MutableMapping[str, str]) -> None:
-    """Choose the profile, before rclpy.init, if nobody elsewhere is to be met.
+    """Choose a profile, before rclpy.init, if nobody else or named machines alone are to be met.
 
     A profile of the user's own stays in force.
     """
-    alone = (
-        environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == 'LOCALHOST'
-        and not environment.get('ROS_STATIC_PEERS')
-    )
-    if alone and not Path(OF_THE_FOLDER).exists():
-        environment.setdefault(VARIABLE, str(PROFILE))
+    confined = environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == 'LOCALHOST'
+    if confined and not Path(OF_THE_FOLDER).exists():
+        alone = not environment.get('ROS_STATIC_PEERS')
+        environment.setdefault(VARIABLE, str(PROFILE if alone else NETWORK_PROFILE))

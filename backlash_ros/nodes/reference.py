@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
@@ -19,11 +20,15 @@ from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.runtime.declare import LiveParameters
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.events import emit
+from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
 from backlash_ros.nodes.runtime.spin import ProcessNode, run
 
 LONGEST_SLEEP_S = 0.05  # so that signals and requests are noticed
+# The loop runs so long, as the controller tells, before outputs that do not come here are given up.
+UNHEARD_S = 0.5
+SAMPLES = 'samples'  # their count in /diagnostics
 
 
 class ReferenceNode(ProcessNode):
@@ -45,6 +50,8 @@ class ReferenceNode(ProcessNode):
         self._started = False
         self._io = DriverIo(self, p)
         self._counter = SampleCounter(self._sample_period)
+        self._diagnostics: Inbox | None = None  # while no output was heard
+        self._loop_runs_at: float | None = None  # when that was seen [s]
         self._message = Float64()
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, KEPT if self._lockstep else DEPTH
@@ -83,6 +90,8 @@ class ReferenceNode(ProcessNode):
         pace = self._pace
         while not self.stopping:
             now = time.monotonic()
+            if self._diagnostics is not None:
+                self._look_for_loop(self._diagnostics, now)
             remaining = max(pace.look_s(now) - now, 0.0)
             if not pace.listens(now):
                 if remaining < LONGEST_SLEEP_S:
@@ -98,6 +107,32 @@ class ReferenceNode(ProcessNode):
             elif pace.listens(now):
                 # It is late, and y_m leaves as soon as it is there.
                 executor.spin_once(timeout_sec=min(remaining, LONGEST_SLEEP_S))
+
+    def _look_for_loop(self, diagnostics: Inbox, now: float) -> None:
+        """Go by the own clock where the loop runs and its outputs do not come here.
+
+        Fast DDS may miss a process of another machine for good that starts at the same moment.
+        """
+        if self._pace.waits:
+            if any(self._tells_of_samples(message) for message, _ in diagnostics.take_all()):
+                self._loop_runs_at = self._loop_runs_at or now
+            if self._loop_runs_at is None or now < self._loop_runs_at + UNHEARD_S:
+                return
+            self._pace.wait_no_longer()
+            self.log.warning(
+                f'{self._io.topics.output} is not heard here, but by the controller: y_m goes by '
+                'the own clock; start the driver some seconds before'
+            )
+        diagnostics.close()
+        self._diagnostics = None
+
+    def _tells_of_samples(self, message: DiagnosticArray) -> bool:
+        """Whether the controller of this loop has used any."""
+        loop = self.settings.word('io.joint') or self.resolve_topic_name(self._io.topics.control)
+        return any(
+            value.key == SAMPLES and value.value != '0'
+            for status in message.status if status.hardware_id == loop for value in status.values
+        )
 
     def _take_up(self, p: Parameters) -> None:
         """Use another signal from the next sample on; a sine goes on without a jump."""
@@ -115,6 +150,8 @@ class ReferenceNode(ProcessNode):
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         else:
             self._io.listen(self._on_output, depth=1)
+            if self._pace.waits:
+                self._diagnostics = Inbox(self, DiagnosticArray, topics.DIAGNOSTICS, 10)
         emit('ready')
 
     def _on_clock(self, message: Clock) -> None:

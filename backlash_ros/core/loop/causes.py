@@ -19,6 +19,7 @@ UNEXPLAINED = 0.05  # share of m times the gap from which on unexplained motion 
 LIMITED = 0.5  # share of limited commands that leaves too little motion
 UNNAMED = 'a node without a name'
 STILL_SAMPLES = 20  # equal values of y in a row, while v moves on
+SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
 # A contradiction between y and G(z) that lasts longer is not put down to late or lost samples [s].
 PATIENCE_S = 3.0
 
@@ -95,6 +96,7 @@ class LoopFigures:
     referred: bool = True  # whether a y_m has come
     reference_silent_s: float = 0.0
     intervals_s: tuple[float, float, float] = (nan, nan, nan)
+    age_s: float = nan  # median time from the stamp of y to its arrival, nan while not known
     used: int = 0
     without_reference: int = 0
     lost: int = 0
@@ -305,6 +307,14 @@ def _timing(f: LoopFigures) -> list[Finding]:
         found.append(Finding(
             Level.WARN, 'rate', f'{f.output.name} comes at {rate:.3g} Hz, sample_period is '
             f'{f.sample_period:g} s ({1.0 / f.sample_period:.3g} Hz): correct one of them',
+        ))
+    if abs(f.age_s) > SKEW * f.sample_period:
+        age = f'{1e3 * abs(f.age_s):.3g} ms'
+        cure = 'set both clocks (chrony, PTP)'
+        found.append(Finding(
+            Level.WARN, 'clock', f'{f.output.name} comes {age} before its stamp: {cure}'
+            if f.age_s < 0.0 else
+            f'{f.output.name} comes {age} after its stamp: {cure} or shorten the way', lasting=True,
         ))
     if f.late > TROUBLE * f.used:
         found.append(Finding(

@@ -138,7 +138,7 @@ class ControlLoop:
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """The same for a sample that was counted already, with the reference that belongs to it."""
         statistics = self.statistics
-        statistics.note_arrival(output.stamp_ns)
+        statistics.note_arrival(output.stamp_ns, output.received_ns)
         if self.standing_down:
             return None
         if not arrival.is_sample:

@@ -33,15 +33,18 @@ class LoopStatistics:
     still_swing: float = 0.0  # how far v has moved meanwhile
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
     _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MOST + 1))
+    _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=MOST))
     _y: float = nan
     _v_low: float = inf
     _v_high: float = -inf
     _still_low: float = inf
     _still_high: float = -inf
 
-    def note_arrival(self, stamp_ns: int) -> None:
-        """Note a message of y, whatever it is worth."""
+    def note_arrival(self, stamp_ns: int, received_ns: int) -> None:
+        """Note a message of y, whatever it is worth: when it left and when it came."""
         self._stamps_ns.append(stamp_ns)
+        if received_ns > 0:  # else the middleware does not tell
+            self._ages_s.append((received_ns - stamp_ns) * 1e-9)
 
     def note(self, y: float, v: float, limited: bool, latency: float) -> None:
         """Count an output and the command that it brought."""
@@ -82,6 +85,13 @@ class LoopStatistics:
         tenth = len(intervals) // 10
         mean = sum(intervals) / len(intervals)
         return 1e-9 * intervals[tenth], 1e-9 * mean, 1e-9 * intervals[-1 - tenth]
+
+    def age_s(self) -> float:
+        """Median of the newest times from stamp to arrival [s]; nan while few.
+
+        Negative where the clock of the driver is ahead of the one of this machine.
+        """
+        return float(np.median(self._ages_s)) if len(self._ages_s) >= FEWEST else nan
 
     def swing(self) -> float:
         """Swing of v since the last call."""

@@ -46,6 +46,15 @@ class ReferencePace:
         self._heard = self._fresh = True
         self._heard_s = at_s
 
+    @property
+    def waits(self) -> bool:
+        """Whether y_m(0) is repeated until an output comes."""
+        return self._begins_with_output and not self._heard
+
+    def wait_no_longer(self) -> None:
+        """Go by the own clock although no output has come."""
+        self._begins_with_output = False
+
     def listens(self, now_s: float) -> bool:
         """Whether it is time to look for an output, and to wait for one if none is there."""
         return now_s >= self._due_s

@@ -96,6 +96,8 @@ class Diagnosis:
             reference_silent_s=timeout if overdue else 0.0,
             # In lockstep the outputs come as fast as the machine goes.
             intervals_s=(nan, nan, nan) if p.flag('lockstep') else statistics.intervals_s(),
+            # Stamps of simulated time have nothing to do with the time of arrival.
+            age_s=nan if p.flag('lockstep') or io.simulated_time else statistics.age_s(),
             still=statistics.still,
             v_swing=statistics.still_swing / gap if gap > 0.0 else 0.0,
             **lately,

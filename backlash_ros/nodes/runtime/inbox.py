@@ -24,7 +24,7 @@ class Inbox:
     """
 
     def __init__(self, node: Node, message_type: type[Any], topic: str, depth: int) -> None:
-        self._type = message_type
+        self._type, self._node = message_type, node
         untyped: Any = Polled
         self._subscription = node.create_subscription(
             message_type, topic, lambda _: None, depth, callback_group=untyped()
@@ -39,3 +39,7 @@ class Inbox:
         """Message and info (time stamps, number) of all that have arrived, oldest first."""
         while (taken := self._subscription.handle.take_message(self._type, False)) is not None:
             yield taken
+
+    def close(self) -> None:
+        """Take no more."""
+        self._node.destroy_subscription(self._subscription)

@@ -27,6 +27,7 @@ from backlash_ros.tools.pages.html_page import relative_error
 from backlash_ros.tools.run_files.results import BACKLASH, CONFIG, result_directory, write_table
 from backlash_ros.tools.simulate import batch
 from backlash_ros.tools.simulate.batch import Job, Outcome
+from backlash_ros.tools.simulate.cluster import run_on_cluster
 from backlash_ros.tools.simulate.simulation import run_loop
 
 SEEDS, SWEEP, SWEEP_FIGURE = 'seeds.csv', 'sweep.csv', 'sweep.png'
@@ -54,6 +55,11 @@ def make_parser() -> argparse.ArgumentParser:
         '--sweep', action='append', default=[], metavar='KEY=v1,v2,...',
         help='run every value of a parameter; given again, every combination',
     )
+    parser.add_argument(
+        '--cluster', metavar='ADDRESS',
+        help='let the workers of this Dask scheduler (tcp://HOST:PORT) do the runs of --seeds and '
+             "--sweep; needs pip install 'backlash_ros[cluster]'",
+    )
     return parser
 
 
@@ -65,6 +71,8 @@ def _simulate(args: Sequence[str] | None) -> None:
     if options.seeds is not None and options.seeds < 1:
         raise InputError(f'--seeds={options.seeds} must be >= 1')
     if options.seeds is None and not options.sweep:
+        if options.cluster is not None:
+            raise InputError('--cluster does many runs: give --seeds or --sweep as well')
         _once(parameters, options.duration, options.out)
     else:
         _many(parameters, options)
@@ -116,7 +124,8 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     seeds = range(first, first + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
     _refuse_bad(options.out)
-    outcomes = batch.run_jobs(jobs, label='simulate')
+    outcomes = batch.run_jobs(jobs, label='simulate') if options.cluster is None \
+        else run_on_cluster(jobs, options.cluster, label='simulate')
     directory = result_directory(options.out)
     write_config(parameters, directory / CONFIG)
     csv = directory / (SWEEP if swept else SEEDS)

@@ -1,0 +1,135 @@
+"""`simulate --cluster`: the same runs on a Dask cluster, whatever becomes of its workers."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from backlash_ros.tools.bringup.processes import with_source
+from backlash_ros.tools.simulate import cluster as tools_cluster
+from backlash_ros.tools.simulate.command import SEEDS, main
+
+HERE = '127.0.0.1'
+RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
+DEADLINE_S = 60.0
+# Nothing listens beyond this machine.
+ON_THIS_MACHINE = ['--host', HERE, '--port', '0', '--no-dashboard']
+
+
+def wait_for(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
+        time.sleep(0.02)
+
+
+class Cluster:
+    """A scheduler and two workers as processes."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._stack = stack
+        file = folder / 'scheduler.json'
+        self._start('dask_scheduler', *ON_THIS_MACHINE, '--scheduler-file', str(file))
+        wait_for(file.exists, 'scheduler')
+        wait_for(lambda: file.read_text().endswith('}'), 'address of the scheduler')
+        self.address: str = json.loads(file.read_text())['address']
+        # Without a nanny, which would start a killed worker anew.
+        self.workers = {
+            name: self._start(
+                'dask_worker', self.address, '--host', HERE, '--no-dashboard', '--no-nanny',
+                '--nthreads', '1', '--name', name, '--local-directory', str(folder),
+            ) for name in ('first', 'second')
+        }
+
+    def _start(self, program: str, *arguments: str) -> subprocess.Popen[bytes]:
+        process = subprocess.Popen(
+            [sys.executable, '-m', f'distributed.cli.{program}', *arguments],
+            env=with_source({**os.environ, 'OMP_NUM_THREADS': '1'}),
+            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )
+        self._stack.callback(process.wait, DEADLINE_S)
+        self._stack.callback(process.kill)
+        return process
+
+    def runs_of(self, name: str) -> list[str]:
+        """What the worker has to do at present."""
+        from distributed import Client
+        with Client(self.address, set_as_default=False) as client:
+            workers = client.scheduler_info()['workers']
+            return [
+                key for worker, keys in client.processing().items()
+                if worker in workers and workers[worker]['name'] == name for key in keys
+            ]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    pytest.importorskip('distributed')
+    with ExitStack() as stack:
+        yield Cluster(tmp_path, stack)
+
+
+def test_killed_worker_loses_no_run_and_no_bit(cluster: Cluster, tmp_path: Path) -> None:
+    remote, local = tmp_path / 'remote', tmp_path / 'local'
+    simulation = subprocess.Popen(
+        [sys.executable, '-m', 'backlash_ros.tools.simulate', *RUNS, '--out', str(remote),
+         '--cluster', cluster.address],
+        env=with_source(os.environ), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )
+    try:
+        wait_for(lambda: cluster.runs_of('first'), 'runs of the worker')
+        os.kill(cluster.workers['first'].pid, signal.SIGKILL)
+        assert main([*RUNS, '--out', str(local)]) == 0
+        said, _ = simulation.communicate(timeout=DEADLINE_S)
+    finally:
+        simulation.kill()
+        simulation.wait()
+    assert simulation.returncode == 0, said
+    assert (remote / SEEDS).read_bytes() == (local / SEEDS).read_bytes()
+
+
+def test_worker_with_other_libraries_is_refused(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(tools_cluster, 'NUMERICS', ('numpy',))
+    assert main([*RUNS, '--cluster', cluster.address]) == 2
+    assert 'install the same versions' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('address', 'cure'), [
+    (f'tcp://{HERE}:1', 'dask scheduler'), ('nonsense://x', 'dask scheduler'),
+])
+def test_missing_scheduler_is_told_in_one_line(
+    address: str, cure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    pytest.importorskip('distributed')
+    monkeypatch.setattr(tools_cluster, 'ANSWER_S', 0.3)
+    assert main([*RUNS, '--cluster', address]) == 2
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1
+    assert f'--cluster {address}: ' in said
+    assert cure in said
+
+
+def test_missing_dask_is_told_with_the_cure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    assert main([*RUNS, '--cluster', 'tcp://x:1']) == 2
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1
+    assert "pip install 'backlash_ros[cluster]'" in said
+
+
+def test_one_run_needs_no_cluster(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['--cluster', 'tcp://x:1']) == 2
+    assert '--seeds' in capsys.readouterr().err

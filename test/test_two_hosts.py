@@ -1,0 +1,32 @@
+"""The loop between two hosts, which are network namespaces of this machine."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
+
+from linked_hosts import Cable, linked_hosts, why_not
+from two_hosts import Case, run
+
+
+@pytest.fixture(scope='module', autouse=True)
+def _needs_namespaces() -> None:
+    if reason := why_not():
+        pytest.skip(reason)
+
+
+def test_backlash_is_learned_from_a_driver_on_another_host(tmp_path: Path) -> None:
+    row = run(Case('cable', cable=Cable(delay_ms=0.5, loss_percent=1.0)), 6.0, tmp_path)
+    assert row.learned_s < 5.0
+    assert row.samples > 1000
+
+
+def test_hosts_are_gone_afterwards() -> None:
+    with linked_hosts() as hosts:
+        names = {host.namespace for host in hosts}
+        assert names <= {path.name for path in Path('/run/netns').iterdir()}
+    assert not names & {path.name for path in Path('/run/netns').iterdir()}
