@@ -9,12 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.command_history import (
-    CONSISTENT,
-    CommandHistory,
-    ReportUse,
-    report_use,
-)
+from backlash_ros.core.report_use import CONSISTENT, ReportUse, report_use
+from backlash_ros.nodes.command_history import CommandHistory
 from backlash_ros.nodes.sample_counter import Arrival, SampleCounter
 
 PERIOD_S, PERIOD_NS = 0.01, 10_000_000

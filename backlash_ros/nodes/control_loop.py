@@ -20,8 +20,9 @@ from backlash_ros.core.estimation.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.last_command import last_commands
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.report_use import report_use
 from backlash_ros.core.state_model import StateModel
-from backlash_ros.nodes.command_history import CommandHistory, report_use
+from backlash_ros.nodes.command_history import CommandHistory
 from backlash_ros.nodes.driver_io import Output
 from backlash_ros.nodes.loop_statistics import LoopStatistics
 from backlash_ros.nodes.sample_counter import Arrival, SampleCounter

@@ -16,8 +16,8 @@ from backlash_ros.core.estimation.record_description import RecordFit
 from backlash_ros.core.estimation.record_fit import fit_record
 from backlash_ros.core.identification.intervals import REPORTED, v_of_intervals
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.report_use import ReportUse, report_use
 from backlash_ros.core.transfer_function import TransferFunction
-from backlash_ros.nodes.command_history import ReportUse, report_use
 from backlash_ros.nodes.driver_findings import (
     FITS,
     UNKNOWN,
