@@ -89,6 +89,14 @@ def test_rounding_alone_is_no_reason_for_a_further_pole(
     assert found.denominator == pytest.approx(case.denominator, abs=1e-9)
 
 
+def test_delays_that_contradict_each_other_where_each_is_sure_leave_the_gentler_one() -> None:
+    # By its deviations alone, each of four delays tells all of G.
+    case = random_case(1042)
+    found = identify(case.v, case.y, case.period, Options((1, 2)))
+    assert set(found.delays) == {0, 1, 2, 3}
+    assert found.delay == case.delay
+
+
 def test_lost_samples_and_outliers_do_not_matter() -> None:
     v, y = record()
     rng = np.random.default_rng(3)

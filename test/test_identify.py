@@ -146,6 +146,9 @@ def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(
     ('t,v,y\n0,1,\n1,1,\n', 'y holds no number'), ('t,v,y\n0,,1\n1,,1\n', 'v holds no number'),
     ('t,v,y\n0,1,1\n1,1,1\n2,1,1\n2.5,1,1\n3,1,1\n4,1,1\n', 'no whole number'),
     ('t,v,y\n0,1,1\n1,1,1\n2,1,1\n1e300,1,1\n', 'spans'),
+    ('t,v,y,y\n0,1,2,3\n1,1,2,3\n', 'y stands there twice'),
+    ('t,v,y\n0,1,2\n1,1e300,2\n', 'v reaches 1e+300'),
+    ('t,v,y\n0,1,0\n1,1,1e-300\n', 'y reaches 1e-300 and swings by 1e-300, beyond 1e-12'),
 ])
 def test_a_bad_file_is_told_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str,
@@ -156,6 +159,15 @@ def test_a_bad_file_is_told_in_one_line(
     error = capsys.readouterr().err
     assert said in error
     assert error.count('\n') == 1
+
+
+def test_the_mark_with_which_spreadsheets_begin_a_file_is_no_part_of_its_header(
+    tmp_path: Path,
+) -> None:
+    v, y = record(10)
+    source = write_csv(tmp_path / 'a.csv', v, y)
+    source.write_text(source.read_text(), encoding='utf-8-sig')
+    assert read_measured(source).y.tolist() == y.tolist()
 
 
 @pytest.mark.parametrize('arguments', [

@@ -108,10 +108,7 @@ def test_an_unknown_actuator_is_found(tmp_path: Path) -> None:
 
 def test_a_precise_result_ends_the_motion_early(tmp_path: Path) -> None:
     with bench(tmp_path) as made:
-        # Which order it is does not matter here, and takes time that a busy machine has not got.
-        code, text = made.finish(made.start(
-            '--duration', '150', '--precision', '50%', '--order', '2', '--integrator', 'no',
-        ))
+        code, text = made.finish(made.start('--duration', '150', '--precision', '50%'))
     assert code == 0, text
     with (tmp_path / 'out' / 'record.csv').open() as record:
         assert sum(1 for _ in record) * PERIOD_S < 145.0

@@ -22,7 +22,7 @@ LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
     'parameters', 'plant', 'reference', 'estimation', 'control', 'scenario', 'assembly',
-    'simulation', 'loop', 'identification', 'driver_check',
+    'loop', 'simulation', 'identification', 'driver_check',
 )
 ESTIMATION = (
     'protocol', 'constants', 'storage', 'regression', 'fit', 'baselines', 'observer',

@@ -69,7 +69,9 @@ def test_a_controller_that_would_have_moved_otherwise_learns_from_what_was_moved
 
 def test_what_the_driver_reports_is_learned_from() -> None:
     """A driver that applies half of each command, and says so."""
-    parameters = Parameters({'plant.uncertainty': 0.0, **NOISY})
+    parameters = Parameters({
+        'plant.uncertainty': 0.0, 'estimator.use_applied_control': True, **NOISY,
+    })
     run = build_closed_loop(parameters).run(300)
     rows = run.rows.copy()
     rows[:, COLUMNS.index('v')] *= 2.0

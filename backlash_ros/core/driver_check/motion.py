@@ -23,8 +23,8 @@ from backlash_ros.core.driver_check.findings import (
 )
 from backlash_ros.core.estimation.whole_record.record_description import RecordFit
 from backlash_ros.core.estimation.whole_record.record_fit import fit_record
-from backlash_ros.core.loop.command_history import ReportUse, report_use
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
+from backlash_ros.core.loop.report_use import ReportUse, report_use
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 

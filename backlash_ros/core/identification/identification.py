@@ -22,10 +22,10 @@ from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
     Compared,
-    cancelled_pole,
     compare,
     effective_rows,
     equal_delays,
+    gives_way,
     held_out_rms,
     lag_one,
     predicted,
@@ -169,13 +169,13 @@ def identifying(
         searched, [one.point for one in candidates], options.orders, options.delays,
         options.integrators, options.held_out,
     ))
-    chosen = selected(compared)
-    best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
-    if cancelled_pole(best) is not None and cancelled_pole(chosen.fit) is None:
-        # Only the best fit of all shows that this pole is none.
-        compared = [one for one in compared if one is not chosen]
+    while True:
         chosen = selected(compared)
         best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
+        if chosen.exact or not gives_way(best, compared):
+            break
+        # Only the best fit of all shows that a pole is none.
+        compared = [one._replace(fit=best) if one is chosen else one for one in compared]
     delays = equal_delays(compared, chosen)
     rows = effective_rows(searched, best)
     # With as many poles, some of them may fit worse.

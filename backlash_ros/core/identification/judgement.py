@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.order_selection import cancelled_pole
+from backlash_ros.core.identification.order_selection import cancelled_poles
 from backlash_ros.core.identification.output_error import Fit, Samples
 
 Array = NDArray[np.float64]
@@ -129,10 +129,10 @@ def remarks(e: Evidence) -> list[str]:
             'v moved at one speed only: a lag before the gap would look like a wider gap; move v '
             'at several speeds'
         )
-    cancelled = cancelled_pole(e.fit)
-    if cancelled is not None:
+    cancelled = cancelled_poles(e.fit)
+    if cancelled:
         found.append(
-            f'the pole {_text(cancelled)} is cancelled by a zero: a lower order does as well; '
+            f'the pole {_text(cancelled[0])} is cancelled by a zero: a lower order does as well; '
             'limit --order'
         )
     if e.held_out > WORSE_LATER * e.trained:

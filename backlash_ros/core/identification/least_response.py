@@ -3,7 +3,8 @@
 High frequencies that v hardly had leave zeros and delay open. Whatever noise puts there, a fast
 controller would act on it. Among the delays that fit alike, and within two standard deviations of
 each fit, the model is taken whose |G|^2, summed over the frequencies at which G is not known, is
-least: sampled plants that are driven through a hold have little gain there.
+least: sampled plants that are driven through a hold have little gain there. Where the deviations of
+the fit leave no such frequency, it is those at which the delays that fit alike contradict it.
 """
 
 from __future__ import annotations
@@ -14,12 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.identification.output_error import Fit, Samples, fit
-from backlash_ros.core.identification.uncertainty import Covariance, covariance_of, response_std
+from backlash_ros.core.identification.uncertainty import (
+    Covariance,
+    covariance_of,
+    response,
+    response_std,
+)
 
 Array = NDArray[np.float64]
 
 POINTS = 40  # frequencies up to half the sampling rate
-UNKNOWN = 0.1  # relative deviation of G beyond which the record is silent
+GRID: Array = np.pi * (np.arange(POINTS) + 0.5) / POINTS  # [rad/sample]
+UNKNOWN = 0.1  # relative deviation, or difference, of G beyond which the record is silent
 ALLOWED = 4.0  # by which the squares may grow, in variances of the noise: two standard deviations
 HALVINGS = 12  # of the factor of the penalty
 FIRST_FACTOR = 1e4  # of it, relative to the squares of the fit
@@ -30,6 +37,8 @@ def least_response(
 ) -> Generator[None, None, Fit]:
     """The fit to take. rivals: with other delays, that fit alike. noise_variance: effective."""
     silent = _silent(samples, best)
+    if not len(silent):
+        silent = _contradicted(best, rivals)
     if not len(silent):
         return best
     found: list[tuple[float, Fit]] = []
@@ -42,15 +51,22 @@ def least_response(
 
 def _silent(samples: Samples, best: Fit) -> Array:
     """Frequencies [rad/sample] from which on G is not known."""
-    w = np.pi * (np.arange(POINTS) + 0.5) / POINTS
-    return np.asarray(w[w > known_up_to(best, covariance_of(samples, best))], dtype=np.float64)
+    return GRID[known_up_to(best, covariance_of(samples, best)) < GRID]
+
+
+def _contradicted(best: Fit, rivals: Sequence[Fit]) -> Array:
+    """Frequencies [rad/sample] at which another delay makes another G."""
+    differs = np.zeros(POINTS, dtype=bool)
+    for one in rivals:
+        later = np.exp(-1j * GRID * (one.structure.delay - best.structure.delay))
+        differs |= np.abs(response(one, GRID) * later / response(best, GRID) - 1.0) > UNKNOWN
+    return np.asarray(GRID[differs])
 
 
 def known_up_to(found: Fit, covariance: Covariance) -> float:
     """Frequency [rad/sample] from which on G is not known; pi where it is known throughout."""
-    w = np.pi * (np.arange(POINTS) + 0.5) / POINTS
-    known = np.flatnonzero(response_std(found, covariance, w) <= UNKNOWN)
-    return float(w[known[-1]]) if len(known) else float(w[0])
+    known = np.flatnonzero(response_std(found, covariance, GRID) <= UNKNOWN)
+    return float(GRID[known[-1]]) if len(known) else float(GRID[0])
 
 
 def _rows(found: Fit, silent: Array) -> Array:

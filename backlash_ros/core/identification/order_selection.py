@@ -1,7 +1,9 @@
 """Which order, delay and integrator: compared on samples that the fit has not seen.
 
-A pole that a zero cancels is none. Structures whose held-out error is within a few percent of the
-least are equally good predictors. Among them the least
+A pole that a zero cancels is none: such a structure gives way to the same one without that pole. It
+would predict a little better, but only what no G makes: the state and the offset that fit the
+samples held out would have a drift more to fit them with. Structures whose held-out error is
+within a few percent of the least of the others are equally good predictors. Among them the least
 
     N' log(squares) + unknowns log(N)
 
@@ -99,10 +101,31 @@ def selected(compared: Sequence[Compared]) -> Compared:
     exact = [one for one in compared if one.exact]
     if exact:
         return min(exact, key=lambda one: (one.structure.unknowns, one.fit.squares))
-    least = min(one.held_out for one in compared)
-    good = [one for one in compared if one.held_out <= WITHIN * least]
-    plain = [one for one in good if cancelled_pole(one.fit) is None]
-    return min(plain or good, key=lambda one: one.criterion)
+    needed = [one for one in compared if not gives_way(one.fit, compared)]
+    least = min(one.held_out for one in needed)
+    good = [one for one in needed if one.held_out <= WITHIN * least]
+    return min(good, key=lambda one: one.criterion)
+
+
+def gives_way(found: Fit, compared: Sequence[Compared]) -> bool:
+    """Whether a zero cancels a pole, and the structure without that pole is compared as well."""
+    order, delay, integrator, _ = found.structure
+    smaller = [
+        Structure(order - 1, delay, integrator and pole != 1.0) for pole in cancelled_poles(found)
+    ]
+    return any(one.structure in smaller for one in compared)
+
+
+def cancelled_poles(found: Fit) -> list[complex]:
+    """Poles that a zero all but cancels, so that neither shows; an integrator as exactly 1."""
+    zeros = np.roots(found.numerator)
+    if not len(zeros) or not np.isfinite(zeros).all():
+        return []
+    poles = [*np.roots(np.append(1.0, found.point.a)), *[1.0] * found.structure.integrator]
+    return [
+        complex(pole) for pole in poles
+        if float(np.abs(zeros - pole).min()) < CANCELS * max(abs(1.0 - pole), SLOWEST)
+    ]
 
 
 def rounding(samples: Samples, found: Fit) -> float:
@@ -117,18 +140,6 @@ def rounding(samples: Samples, found: Fit) -> float:
     return ROUNDED * EPS * float(np.abs(found.denominator).sum()) * y * float(
         np.linalg.norm(answer)
     )
-
-
-def cancelled_pole(found: Fit) -> complex | None:
-    """A pole that a zero all but cancels, so that neither shows; None where there is none."""
-    zeros = np.roots(found.numerator)
-    if not len(zeros) or not np.isfinite(zeros).all():
-        return None
-    for pole in np.roots(found.denominator):
-        near = float(np.abs(zeros - pole).min())
-        if near < CANCELS * max(abs(1.0 - pole), SLOWEST):
-            return complex(pole)
-    return None
 
 
 def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:

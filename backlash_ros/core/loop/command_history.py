@@ -3,39 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from enum import Enum
 from math import inf, nan
 
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.loop.report_use import ReportTrust, ReportUse
 
 # Commands and reports that may wait: more than a stall of the controller can leave behind.
 REMEMBERED = 256
 LONGEST_TRANSIT = 0.25  # of a period: what is taken into account
 TRANSIT_STEP = 1e-3  # of a period: by which its median follows with every output
-# Outputs in a row with a report for each of their intervals after which reports are believed, and
-# without, after which they are given up. Messages that have nothing to do with the samples fit an
-# interval every other time at most: 20 times in a row by a chance of one in a million.
-CONSISTENT = 20
 FRESH = 1.5  # periods before an output up to which a report tells the v of its interval
-
-
-class ReportUse(Enum):
-    """Whether the v that the driver reports goes before the own command."""
-
-    NEVER = 'false'
-    AUTO = 'auto'
-    ALWAYS = 'true'
-
-
-def report_use(p: Parameters) -> ReportUse:
-    """What estimator.use_applied_control comes to.
-
-    With control.delay_samples a driver may report v before or after that delay: auto leaves it
-    alone then. In lockstep every v is applied at once.
-    """
-    use = ReportUse(p.word('estimator.use_applied_control'))
-    delayed = use is ReportUse.AUTO and p.integer('control.delay_samples') > 0
-    return ReportUse.NEVER if delayed or p.flag('lockstep') else use
 
 
 class CommandHistory:
@@ -44,14 +20,10 @@ class CommandHistory:
     The driver applies over an interval the newest v it has when the interval ends with the next
     sample. So a v that cannot have been there when that sample was taken came too late, and the one
     before it was in use: v is as long under way as y is. Times are those of one clock [ns].
-
-    uses_reports: whether reports go before the own commands at present.
     """
 
     def __init__(self, sample_period_s: float, use: ReportUse = ReportUse.ALWAYS) -> None:
-        self.uses_reports = use is ReportUse.ALWAYS
-        self._use = use
-        self._contrary = 0  # outputs in a row that speak against uses_reports
+        self._trust = ReportTrust(use)
         self.late = 0  # commands that missed their sample
         self.unreported = 0  # outputs without a matching report while reports are used
         self._period_ns = sample_period_s * 1e9
@@ -59,6 +31,11 @@ class CommandHistory:
         self._transit_ns = 0.0  # median time from one node to the other
         self._published: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._reported: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
+
+    @property
+    def uses_reports(self) -> bool:
+        """Whether reports go before the own commands at present."""
+        return self._trust.trusted
 
     def note_transit(self, passed_ns: float) -> None:
         """Note how long an output was under way."""
@@ -123,10 +100,7 @@ class CommandHistory:
             reports += reports[-1:] * unsent
         # The report of the newest interval may still be under way while older ones are here.
         complete = len(reports) == intervals and stamp_ns > end_ns - 0.5 * self._period_ns
-        self._contrary = 0 if complete is self.uses_reports else self._contrary + 1
-        if self._use is ReportUse.AUTO and self._contrary == CONSISTENT:
-            self.uses_reports, self._contrary = complete, 0
-        if not self.uses_reports:
+        if not self._trust.note(complete):
             return []
         self.unreported += not complete
         return reports if complete else []

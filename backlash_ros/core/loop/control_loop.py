@@ -19,9 +19,10 @@ from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Estimate
-from backlash_ros.core.loop.command_history import CommandHistory, report_use
+from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.output import Output
+from backlash_ros.core.loop.report_use import report_use
 from backlash_ros.core.loop.sample_counter import Arrival, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.state_model import StateModel

@@ -1,8 +1,8 @@
 """A recorded run through a controller once more, with its own parameters or with others.
 
 The controller is the one of the loop and is stepped as there: it computes its command from every
-recorded y and y_m. What it learns from is the v that was recorded: the reported one where there is
-one report for each interval, else the command.
+recorded y and y_m. What it learns from is the v that was recorded: the reported one where the loop
+would have believed it, else the command.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.assembly import build_controller, build_model
 from backlash_ros.core.control.controller import LONGEST_GAP, plausible
 from backlash_ros.core.estimation.moving_horizon.learned_model import learned_model_of
+from backlash_ros.core.loop.report_use import ReportTrust, report_use
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
 
@@ -58,6 +59,7 @@ def replay(
     lost = np.maximum(np.round(steps).astype(int) - 1, 0)
     controller = build_controller(p)
     rows = np.full((recorded.samples, len(COLUMNS)), np.nan)
+    trust = ReportTrust(report_use(p))
     v_before = v_made = 0.0
     for k, (y_m, y, v) in enumerate(zip(*columns, strict=True)):
         y_m, y, v = float(y_m), float(y), float(v)
@@ -72,7 +74,8 @@ def replay(
         if k and v_made != v_before:
             applied = [v_before] * (missing + 1)
             controller.start_from(v_before)
-        if k and reports and len(reports[k]) == missing + 1:
+        complete = bool(reports) and len(reports[k]) == missing + 1
+        if k and trust.note(complete) and complete:
             applied = list(reports[k])
         step = controller.step(y, y_m, missing, applied)
         controller.refine()

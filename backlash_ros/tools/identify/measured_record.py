@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.bags.content import is_bag
+from backlash_ros.core.control.controller import LARGEST
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
 from backlash_ros.tools.cli.errors import InputError
 from backlash_ros.tools.report.command import BAG, open_source
@@ -83,7 +84,7 @@ def read_measured(
 
 def _from_csv(path: Path, sample_period: float | None) -> MeasuredRecord:
     try:
-        with path.open(newline='', encoding='utf-8') as file:
+        with path.open(newline='', encoding='utf-8-sig') as file:
             rows = list(csv.reader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f'{path}: cannot be read: {error}') from None
@@ -94,6 +95,9 @@ def _from_csv(path: Path, sample_period: float | None) -> MeasuredRecord:
             f'{path}: line 1: must be a header with {", ".join(COLUMNS)}; {", ".join(missing)} '
             f'{"is" if len(missing) == 1 else "are"} missing'
         )
+    for name in COLUMNS:
+        if header.count(name) > 1:
+            raise InputError(f'{path}: line 1: {name} stands there twice: leave one of them')
     places = [header.index(name) for name in COLUMNS]
     values: list[list[float]] = []
     for number, row in enumerate(rows[1:], start=2):
@@ -146,6 +150,13 @@ def _usable(
             raise InputError(f'{path}: {name} holds what is not finite')
         if not np.isfinite(values).any():
             raise InputError(f'{path}: {name} holds no number')
+        largest = float(np.nanmax(np.abs(values)))
+        swing = float(np.nanmax(values) - np.nanmin(values))
+        if largest > LARGEST or 0.0 < swing < 1.0 / LARGEST:
+            raise InputError(
+                f'{path}: {name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
+                f'{1.0 / LARGEST:g} to {LARGEST:g}: choose another unit, drop what is no reading'
+            )
     known = np.isfinite(v)
     first = int(np.argmax(known))
     newest = np.maximum.accumulate(np.where(known, np.arange(len(v)), 0))

@@ -11,6 +11,7 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from backlash_ros.core.identification.identification import Details, Identification
+from backlash_ros.core.identification.order_selection import gives_way
 from backlash_ros.core.identification.uncertainty import (
     autocorrelation,
     response,
@@ -53,9 +54,9 @@ def draw(found: Identification) -> Iterator[Picture]:
     yield Picture(
         'residual.png', 'Residual of the fit',
         'y minus the simulation of the whole record. Its autocorrelation should stay within the '
-        'band of white noise; the rounding of an encoder is allowed to leave it for a few lags. '
-        'Over v it should show no shape: a slope or a hook is a nonlinearity that is not in the '
-        'model.', png(draw_residual(found, details)),
+        'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
+        'shape: a slope or a hook is a nonlinearity that is not in the model.',
+        png(draw_residual(found, details)),
     )
     yield Picture(
         'gap.png', 'Misfit over the gap',
@@ -65,8 +66,9 @@ def draw(found: Identification) -> Iterator[Picture]:
     )
     yield Picture(
         'orders.png', 'Orders and delays compared',
-        'Error on the samples held out. The ring marks the one that was taken.',
-        png(draw_orders(found, details)),
+        'Error on the samples held out. The ring marks the one that was taken. White: a zero '
+        'cancels a pole, and the lower order without it is taken instead.',
+        png(draw_orders(details)),
     )
     yield Picture(
         'poles_zeros.png', 'Poles and zeros of G',
@@ -166,7 +168,7 @@ def draw_profile(found: Identification, details: Details) -> Figure:
     return figure
 
 
-def draw_orders(found: Identification, details: Details) -> Figure:
+def draw_orders(details: Details) -> Figure:
     """Error on the samples held out, over the order, a line per delay."""
     figure = new_figure(4.2)
     integrators = sorted({one.structure.integrator for one in details.compared})
@@ -184,11 +186,15 @@ def _draw_orders(axes: Axes, details: Details, integrator: bool) -> None:
     delays = sorted({one.structure.delay for one in details.compared})
     for delay, colour in zip(delays, _cycled(len(delays)), strict=True):
         line = sorted(
-            (one.structure.order, one.held_out) for one in details.compared
+            (one.structure.order, one.held_out, gives_way(one.fit, details.compared))
+            for one in details.compared
             if one.structure.delay == delay and one.structure.integrator == integrator
         )
-        axes.plot(*zip(*line, strict=True), 'o-', color=colour, markersize=5, alpha=0.8,
+        orders, errors, cancelled = zip(*line, strict=True)
+        axes.plot(orders, errors, 'o-', color=colour, markersize=5, alpha=0.8,
                   label=f'delay {delay}')
+        axes.plot(orders, errors, 'o', color=colour, markersize=5, markerfacecolor='white',
+                  markevery=np.flatnonzero(cancelled).tolist())
     if details.chosen.structure.integrator == integrator:
         axes.plot(details.chosen.structure.order, details.chosen.held_out, 'o', markersize=15,
                   markerfacecolor='none', markeredgecolor='#000000', markeredgewidth=1.5)
@@ -290,12 +296,11 @@ def draw_loop(found: Identification, details: Details) -> Figure:
     left.plot(v, details.samples.whole_y[-LOOP_POINTS:], color=COLOURS['y'], linewidth=0.8)
     label(left, 'As measured', 'y', 'v')
     u = found.m * (details.fit.play.p[-LOOP_POINTS:] - found.c_r)
-    right.plot(v, u, color='#999999', linewidth=1.0, label='u')
+    right.plot(v, u, color='#222222', linewidth=1.2, label='u', zorder=3)
     ends = np.array([v.min(), v.max()])
-    right.plot(ends, found.m * (ends - found.c_r), '--', color=COLOURS['c_r'],
-               label=f'c_r = {found.c_r:.4g}')
-    right.plot(ends, found.m * (ends - found.c_l), '--', color=COLOURS['c_l'],
-               label=f'c_l = {found.c_l:.4g}')
+    for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):
+        right.plot(ends, found.m * (ends - value), color=COLOURS[name], linewidth=4.0, alpha=0.5,
+                   label=f'{name} = {value:.4g}')
     label(right, 'As found', 'u', 'v')
     right.legend(frameon=False, loc='upper left', fontsize=10)
     return figure

@@ -106,15 +106,15 @@ def _reports(
 ) -> Sequence[Sequence[float]]:
     """What the driver said to have applied before each row, where the controller uses it."""
     from backlash_ros.bags.content import is_bag
+    from backlash_ros.core.loop.report_use import ReportUse, report_use
     from backlash_ros.tools.report.command import BAG
     from backlash_ros.tools.run_files.bag_reading import read_reports
-    use = parameters.word('estimator.use_applied_control')
-    delayed = use == 'auto' and parameters.integer('control.delay_samples') > 0
-    if use == 'false' or delayed or parameters.flag('lockstep'):
+    use = report_use(parameters)
+    if use is ReportUse.NEVER:
         return ()
     bag = next((folder for folder in (path, path / BAG) if is_bag(folder)), None)
     reports = [] if bag is None else read_reports(bag, run.column('y'), axis)
-    if not reports and use == 'true':
+    if not reports and use is ReportUse.ALWAYS:
         print(f'{EXECUTABLE}: warning: {path}: holds no applied_control: v is that of control',
               file=sys.stderr)
     return reports

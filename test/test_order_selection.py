@@ -1,0 +1,90 @@
+"""Which structure is taken: a pole that a zero cancels is none."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core.identification.identification import Options, identify
+from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.identification.order_selection import (
+    Compared,
+    cancelled_poles,
+    gives_way,
+    selected,
+)
+from backlash_ros.core.identification.output_error import Fit, Point, Structure
+from backlash_ros.core.identification.play_record import PlayOutput, PlayRecord
+
+Array = NDArray[np.float64]
+NOTHING = PlayOutput(np.empty(0), np.empty(0), np.empty(0), 0)
+
+
+def fit_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Fit:
+    """A fit with these roots; poles: without the integrator."""
+    structure = Structure(len(poles) + integrator, 0, integrator)
+    a = np.real(np.poly(poles))[1:] if poles else np.empty(0)
+    b = np.zeros(structure.order)
+    b[structure.order - 1 - len(zeros):] = np.real(np.poly(zeros))
+    return Fit(structure, Point(a, 1.0, 0.0), np.append(b, 0.0), np.empty(0), NOTHING, 0.0, 1.0, 1)
+
+
+def compared(fit: Fit, held_out: float, criterion: float, exact: bool = False) -> Compared:
+    return Compared(fit.structure, held_out, fit, fit, criterion, exact)
+
+
+PLAIN = compared(fit_of(False, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8]), 1.2, -20.0)
+NO_INTEGRATOR = compared(fit_of(True, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0]), 1.1, -30.0)
+NEITHER = compared(fit_of(True, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0, 0.98]), 1.0, -40.0)
+
+
+@pytest.mark.parametrize(('integrator', 'poles', 'zeros', 'cancelled'), [
+    (True, [0.9], [1.0 + 1e-4], [1.0]), (True, [0.9], [1.0 - 1e-3], []),
+    (True, [0.9], [0.9], [0.9]), (False, [0.9, 0.5], [0.901], [0.9]),
+    (False, [0.9, 0.5], [0.91], []), (True, [0.9, 0.5], [1.0, 0.5], [0.5, 1.0]),
+    (False, [0.5, 0.6 + 0.4j, 0.6 - 0.4j], [0.6 + 0.4j, 0.6 - 0.4j], [0.6 + 0.4j, 0.6 - 0.4j]),
+    (True, [], [], []), (False, [0.9, 0.5], [], []),
+])
+def test_a_pole_with_a_zero_on_it_is_cancelled(
+    integrator: bool, poles: list[complex], zeros: list[complex], cancelled: list[complex],
+) -> None:
+    assert cancelled_poles(fit_of(integrator, poles, zeros)) == pytest.approx(cancelled)
+
+
+def test_a_cancelled_pole_gives_way_however_well_it_predicts() -> None:
+    assert selected([PLAIN, NO_INTEGRATOR, NEITHER]) is PLAIN
+    # The structure without the slow pole is not needed either, nor the one without the integrator.
+    slow = compared(fit_of(False, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 0.98]), 1.05, -35.0)
+    assert selected([PLAIN, NO_INTEGRATOR, slow, NEITHER]) is PLAIN
+
+
+def test_it_gives_way_to_nothing_else_than_the_structure_without_it() -> None:
+    assert gives_way(NO_INTEGRATOR.fit, [PLAIN])
+    assert not gives_way(PLAIN.fit, [PLAIN])
+    # Neither of two orders less nor of another delay.
+    assert not gives_way(NEITHER.fit, [PLAIN, NEITHER])
+    assert selected([PLAIN, NEITHER]) is NEITHER
+    later = PLAIN._replace(structure=PLAIN.structure._replace(delay=1))
+    assert not gives_way(NO_INTEGRATOR.fit, [later, NO_INTEGRATOR])
+
+
+def test_without_noise_nothing_gives_way_to_what_does_not_explain_y() -> None:
+    exact = NO_INTEGRATOR._replace(exact=True)
+    assert selected([PLAIN, exact]) is exact
+
+
+def test_a_slow_motion_of_a_motor_shows_no_integrator() -> None:
+    """The rounding of a slow y drifts, which an integrator without effect would follow."""
+    period, step = 0.005, 2.0 * np.pi / 2**14
+    v: Array = np.array(list(islice(strokes(-9.0, 11.0, 200.0, period, 60.0, 0.0), 2700)))
+    u = 0.098 * (PlayRecord(v).output(0.9, 0.55).p - 0.55)
+    y = lfilter([0.0, 0.1568, 0.1269], [1.0, -1.2498, 0.5335], u)
+    found = identify(v, step * np.round(y / step), period, Options((2, 3, 4), (0,)))
+    assert found.reasons == ()
+    assert not found.integrator
+    assert found.denominator == pytest.approx([1.0, -1.2498, 0.5335], abs=1e-3)
+    assert found.gap == pytest.approx(0.9, abs=1e-3)

@@ -1,0 +1,143 @@
+"""replay from a bag whose driver says which v it applied: the estimates of the run once more."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from test_report import MULTI_ARRAY, TYPES, multi_array
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.sample_counter import SampleCounter
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
+from backlash_ros.nodes.runtime.driver_io import Output
+from backlash_ros.tools.config.configuration import write_config
+from backlash_ros.tools.replay.command import main
+from backlash_ros.tools.report.command import open_source
+from backlash_ros.tools.run_files.bag_reading import read_reports
+
+FLOAT = 'std_msgs/msg/Float64'
+START_NS, PERIOD_NS = 1_800_000_000_000_000_000, 10_000_000
+SAMPLES, LIMIT = 200, 4.0
+LABELS = {topics.SIGNALS: topics.SIGNAL_LABELS, topics.ESTIMATES: topics.ESTIMATE_LABELS}
+LOST = {60, 61, 150}  # outputs that never reach the controller
+GIVEN = {'plant.uncertainty': 0.0, 'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
+
+
+class LimitingDriver:
+    """A loop as the controller node runs it, beside a driver that applies v within ±reach.
+
+    Everything is punctual, and each report leaves just before the y that its v led to.
+    """
+
+    def __init__(self, p: Parameters, reach: float) -> None:
+        self.messages: list[tuple[int, str, float]] = []  # stamp [ns], topic, value
+        self._p, self._reach = p, reach
+        self._rows: list[tuple[float, ...]] = []
+
+    def run(self) -> RunRecord:
+        p, now_ns = self._p, START_NS
+        plant, reference = build_plant(p), build_reference(p)
+        loop = ControlLoop(p, lambda v: None, lambda: now_ns, None, SampleCounter(0.01))
+        applied = 0.0
+        for k in range(SAMPLES):
+            sampled_ns = START_NS + k * PERIOD_NS
+            y = plant.measure()
+            now_ns = sampled_ns + PERIOD_NS // 10
+            if k:
+                self.messages.append((sampled_ns - 1000, topics.APPLIED_CONTROL, applied))
+                loop.take_applied(applied, sampled_ns - 1000)
+            self.messages.append((sampled_ns, topics.PLANT_OUTPUT, y))
+            if k not in LOST:
+                self._answer(loop, Output(y, sampled_ns, sampled_ns, now_ns, k + 1),
+                             reference(0.01 * k))
+                applied = min(max(loop.v, -self._reach), self._reach)
+            plant.step(applied)
+        return RunRecord(np.array(self._rows), 0.01, len(LOST))
+
+    def _answer(self, loop: ControlLoop, output: Output, y_m: float) -> None:
+        loop.take_reference(y_m)
+        step = loop.answer(output)
+        assert step is not None
+        loop.core.refine()
+        e, estimator = step.estimate, loop.core.estimator
+        row = {
+            't': 0.01 * loop.counter.index, 'y_m': step.y_m, 'y': step.y, 'u_d': step.u_d,
+            'v': step.v, 'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f, 'status': e.status,
+            'u_hat': estimator.u_hat, 'innovation': estimator.innovation,
+            **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
+        }
+        self._rows.append(tuple(float(row.get(name, np.nan)) for name in COLUMNS))
+
+    def write(self, folder: Path, run: RunRecord, without: str = '') -> Path:
+        """The folder of a run with its bag; without: a topic that was not recorded."""
+        write_config(self._p, folder / 'parameters.yaml')
+        sent = [(at, topic, float_message(value)) for at, topic, value in self.messages]
+        for row in run.rows.tolist():
+            known = dict(zip(COLUMNS, row, strict=True))
+            known['sample'] = round(known['t'] / 0.01)
+            sent += [
+                (START_NS + known['sample'] * PERIOD_NS + 10**6, topic,
+                 multi_array(labels, [known.get(label, np.nan) for label in labels]))
+                for topic, labels in LABELS.items()
+            ]
+        with Writer(folder / 'bag', version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+            connections = {
+                topic: writer.add_connection(
+                    f'/{topic}', MULTI_ARRAY if topic in LABELS else FLOAT, typestore=TYPES
+                ) for topic in {topic for _, topic, _ in sent} - {without}
+            }
+            for stamp_ns, topic, raw in sorted(sent):
+                if topic != without:
+                    writer.write(connections[topic], stamp_ns, raw)
+        return folder
+
+
+def float_message(value: float) -> bytes:
+    return bytes(TYPES.serialize_cdr(TYPES.types[FLOAT](data=value), FLOAT))
+
+
+@pytest.mark.parametrize(('use', 'reach'), [('true', LIMIT), ('auto', LIMIT), ('auto', np.inf)])
+def test_the_estimates_of_the_run_come_out_to_the_last_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], use: str, reach: float,
+) -> None:
+    driver = LimitingDriver(Parameters({**GIVEN, 'estimator.use_applied_control': use}), reach)
+    run = driver.run()
+    folder = driver.write(tmp_path, run)
+    source = open_source(folder)
+    assert source.run.column('t') == pytest.approx(run.column('t'))
+    assert source.run.lost_samples == len(LOST)
+    assert main([str(folder), '--out', str(tmp_path / 'out')]) == 0
+    told = capsys.readouterr()
+    assert 'to the last bit' in told.out
+    assert 'warning' not in told.err
+
+
+def test_without_its_reports_a_limiting_driver_is_learned_wrongly(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    driver = LimitingDriver(Parameters({**GIVEN, 'estimator.use_applied_control': True}), LIMIT)
+    run = driver.run()
+    assert run.column('c_r')[-1] == pytest.approx(3.0, rel=0.01)
+    folder = driver.write(tmp_path, run, without=topics.APPLIED_CONTROL)
+    assert main([str(folder), '--out', str(tmp_path / 'out')]) == 0
+    told = capsys.readouterr()
+    assert 'holds no applied_control: v is that of control' in told.err
+    assert 'part from those of the run' in told.out
+
+
+def test_reports_are_told_apart_by_the_outputs_around_them(tmp_path: Path) -> None:
+    driver = LimitingDriver(Parameters(GIVEN), LIMIT)
+    run = driver.run()
+    reports = read_reports(driver.write(tmp_path, run) / 'bag', run.column('y'))
+    samples = np.round(run.column('t') / 0.01).astype(int)
+    assert [len(values) for values in reports] == [0, *np.diff(samples)]
+    applied = [value for _, topic, value in driver.messages if topic == topics.APPLIED_CONTROL]
+    assert [value for values in reports for value in values] == applied
+    # Where an output of the run is not in the bag, nobody knows what belongs to which interval.
+    assert read_reports(tmp_path / 'bag', np.append(run.column('y'), 7.0)) == []
