@@ -93,7 +93,7 @@ def covariance(estimator: Estimator) -> Array | None:
 def run_seed(job: SeedJob) -> SeedResult:
     """Simulate one seed and compare with the bound at every mark."""
     p = Parameters({**EXACT, 'seed': job.seed, **job.changes})
-    period = p.real('sample_period')
+    period = p.get_float('sample_period')
     marks = [round(mark / period) for mark in job.marks_s]
     loop = build_closed_loop(p)
     covariances: dict[int, Array | None] = {}
@@ -105,16 +105,16 @@ def run_seed(job: SeedJob) -> SeedResult:
     run = loop.run(max(marks) + 1, keep)
     index = np.rint(run.column('t') / period).astype(int)
     rows = [int(np.searchsorted(index, mark, side='right')) - 1 for mark in marks]
-    truth = p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
+    truth = p.get_float('backlash.m'), p.get_float('backlash.c_r'), p.get_float('backlash.c_l')
     error = estimates(run)[rows] - truth
     # A lost sample leaves the command before it in force.
     v = run.column('v')[np.searchsorted(index, np.arange(max(marks)), side='right') - 1]
     received = np.isin(np.arange(max(marks) + 1), index)
     bound = np.array([
         cramer_rao(
-            v[:mark], np.array(p.reals('plant.numerator')),
-            np.array(p.reals('plant.denominator')), truth, p.real('output_noise_std'),
-            received[:mark + 1], p.real('backlash.initial_u'),
+            v[:mark], np.array(p.get_floats('plant.numerator')),
+            np.array(p.get_floats('plant.denominator')), truth, p.get_float('output_noise_std'),
+            received[:mark + 1], p.get_float('backlash.initial_u'),
         ) for mark in marks
     ])
     nees = np.array([_nees(e, covariances[k]) for e, k in zip(error, marks, strict=True)])
@@ -127,7 +127,7 @@ def _nees(error: Array, cov: Array | None) -> float:
 
 def run_quiet_case(seed: int) -> CaseResult:
     """The random case with next to no noise, which the estimator is told."""
-    noise = QUIET_NOISE * random_case(seed).parameters.real('output_noise_std')
+    noise = QUIET_NOISE * random_case(seed).parameters.get_float('output_noise_std')
     return _run_case(random_case(
         seed, **{'output_noise_std': noise, 'estimator.output_noise_std': noise}
     ))
@@ -145,7 +145,7 @@ def run_uncertain_case(seed: int) -> CaseResult:
 
 def _run_case(case: Case) -> CaseResult:
     seed, p = case.seed, case.parameters
-    truth = p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
+    truth = p.get_float('backlash.m'), p.get_float('backlash.c_r'), p.get_float('backlash.c_l')
     try:
         run = build_closed_loop(p).run(case.samples + 1)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
@@ -173,7 +173,7 @@ def _trouble(run: RunRecord, p: Parameters) -> str:
     values = estimates(run)
     if not (np.isfinite(values).all() and np.isfinite(run.column('v')).all()):
         return 'not finite'
-    bounds = np.array([p.pair(f'estimator.bounds.{name}') for name in NAMES])
+    bounds = np.array([p.get_pair(f'estimator.bounds.{name}') for name in NAMES])
     if (values < bounds[:, 0]).any() or (values > bounds[:, 1]).any():
         return 'outside the bounds'
     return ''

@@ -143,7 +143,7 @@ class Sequence:
         self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
         self._loop: object = None
         self._lately = NOTHING  # what has happened last
-        self._weights = {p.real('tracking.input_weight')}  # with which u_d was asked for
+        self._weights = {p.get_float('tracking.input_weight')}  # with which u_d was asked for
         self._u_d = 0.0
         self._widest = 0.0
         inherited = None
@@ -155,7 +155,7 @@ class Sequence:
         self.controller = Controller(p, self.driver, inherited, self._sent, self._answered)
         if v is not None:
             self.controller.restart(inherited, v)
-        told(f'{p.word("estimator.law")}, {p.word("structure")}, truth {self.truth}')
+        told(f'{p.get_str("estimator.law")}, {p.get_str("structure")}, truth {self.truth}')
 
     def run(self) -> Findings:
         """Play the sequence."""
@@ -245,8 +245,8 @@ class Sequence:
         rng, p = self.rng, self.controller.p
         changes: dict[str, object] = {}
         for name in ('control.min', 'control.max', 'control.rate_max'):
-            if isfinite(p.real(name)):
-                changes[name] = self.p.real(name) * float(rng.uniform(0.3, 1.5))
+            if isfinite(p.get_float(name)):
+                changes[name] = self.p.get_float(name) * float(rng.uniform(0.3, 1.5))
         if changes:
             self._told(f'    {changes}')
             self.controller.take_up(p.replaced(changes))
@@ -256,16 +256,16 @@ class Sequence:
         scale = float(10.0 ** rng.uniform(-1.0, 1.0))
         changes: list[dict[str, object]] = [
             {'tracking.input_weight': 1e-2 * scale}, {'inverse.caution': scale},
-            {'inverse.direction_band': 0.01 * scale * self.p.real('backlash.m')},
+            {'inverse.direction_band': 0.01 * scale * self.p.get_float('backlash.m')},
             {'lms.step': min(scale, 1.9)}, {'inverse.take_up_rate': 100.0 * scale},
         ]
         if self.controller.loop.takes_up_noise:
-            noise = p.real('output_noise_std')
+            noise = p.get_float('output_noise_std')
             changes.append({'estimator.output_noise_std': noise * scale})
         change = changes[int(rng.integers(len(changes)))]
         self._told(f'    {change}')
         self.controller.take_up(p.replaced(change))
-        self._weights.add(self.controller.p.real('tracking.input_weight'))
+        self._weights.add(self.controller.p.get_float('tracking.input_weight'))
 
     def _call_service(self, tick: int) -> None:
         rng, loop = self.rng, self.controller.loop
@@ -304,7 +304,7 @@ class Sequence:
             value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth
         )
         gap = c_r - c_l
-        return Estimate(m, c_r, c_l, self.p.real('proportional.f'),
+        return Estimate(m, c_r, c_l, self.p.get_float('proportional.f'),
                         1e-3 * m, 1e-3 * gap, 1e-3 * gap)
 
     # What is watched.
@@ -335,7 +335,7 @@ class Sequence:
         self._widest = max(self._widest, e.m * (e.c_r - e.c_l))
         move = abs(v - self._v_before)
         # Through the four blocks u_d answers at once to what y has done meanwhile.
-        goes_on = renewed and self.p.word('structure') != 'pole_placement'
+        goes_on = renewed and self.p.get_str('structure') != 'pole_placement'
         # A v that was led to zero meanwhile starts from there.
         goes_on = goes_on and self._v_before == self._v_answered
         if goes_on and self._moves >= LEARNED_MOVES and self._last is not None:
@@ -370,7 +370,7 @@ class Sequence:
         kind = found.wrong if e.learned else found.wrong_without
         if e.learned and self._foreign:
             kind = found.wrong_inherited
-        elif e.learned and self.p.real('truth.scale_frequency') != 1.0:
+        elif e.learned and self.p.get_float('truth.scale_frequency') != 1.0:
             kind = found.wrong_uncertain
         kind.append(
             f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
@@ -382,9 +382,11 @@ class Sequence:
     def _conclude(self) -> None:
         """Say whether u_d has gone further than a loop ever may."""
         p = self.p
-        if p.word('structure') == 'proportional':
-            f = max(abs(p.real('proportional.f')), *map(abs, p.pair('proportional.bounds')))
-            allowed = (p.real('amplitude') + f * 100.0) / (1.0 - LARGEST_F_OVER_M)
+        if p.get_str('structure') == 'proportional':
+            f = max(
+                abs(p.get_float('proportional.f')), *map(abs, p.get_pair('proportional.bounds'))
+            )
+            allowed = (p.get_float('amplitude') + f * 100.0) / (1.0 - LARGEST_F_OVER_M)
         else:
             # The gapless loop is only run where it may matter.
             allowed = TWICE * (1.0 + LARGEST_FEEDBACK) * self._widest
@@ -397,7 +399,7 @@ class Sequence:
     def _asked(self) -> float:
         """Largest |u_d| of a loop that knows a plant without a gap, for the same references."""
         known = self.p.replaced({
-            'estimator.law': 'fixed', 'estimator.initial.m': self.p.real('backlash.m'),
+            'estimator.law': 'fixed', 'estimator.initial.m': self.p.get_float('backlash.m'),
             'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
             'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'output_noise_std': 0.0,
             'control.min': -inf, 'control.max': inf, 'control.rate_max': inf,
@@ -435,7 +437,11 @@ class Sequence:
 def _truth(p: Parameters) -> tuple[float, float, float]:
     """m, c_r, c_l as the controller may know them: the gain at rest of the true G is part of m."""
     ratio = _gain_at_rest(build_true_model(p)) / _gain_at_rest(build_model(p))
-    return p.real('backlash.m') * ratio, p.real('backlash.c_r'), p.real('backlash.c_l')
+    return (
+        p.get_float('backlash.m') * ratio,
+        p.get_float('backlash.c_r'),
+        p.get_float('backlash.c_l'),
+    )
 
 
 def _gain_at_rest(model: TransferFunction) -> float:

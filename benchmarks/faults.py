@@ -77,7 +77,7 @@ def play(seed: int) -> Result:
         warnings.simplefilter('ignore')
         sequence = Sequence(seed)
         p = sequence.p
-        loop = f'{p.word("estimator.law")}, {p.word("structure")}'
+        loop = f'{p.get_str("estimator.law")}, {p.get_str("structure")}'
         try:
             findings = sequence.run()
         except Exception as error:

@@ -239,7 +239,7 @@ def close_loop(
 
 def uncompensated(gear: Gear, parameters: Parameters, motion: str) -> Run:
     """The loop that takes the gap for 0."""
-    m = parameters.real('estimator.initial.m')
+    m = parameters.get_float('estimator.initial.m')
     controller = constant(parameters, m, 0.0, 0.0, DOUBT)
     return close_loop(gear, controller, motion, False, CONSTANT_PERIODS, CONSTANT_FIRST)
 
@@ -248,7 +248,7 @@ def oracle(
     gear: Gear, parameters: Parameters, motion: str, lost: float,
 ) -> tuple[float, tuple[float, float, float]]:
     """Least error with constants, by Nelder and Mead, and these constants (m, c_r, c_l)."""
-    known = parameters.real('estimator.initial.m')
+    known = parameters.get_float('estimator.initial.m')
     begin = np.array([1.0, 0.5, 0.5])
 
     def error(x: Array) -> float:

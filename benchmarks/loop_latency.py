@@ -88,7 +88,7 @@ class Driver:
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._plant, self._reference = build_plant(parameters), build_reference(parameters)
-        self._period = parameters.real('sample_period')
+        self._period = parameters.get_float('sample_period')
         self._v = self._v_before = 0.0
         self._v_came_at = 0.0
         self._answered_at: float | None = None

@@ -38,11 +38,11 @@ NOISE = 1e-3
 def resampled(period_s: float) -> dict[str, object]:
     """plant.numerator and plant.denominator of the example, exact for a v that is held."""
     p = Parameters()
-    a, b, c, _ = signal.tf2ss(p.reals('plant.numerator'), p.reals('plant.denominator'))
+    a, b, c, _ = signal.tf2ss(p.get_floats('plant.numerator'), p.get_floats('plant.denominator'))
     n = len(a)
     held = np.eye(n + 1)
     held[:n, :n], held[:n, n:] = a, b
-    finer = np.real(linalg.expm(linalg.logm(held) * (period_s / p.real('sample_period'))))
+    finer = np.real(linalg.expm(linalg.logm(held) * (period_s / p.get_float('sample_period'))))
     numerator, denominator = signal.ss2tf(finer[:n, :n], finer[:n, n:], c, np.zeros((1, 1)))
     return {
         'plant.numerator': np.trim_zeros(numerator[0], 'f').tolist(),

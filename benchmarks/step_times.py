@@ -94,8 +94,8 @@ class Sampled:
         self, parameters: Parameters, skip: int = 0, budget_s: float | None = None,
     ) -> None:
         self._loop = build_closed_loop(parameters)
-        self._amplitude = parameters.real('amplitude')
-        self._frequency = parameters.real('frequency')
+        self._amplitude = parameters.get_float('amplitude')
+        self._frequency = parameters.get_float('frequency')
         self._applied: tuple[float, ...] = ()
         self._budget_s = inf if budget_s is None else budget_s
         self.refined = 0.0  # time of the newest call of refine [s]
@@ -232,7 +232,7 @@ def refine_rows() -> list[list[str]]:
             parameters = Parameters({
                 'structure': structure, 'output_noise_std': NOISE, 'plant.uncertainty': uncertainty,
             })
-            budget_s = BUDGET * parameters.real('sample_period')
+            budget_s = BUDGET * parameters.get_float('sample_period')
             sampled = Sampled(parameters, budget_s=budget_s)
             done = 0
             for until in (ACQUISITION, STEADY_FROM, STEADY_FROM + TIMED):

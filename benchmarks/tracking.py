@@ -115,7 +115,7 @@ def run_job(job: Job) -> Result:
     p = job.parameters
     loop = build_closed_loop(p)
     if job.reference:
-        period = p.real('sample_period')
+        period = p.get_float('sample_period')
         loop.reference = ReferenceSignal('file', sample_period=period, samples=job.reference)
     delay = loop.controller.structure.delay
     try:
@@ -123,7 +123,7 @@ def run_job(job: Job) -> Result:
             run = loop.run(job.samples)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         return Result(RunRecord(np.zeros((1, len(COLUMNS))), 1.0), np.zeros(1), delay, str(error))
-    u = run.column('u') + p.real('input_disturbance')
+    u = run.column('u') + p.get_float('input_disturbance')
     model = build_model(p)
     return Result(run, signal.lfilter(model.numerator, model.denominator, u), delay)
 
@@ -141,21 +141,25 @@ def adaptive(values: dict[str, object]) -> Parameters:
 
 def without_backlash(values: dict[str, object]) -> Parameters:
     """The same loop with the backlash removed."""
-    slope = Parameters(values).real('backlash.m')
+    slope = Parameters(values).get_float('backlash.m')
     return Parameters({**values, **NO_GAP, **_known(slope, 0.0, 0.0), 'fixed.doubt': 0.0,
                        'backlash.initial_u': 0.0})
 
 
 def uncompensated(values: dict[str, object]) -> Parameters:
     """The same loop without compensation."""
-    slope = Parameters(values).real('backlash.m')
+    slope = Parameters(values).get_float('backlash.m')
     return Parameters({**values, **_known(slope, 0.0, 0.0), 'fixed.doubt': 0.5})
 
 
 def exact(values: dict[str, object]) -> Parameters:
     """The same loop with the true backlash known and no noise."""
     p = Parameters(values)
-    m, c_r, c_l = p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l')
+    m, c_r, c_l = (
+        p.get_float('backlash.m'),
+        p.get_float('backlash.c_r'),
+        p.get_float('backlash.c_l'),
+    )
     return Parameters({**values, **_known(m, c_r, c_l), 'output_noise_std': 0.0})
 
 
@@ -320,9 +324,9 @@ def tracked_case(seed: int) -> tuple[dict[str, object], int]:
     """A case of the estimation benchmark whose reference is one for y, and its period."""
     case = random_case(seed)
     p = case.parameters
-    z = np.exp(1j * p.real('frequency') * p.real('sample_period'))
+    z = np.exp(1j * p.get_float('frequency') * p.get_float('sample_period'))
     gain = abs(complex(build_model(p).response(np.array([z]))[0]))
-    values = {**p, 'structure': 'tracking', 'amplitude': gain * p.real('amplitude')}
+    values = {**p, 'structure': 'tracking', 'amplitude': gain * p.get_float('amplitude')}
     return values, case.samples // 3
 
 
@@ -332,7 +336,7 @@ def point_5(simulate: Simulate, cases: int = 100, first: int = 0) -> Iterator[Ch
     chosen = [tracked_case(seed) for seed in seeds]
     jobs = []
     for values, period in chosen:
-        delay = Parameters(values).integer('tracking.preview')
+        delay = Parameters(values).get_int('tracking.preview')
         jobs += three(values, delay + 8 * period)
     results = simulate(jobs)
     unstable, cancelled = [], 0

@@ -96,7 +96,7 @@ def motor_jobs(
 ) -> Iterator[Job]:
     """The geared motor with the true plant of every case and the backlash of every seed."""
     base = effective_parameters(MOTOR)
-    samples = round(seconds / base.real('sample_period')) + 1
+    samples = round(seconds / base.get_float('sample_period')) + 1
     changed = {name.replace('__', '.'): value for name, value in changes.items()}
     for (name, case), seed in product(cases.items(), seeds):
         p = base.replaced({**changed, **case, **random_backlash(seed)})
@@ -105,7 +105,7 @@ def motor_jobs(
 
 def frozen_reference(p: Parameters, samples: int) -> tuple[float, ...]:
     """The reference of the parameters until it freezes."""
-    reference, period = build_reference(p), p.real('sample_period')
+    reference, period = build_reference(p), p.get_float('sample_period')
     return tuple(reference(min(k * period, FREEZES_AT_S)) for k in range(samples))
 
 

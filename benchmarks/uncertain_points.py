@@ -205,7 +205,7 @@ class Benchmark:
 
 
 def _told(job: Job, factor: float) -> Job:
-    noise = job.parameters.real('estimator.output_noise_std') * factor
+    noise = job.parameters.get_float('estimator.output_noise_std') * factor
     return replace(job, parameters=job.parameters.replaced({'estimator.output_noise_std': noise}))
 
 
@@ -219,7 +219,7 @@ def _leaking(seed: int) -> Job:
 
 
 def _negative(job: Job) -> Job:
-    numerator = [-b for b in job.parameters.reals('plant.numerator')]
+    numerator = [-b for b in job.parameters.get_floats('plant.numerator')]
     return replace(job, parameters=job.parameters.replaced({'truth.numerator': numerator}))
 
 

@@ -84,7 +84,7 @@ def run_job(job: Job) -> Figures:
     loop = build_closed_loop(p)
     loop.plant = plant = Watched(_plant(job))
     if job.reference:
-        period = p.real('sample_period')
+        period = p.get_float('sample_period')
         loop.reference = ReferenceSignal('file', sample_period=period, samples=job.reference)
     models: list[object] = []  # in whose coordinates the state stands, at every sample
     try:
@@ -102,7 +102,9 @@ def _plant(job: Job) -> object:
     if not job.coasts:
         return build_plant(p)
     return CoastingLoad(
-        build_plant(p).backlash, p.real('sample_period'), quantum=p.real('output_quantum'),
+        build_plant(p).backlash,
+        p.get_float('sample_period'),
+        quantum=p.get_float('output_quantum'),
         **job.coasts,
     )
 

@@ -72,7 +72,7 @@ class LoopFuzzer:
 
     def run(self, samples: int) -> None:
         """Raises AssertionError for what must not be."""
-        period = self.parameters.real('sample_period')
+        period = self.parameters.get_float('sample_period')
         lost: list[float] = []  # v of the samples whose y did not come
         for k in range(samples):
             if k == self._until:
@@ -92,7 +92,7 @@ class LoopFuzzer:
         assert isfinite(v), v
         assert LOW <= v <= HIGH, v
         p = self.parameters
-        move = p.real('control.rate_max') * p.real('sample_period')
+        move = p.get_float('control.rate_max') * p.get_float('sample_period')
         assert abs(v - self._v) <= move * (1.0 + 1e-9), (v, self._v)
         assert isfinite(estimate.m), estimate
         assert estimate.m > 0.0, estimate

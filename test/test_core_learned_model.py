@@ -60,8 +60,8 @@ def test_a_model_without_its_delay_is_the_same_with_it(
 def test_delay_of_the_parameters_comes_out_as_it_was_told() -> None:
     p = MOTOR.replaced({'control.delay_samples': 2})
     found = learned(build_closed_loop(p))
-    assert found.numerator == p.reals('plant.numerator')
-    assert found.denominator == p.reals('plant.denominator')
+    assert found.numerator == p.get_floats('plant.numerator')
+    assert found.denominator == p.get_floats('plant.denominator')
     assert found.delay_samples == 2
 
 
@@ -69,7 +69,7 @@ def test_before_anything_is_learned_the_told_model_stands_without_deviations() -
     loop = build_closed_loop(MOTOR)
     found = learned(loop)
     assert (found.numerator, found.denominator) == (
-        MOTOR.reals('plant.numerator'), MOTOR.reals('plant.denominator'))
+        MOTOR.get_floats('plant.numerator'), MOTOR.get_floats('plant.denominator'))
     assert all(map(isnan, (*found.response_std, found.noise_ratio, found.unexplained)))
 
 
@@ -77,7 +77,7 @@ def test_what_was_learned_is_as_sure_as_it_says() -> None:
     p = MOTOR.replaced({'truth.scale_frequency': 1.1, 'output_noise_std': 2e-3})
     found = build_closed_loop(p).run(1200).learned
     assert found is not None
-    assert found.denominator != p.reals('plant.denominator')
+    assert found.denominator != p.get_floats('plant.denominator')
     z = np.exp(2j * np.pi * np.array(FREQUENCIES))
     gain = [build_true_model(p).response(np.ones(1, complex)), build_model(p).response(
         np.ones(1, complex))]
@@ -99,7 +99,7 @@ def test_a_law_that_learns_no_model_goes_by_the_told_one() -> None:
     p = MOTOR.replaced({'estimator.law': 'lms'})
     found = build_closed_loop(p).run(50).learned
     assert found is not None
-    assert found.numerator == p.reals('plant.numerator')
+    assert found.numerator == p.get_floats('plant.numerator')
     assert isnan(found.noise_ratio)
 
 
@@ -116,8 +116,8 @@ def test_fields_hold_all(numbers: list[float], delay: int) -> None:
 
 def test_wrong_sign_is_told_until_there_is_an_estimate() -> None:
     turned = {
-        'truth.numerator': [-b for b in MOTOR.reals('plant.numerator')],
-        'truth.denominator': list(MOTOR.reals('plant.denominator')),
+        'truth.numerator': [-b for b in MOTOR.get_floats('plant.numerator')],
+        'truth.denominator': list(MOTOR.get_floats('plant.denominator')),
     }
     loop = build_closed_loop(MOTOR.replaced(turned))
     assert not law(loop).wrong_sign

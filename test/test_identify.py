@@ -80,14 +80,14 @@ def test_numbers_are_those_of_the_actuator(result: Path) -> None:
 def test_the_file_is_a_complete_configuration(result: Path) -> None:
     parameters = effective_parameters(result / 'identified.yaml')
     numbers = json.loads((result / 'identified.json').read_text())
-    assert parameters.reals('plant.denominator') == pytest.approx(numbers['denominator'])
-    assert parameters.integer('control.delay_samples') == numbers['delay_samples']
-    assert parameters.real('plant.uncertainty') == numbers['uncertainty']
+    assert parameters.get_floats('plant.denominator') == pytest.approx(numbers['denominator'])
+    assert parameters.get_int('control.delay_samples') == numbers['delay_samples']
+    assert parameters.get_float('plant.uncertainty') == numbers['uncertainty']
     # What was given stays, but for the plant that is simulated.
-    assert parameters.real('control.rate_max') == 40.0
-    assert parameters.word('on_stop') == 'zero'
-    assert parameters.real('backlash.m') == 0.5
-    assert parameters.real('input_disturbance') == 0.0
+    assert parameters.get_float('control.rate_max') == 40.0
+    assert parameters.get_str('on_stop') == 'zero'
+    assert parameters.get_float('backlash.m') == 0.5
+    assert parameters.get_float('input_disturbance') == 0.0
     build_controller(parameters)
 
 
@@ -335,7 +335,7 @@ def test_an_axis_gets_a_file_of_its_own(
     assert 'choose one, like --axis x' in capsys.readouterr().err
     assert main([*given, '--axis', 'z']) == 0
     found = effective_parameters(tmp_path / 'out' / 'identified.yaml', axis='z')
-    assert found.real('control.max') == 5.0
+    assert found.get_float('control.max') == 5.0
 
 
 def test_a_longer_record_than_is_searched_is_fitted_as_a_whole(tmp_path: Path) -> None:

@@ -47,8 +47,8 @@ def test_who_listens_late_hears_the_told_model_before_anything_is_learned(tmp_pa
         heard = models_heard(probe)
         probe.wait_until(lambda: heard, 'the model')
         model = model_of(heard[-1])
-        assert model.numerator == P.reals('plant.numerator')
-        assert model.denominator == P.reals('plant.denominator')
+        assert model.numerator == P.get_floats('plant.numerator')
+        assert model.denominator == P.get_floats('plant.denominator')
         assert model.delay_samples == 1
         assert all(map(isnan, (*model.response_std, model.noise_ratio, model.unexplained)))
         assert controller.stop() == 0
@@ -92,7 +92,7 @@ def test_negative_slope_is_an_error_within_two_seconds(tmp_path: Path) -> None:
         )
         label = topics.SIGNAL_LABELS.index('sample')
         first = driver.signals[0].data[label]
-        assert (driver.signals[-1].data[label] - first) * P.real('sample_period') < 2.0
+        assert (driver.signals[-1].data[label] - first) * P.get_float('sample_period') < 2.0
         driver.run_until(
             lambda: driver.says('plant_output moves against v: reverse it'), 'the sign'
         )

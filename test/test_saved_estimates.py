@@ -37,7 +37,7 @@ def test_saved_estimate_comes_back_to_the_last_bit(
 ) -> None:
     p = parameters(tmp_path_factory.mktemp('saved') / 'estimates.json')
     estimate = Estimate(m, c_r, c_l, f, std, std, std)
-    save_estimate(Path(p.word('estimates.file')), estimate, p)
+    save_estimate(Path(p.get_str('estimates.file')), estimate, p)
     loaded = load_estimate(p)
     assert loaded is not None
     assert (loaded.m, loaded.c_r, loaded.c_l, loaded.f) == (m, c_r, c_l, f)

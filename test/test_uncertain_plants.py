@@ -89,7 +89,7 @@ def test_figures_of_a_loop_that_knows_everything() -> None:
 def test_estimate_that_is_confidently_wrong_counts_as_long_as_it_is_said_to_be_tracking() -> None:
     job = motor_job({}, 1.0)
     p = ideal(job).parameters
-    wrong = p.replaced({'estimator.initial.c_r': 2.0 * p.real('backlash.c_r')})
+    wrong = p.replaced({'estimator.initial.c_r': 2.0 * p.get_float('backlash.c_r')})
     assert run_job(Job(EXACT, 3, wrong, job.samples)).wrong_s == pytest.approx(1.0, abs=0.01)
 
 

@@ -71,25 +71,25 @@ def build_controller(p: Parameters, inherited: Estimate | None = None) -> Adapti
     check_model(build_model(p))
     _check_first_guess(p)
     check_last_commands(p)
-    period = p.real('sample_period')
+    period = p.get_float('sample_period')
     inverse = BacklashInverse(
-        p.real('inverse.direction_band'), p.real('inverse.take_up_rate') * period
+        p.get_float('inverse.direction_band'), p.get_float('inverse.take_up_rate') * period
     )
     _check_structure(p)
-    estimator = ESTIMATORS[p.word('estimator.law')](p, inherited or _initial(p))
+    estimator = ESTIMATORS[p.get_str('estimator.law')](p, inherited or _initial(p))
     learner = None
-    if isinstance(estimator, MovingHorizon) and p.flag('plant.adapt'):
+    if isinstance(estimator, MovingHorizon) and p.get_bool('plant.adapt'):
         learner = estimator
     return AdaptiveController(estimator, build_structure(p), inverse, build_limits(p), learner)
 
 
 def build_structure(p: Parameters) -> Structure:
     """The linear part alone."""
-    return STRUCTURES[p.word('structure')](p)
+    return STRUCTURES[p.get_str('structure')](p)
 
 
 def _check_structure(p: Parameters) -> None:
-    law, structure = p.word('estimator.law'), p.word('structure')
+    law, structure = p.get_str('estimator.law'), p.get_str('structure')
     if not law_fits(law, structure):
         raise ParameterError(
             'structure', structure, f'must be {ONLY_IN[law]} for estimator.law: {law}',
@@ -101,13 +101,13 @@ def _check_first_guess(p: Parameters) -> None:
     bounds = _bounds(p)
     for name in ('m', 'c_r', 'c_l'):
         low, high = getattr(bounds, name)
-        value = p.real(f'estimator.initial.{name}')
+        value = p.get_float(f'estimator.initial.{name}')
         if not low <= value <= high:
             raise ParameterError(
                 f'estimator.initial.{name}', value, f'must lie within [{low:g}, {high:g}]',
                 f'change it or estimator.bounds.{name}',
             )
-    low, high = p.pair('proportional.bounds')
+    low, high = p.get_pair('proportional.bounds')
     if low >= high:
         raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')
 
@@ -117,72 +117,72 @@ def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
 
     with_reference: whether the parameters of the reference are those in use.
     """
-    frequency = p.real('frequency') if with_reference else None
-    return model_warnings(build_model(p), p.real('sample_period'), frequency)
+    frequency = p.get_float('frequency') if with_reference else None
+    return model_warnings(build_model(p), p.get_float('sample_period'), frequency)
 
 
 def build_limits(p: Parameters) -> Limits:
     """Limits of v per sample."""
-    rate = p.real('control.rate_max')
-    move = inf if rate == inf else rate * p.real('sample_period')
-    return Limits(p.real('control.min'), p.real('control.max'), move)
+    rate = p.get_float('control.rate_max')
+    move = inf if rate == inf else rate * p.get_float('sample_period')
+    return Limits(p.get_float('control.min'), p.get_float('control.max'), move)
 
 
 def _bounds(p: Parameters) -> Bounds:
     return Bounds(
-        p.pair('estimator.bounds.m'), p.pair('estimator.bounds.c_r'),
-        p.pair('estimator.bounds.c_l'),
+        p.get_pair('estimator.bounds.m'), p.get_pair('estimator.bounds.c_r'),
+        p.get_pair('estimator.bounds.c_l'),
     )
 
 
 def _initial(p: Parameters) -> Estimate:
     return Estimate(
-        p.real('estimator.initial.m'), p.real('estimator.initial.c_r'),
-        p.real('estimator.initial.c_l'), p.real('proportional.f'),
+        p.get_float('estimator.initial.m'), p.get_float('estimator.initial.c_r'),
+        p.get_float('estimator.initial.c_l'), p.get_float('proportional.f'),
     )
 
 
 def _reconstruction(p: Parameters) -> InputReconstruction:
-    noise_std = p.real('estimator.output_noise_std') * LITTLE_SMOOTHING
+    noise_std = p.get_float('estimator.output_noise_std') * LITTLE_SMOOTHING
     try:
-        return InputReconstruction(build_model(p), noise_std, p.integer('estimator.lag'))
+        return InputReconstruction(build_model(p), noise_std, p.get_int('estimator.lag'))
     except ArithmeticError as error:
         raise ParameterError(
-            'estimator.output_noise_std', p.real('estimator.output_noise_std'), str(error),
+            'estimator.output_noise_std', p.get_float('estimator.output_noise_std'), str(error),
             'give the standard deviation of the noise on y, in the unit of y',
         ) from None
 
 
 def _moving_horizon(p: Parameters, initial: Estimate) -> Estimator:
     observer = None
-    if p.word('structure') != 'proportional':
+    if p.get_str('structure') != 'proportional':
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
         observer = FixedBacklash(
-            given, build_state_model(p), p.real('estimator.output_noise_std'),
+            given, build_state_model(p), p.get_float('estimator.output_noise_std'),
             DOUBT_OF_FIRST_GUESS,
         )
     return MovingHorizon(
-        initial, _bounds(p), build_state_model(p), p.real('estimator.output_noise_std'),
-        p.real('estimator.input_noise_std'), p.triple('estimator.drift_std'),
-        p.real('sample_period'), p.real('plant.uncertainty'), observer,
+        initial, _bounds(p), build_state_model(p), p.get_float('estimator.output_noise_std'),
+        p.get_float('estimator.input_noise_std'), p.get_triple('estimator.drift_std'),
+        p.get_float('sample_period'), p.get_float('plant.uncertainty'), observer,
     )
 
 
 def _lms(p: Parameters, initial: Estimate) -> Estimator:
     return NormalisedLms(
-        initial, _bounds(p), p.pair('proportional.bounds'), _reconstruction(p),
-        p.real('lms.step'), p.real('lms.step_f'),
+        initial, _bounds(p), p.get_pair('proportional.bounds'), _reconstruction(p),
+        p.get_float('lms.step'), p.get_float('lms.step_f'),
     )
 
 
 def _printed(p: Parameters, initial: Estimate) -> Estimator:
-    return PrintedLaw(initial, _bounds(p), p.pair('proportional.bounds'), _reconstruction(p))
+    return PrintedLaw(initial, _bounds(p), p.get_pair('proportional.bounds'), _reconstruction(p))
 
 
 def _fixed(p: Parameters, initial: Estimate) -> Estimator:
     return FixedBacklash(
-        initial, build_state_model(p), p.real('estimator.output_noise_std'),
-        p.real('fixed.doubt'),
+        initial, build_state_model(p), p.get_float('estimator.output_noise_std'),
+        p.get_float('fixed.doubt'),
     )
 
 
@@ -194,8 +194,8 @@ def law_fits(law: str, structure: str) -> bool:
 def _gradient(p: Parameters, initial: Estimate) -> Estimator:
     blocks = build_four_blocks(p)
     return GradientEstimator(
-        initial, _bounds(p), blocks, build_model(p).order, p.real('gradient.step'),
-        p.real('estimator.output_noise_std'),
+        initial, _bounds(p), blocks, build_model(p).order, p.get_float('gradient.step'),
+        p.get_float('estimator.output_noise_std'),
     )
 
 
@@ -210,20 +210,20 @@ def _pole_placement(p: Parameters) -> Structure:
 def build_four_blocks(p: Parameters) -> FourBlocks:
     """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
     model, state = build_model(p), build_state_model(p)
-    weight = p.real('tracking.input_weight') * power_gain(model, np.pi / 10.0)
+    weight = p.get_float('tracking.input_weight') * power_gain(model, np.pi / 10.0)
     gains = lq_gains(state, weight)
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
-    return place_poles(model, closed, p.real('pole_placement.filter_pole'))
+    return place_poles(model, closed, p.get_float('pole_placement.filter_pole'))
 
 
 def _tracking(p: Parameters) -> Structure:
     weights = Weights(
-        p.real('tracking.input_weight'), p.real('tracking.integral_weight'),
-        p.integer('tracking.preview'),
+        p.get_float('tracking.input_weight'), p.get_float('tracking.integral_weight'),
+        p.get_int('tracking.preview'),
     )
     return Tracking(
-        design(build_state_model(p), weights), weights, p.real('inverse.caution'),
-        p.real('estimator.output_noise_std'),
+        design(build_state_model(p), weights), weights, p.get_float('inverse.caution'),
+        p.get_float('estimator.output_noise_std'),
     )
 
 

@@ -18,8 +18,10 @@ from backlash_ros.core.reference.signal import ReferenceSignal
 
 def build_model(p: Parameters) -> TransferFunction:
     """G(z), and the delay between control and its effect as poles at 0."""
-    delay = (0.0,) * p.integer('control.delay_samples')
-    return TransferFunction(p.reals('plant.numerator'), p.reals('plant.denominator') + delay)
+    delay = (0.0,) * p.get_int('control.delay_samples')
+    return TransferFunction(
+        p.get_floats('plant.numerator'), p.get_floats('plant.denominator') + delay
+    )
 
 
 def build_true_model(p: Parameters) -> TransferFunction:
@@ -27,17 +29,18 @@ def build_true_model(p: Parameters) -> TransferFunction:
 
     Raises ParameterError where that G(z) cannot be altered as truth.* asks.
     """
-    delay = p.integer('truth.delay_samples')
+    delay = p.get_int('truth.delay_samples')
     if delay < 0:
-        delay = p.integer('control.delay_samples')
-    numerator, denominator = p.reals('truth.numerator'), p.reals('truth.denominator')
+        delay = p.get_int('control.delay_samples')
+    numerator, denominator = p.get_floats('truth.numerator'), p.get_floats('truth.denominator')
     base = TransferFunction(
-        numerator or p.reals('plant.numerator'), denominator or p.reals('plant.denominator'),
+        numerator or p.get_floats('plant.numerator'),
+        denominator or p.get_floats('plant.denominator'),
         'truth' if numerator or denominator else 'plant',
     )
     altered = altered_plant(base, Alteration(
-        p.real('truth.scale_frequency'), p.real('truth.scale_damping'),
-        p.real('truth.extra_lag') / p.real('sample_period'),
+        p.get_float('truth.scale_frequency'), p.get_float('truth.scale_damping'),
+        p.get_float('truth.extra_lag') / p.get_float('sample_period'),
     ))
     return delayed(altered, delay)
 
@@ -45,24 +48,33 @@ def build_true_model(p: Parameters) -> TransferFunction:
 def build_plant(p: Parameters) -> SimulatedPlant:
     """The simulated plant with its hidden backlash."""
     backlash = Backlash(
-        p.real('backlash.m'), p.real('backlash.c_r'), p.real('backlash.c_l'),
-        p.real('backlash.initial_u'),
+        p.get_float('backlash.m'), p.get_float('backlash.c_r'), p.get_float('backlash.c_l'),
+        p.get_float('backlash.initial_u'),
     )
     imperfections = Imperfections(
-        p.real('output_noise_std'), p.real('output_quantum'), p.real('input_disturbance'),
-        p.real('truth.walk_std'), p.triple('backlash.rate'), p.real('backlash.jump_time'),
-        p.triple('backlash.jump'),
+        p.get_float('output_noise_std'),
+        p.get_float('output_quantum'),
+        p.get_float('input_disturbance'),
+        p.get_float('truth.walk_std'),
+        p.get_triple('backlash.rate'),
+        p.get_float('backlash.jump_time'),
+        p.get_triple('backlash.jump'),
     )
-    rng = np.random.default_rng(p.integer('seed'))
+    rng = np.random.default_rng(p.get_int('seed'))
     return SimulatedPlant(
-        build_true_model(p), backlash, p.real('sample_period'), rng, imperfections
+        build_true_model(p), backlash, p.get_float('sample_period'), rng, imperfections
     )
 
 
 def build_reference(p: Parameters) -> ReferenceSignal:
     """y_m(t); reads the file for waveform: file."""
     return ReferenceSignal(
-        p.word('waveform'), p.real('amplitude'), p.real('frequency'), p.real('bias'),
-        p.real('frequency_start'), p.real('sweep_time'), p.real('sample_period'),
+        p.get_str('waveform'),
+        p.get_float('amplitude'),
+        p.get_float('frequency'),
+        p.get_float('bias'),
+        p.get_float('frequency_start'),
+        p.get_float('sweep_time'),
+        p.get_float('sample_period'),
         read_reference_file(p),
     )

@@ -69,21 +69,21 @@ class ControllerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__(CONTROLLER)
         p = self.settings
-        if p.flag('lockstep') and p.word('io.style') != 'native':
+        if p.get_bool('lockstep') and p.get_str('io.style') != 'native':
             raise ParameterError('lockstep', True, 'needs io.style: native')
         # Whatever is wrong with the parameters ends the process before it takes part in anything.
         build_controller(p, load_estimate(p))
         for warning in warnings_of(p, with_reference=False):
             self.log.warning(warning)
         self.loop: ControlLoop | None = None  # None while unconfigured
-        self._lockstep = p.flag('lockstep')
+        self._lockstep = p.get_bool('lockstep')
         self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
         # Whoever waits for the others begins with them; who does not may have been restarted.
         self._set_up(
-            p, from_zero=not self._lockstep and p.integer('wait_for_subscribers') > 0
+            p, from_zero=not self._lockstep and p.get_int('wait_for_subscribers') > 0
         )
-        self._saver = EstimateSaver(p.word('estimates.file'))
+        self._saver = EstimateSaver(p.get_str('estimates.file'))
         self._saved_at = time.monotonic()
         self._queues: tuple[deque[Any], deque[Any], deque[Any]] = (deque(), deque(), deque())
         self._ticks, self._references, self._outputs = self._queues
@@ -99,7 +99,7 @@ class ControllerNode(ManagedNode):
         self._steps = StepPublisher(self)
         self._model = ModelPublisher(self)
         self._diagnostics = DiagnosticsPublisher(
-            self, p.word('io.joint') or self._io.publisher.topic_name
+            self, p.get_str('io.joint') or self._io.publisher.topic_name
         )
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         self._reference = self.create_subscription(
@@ -123,17 +123,17 @@ class ControllerNode(ManagedNode):
         if not self._lockstep:
             self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
         self._announce()
-        if p.flag('autostart'):
+        if p.get_bool('autostart'):
             self.start()
 
     def _announce(self) -> None:
         """Say in the log what the node is about."""
         p, output, control = self.settings, self._io.topics.output, self._io.topics.control
-        name, period = self.resolve_topic_name, p.real('sample_period')
+        name, period = self.resolve_topic_name, p.get_float('sample_period')
         self.log.info(
             f'started: {name(output)} and {name(topics.REFERENCE)} in, {name(control)} out, '
             f'sample_period {period:g} s ({1.0 / period:.4g} Hz); '
-            + (f'waits for {topics.REFERENCE} and {output}' if p.flag('autostart')
+            + (f'waits for {topics.REFERENCE} and {output}' if p.get_bool('autostart')
                else 'autostart is false: waits for '
                     f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
         )
@@ -182,7 +182,7 @@ class ControllerNode(ManagedNode):
 
     def _knows_rivals(self) -> bool:
         """Whether no controller of this machine has still to be found that may be in charge."""
-        return self._rivals.complete or self._live.parameters.word('on_rival') == 'warn'
+        return self._rivals.complete or self._live.parameters.get_str('on_rival') == 'warn'
 
     def _await_loop(self) -> None:
         """Listen to plant_output as soon as everybody is there."""
@@ -200,7 +200,7 @@ class ControllerNode(ManagedNode):
         if loop.last is not None:
             if not loop.standing_down:
                 self._last_commands.send_all(
-                    loop, p.word('on_stop'), p.real('timeout.ramp'), self._diagnose
+                    loop, p.get_str('on_stop'), p.get_float('timeout.ramp'), self._diagnose
                 )
             self._save(loop)
             self._model.publish(loop)
@@ -225,7 +225,7 @@ class ControllerNode(ManagedNode):
 
     def _conditions_of_start(self) -> list[Callable[[], bool]]:
         """What has to be there before plant_output is listened to, for that starts the loop."""
-        wanted = max(self.settings.integer('wait_for_subscribers'), int(self._lockstep))
+        wanted = max(self.settings.get_int('wait_for_subscribers'), int(self._lockstep))
         if not wanted:
             return []
         return [
@@ -240,7 +240,7 @@ class ControllerNode(ManagedNode):
         # Whoever is activated twice before everybody is there has two that wait.
         if self._driver is None:
             self._rivals.look()
-            kept = max(KEPT_S / self.settings.real('sample_period'), KEPT_OUTPUTS)
+            kept = max(KEPT_S / self.settings.get_float('sample_period'), KEPT_OUTPUTS)
             self._driver = self._io.listen(self._on_output, round(min(kept, DEPTH)))
             emit('ready')
 
@@ -306,7 +306,7 @@ class ControllerNode(ManagedNode):
     def _follow_up(self, loop: ControlLoop, step: ControlStep, was_silent: bool) -> None:
         """Tell of a step."""
         self._steps.publish(loop, step)
-        self._model.follow(loop, self.settings.real('sample_period'))
+        self._model.follow(loop, self.settings.get_float('sample_period'))
         if was_silent or step.estimate.status != self._told:
             self._told = step.estimate.status
             self._diagnose()
@@ -317,7 +317,7 @@ class ControllerNode(ManagedNode):
         changes = p[NOISE] != self._live.parameters[NOISE]
         if self.loop is not None and changes and not self.loop.takes_up_noise:
             raise ParameterError(
-                NOISE, p[NOISE], f'is not taken up live by {p.word("estimator.law")}',
+                NOISE, p[NOISE], f'is not taken up live by {p.get_str("estimator.law")}',
                 'clean the node up, set it, and configure again',
             )
 
@@ -326,14 +326,14 @@ class ControllerNode(ManagedNode):
         if self.loop is not None:
             self.loop.take_up(p)
         else:
-            self._saver.file = p.word('estimates.file')
+            self._saver.file = p.get_str('estimates.file')
             if p['sample_period'] != before['sample_period']:
                 self._set_up(p, from_zero=False)
         self._mind_rivals()
 
     def _set_up(self, p: Parameters, from_zero: bool) -> None:
         """Take up what follows from the sample period."""
-        period = p.real('sample_period')
+        period = p.get_float('sample_period')
         self._post_command_sleep_s, self._period_ns = POST_COMMAND_SLEEP * period, period * 1e9
         self._refine_budget_s = REFINE_SHARE * period
         self._counter = SampleCounter(period, from_zero)
@@ -341,7 +341,7 @@ class ControllerNode(ManagedNode):
     def _mind_rivals(self) -> None:
         """Stand down or command again, as on_rival says, and tell of it."""
         loop, found = self.loop, self._rivals.found
-        on_rival = self._live.parameters.word('on_rival')
+        on_rival = self._live.parameters.get_str('on_rival')
         stand_down = on_rival == 'stand_down' and not self._rivals.came_first
         if loop is not None and stand_down != loop.standing_down:
             if stand_down:
@@ -363,16 +363,16 @@ class ControllerNode(ManagedNode):
         if loop is None or not self.active:
             return
         self._save_now_and_then(loop)
-        timeout = self._live.parameters.real('timeout.plant_output')
+        timeout = self._live.parameters.get_float('timeout.plant_output')
         if loop.heard_at is None or loop.silent or timeout == 0.0:
             return
         if time.monotonic() > loop.heard_at + timeout:
             loop.give_up()
-            self._last_commands.begin(loop, self._live.parameters.word('on_timeout'))
+            self._last_commands.begin(loop, self._live.parameters.get_str('on_timeout'))
             self._diagnose()
 
     def _save_now_and_then(self, loop: ControlLoop) -> None:
-        period = self._live.parameters.real('estimates.save_period')
+        period = self._live.parameters.get_float('estimates.save_period')
         if period > 0.0 and time.monotonic() > self._saved_at + period:
             self._saved_at = time.monotonic()
             self._save(loop)

@@ -129,27 +129,27 @@ class RecorderNode(ProcessNode):
     def __init__(self) -> None:
         super().__init__(RECORDER)
         p = self.settings
-        self._lockstep = p.flag('lockstep')
+        self._lockstep = p.get_bool('lockstep')
         self._now_ns = 0  # simulated time
         self._bag: Bag | None = None
         self._diagnostics: DiagnosticsPublisher | None = None
         self.failure = ''  # why the recording has stopped before its time
         self._channels: list[Channel] = []
         self._progress = Progress()
-        if p.word('bag'):
-            self._open_bag(p.word('bag'), p.word('storage'))
-            self.log.info(f"started: records to {p.word('bag')} ({p.word('storage')})")
+        if p.get_str('bag'):
+            self._open_bag(p.get_str('bag'), p.get_str('storage'))
+            self.log.info(f"started: records to {p.get_str('bag')} ({p.get_str('storage')})")
         else:
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
-        self._driver = STYLES[p.word('io.style')]
+        self._driver = STYLES[p.get_str('io.style')]
         wanted = (*NEEDED_PUBLISHERS, self._driver.control)
         recorded = {**OF_THE_LOOP, self._driver.control: self._driver.control_type}
         for topic, message_type in recorded.items():
             # A G that was learned before this recorder came belongs into the bag as well.
             qos: QoSProfile | int = KEPT if topic == topics.MODEL else DEPTH
             subscription = self._record(topic, message_type, qos)
-            if p.flag('wait_for_publishers') and topic in wanted:
+            if p.get_bool('wait_for_publishers') and topic in wanted:
                 needed.append(subscription)
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, DEPTH)

@@ -35,8 +35,11 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
     Raises ParameterError where a limit is missing or the limits exclude each other.
     """
     excursion = inf if amplitude is None else amplitude
-    low, high = max(p.real('control.min'), -excursion), min(p.real('control.max'), excursion)
-    speed = min(p.real('control.rate_max'), inf if rate is None else rate)
+    low, high = (
+        max(p.get_float('control.min'), -excursion),
+        min(p.get_float('control.max'), excursion),
+    )
+    speed = min(p.get_float('control.rate_max'), inf if rate is None else rate)
     for name, value in (('control.min', low), ('control.max', high)):
         if abs(value) == inf:
             raise ParameterError(

@@ -50,7 +50,7 @@ class ControlLoop:
     ) -> None:
         self.statistics = LoopStatistics()
         self.counter = counter
-        self.commands = CommandHistory(p.real('sample_period'), report_use(p))
+        self.commands = CommandHistory(p.get_float('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
         self.v, self.knows_v = v or 0.0, v is not None
         self.silent = self.standing_down = False
@@ -58,7 +58,7 @@ class ControlLoop:
         self.last: ControlStep | None = None
         self.heard_at: float | None = None  # on the steady clock [s]
         self._p, self._send, self._now_ns = p, send, now_ns
-        self._lockstep = p.flag('lockstep')
+        self._lockstep = p.get_bool('lockstep')
         self._missing = 0  # outputs since the newest one that was used
         self._unsent = 0  # those of them that were never published
         self._restarted = False  # whether sender or clock restarted since then
@@ -213,15 +213,15 @@ class ControlLoop:
         before, self._p = self._p, p
         core = self.core
         core.limits = build_limits(p)
-        core.inverse.set_band(p.real('inverse.direction_band'))
-        core.inverse.take_up = p.real('inverse.take_up_rate') * p.real('sample_period')
+        core.inverse.set_band(p.get_float('inverse.direction_band'))
+        core.inverse.take_up = p.get_float('inverse.take_up_rate') * p.get_float('sample_period')
         if isinstance(core.estimator, NormalisedLms):
-            core.estimator.step = p.real('lms.step')
-            core.estimator.step_f = p.real('lms.step_f')
+            core.estimator.step = p.get_float('lms.step')
+            core.estimator.step_f = p.get_float('lms.step_f')
         if isinstance(core.estimator, MovingHorizon):
             core.estimator.set_noise(
-                p.real('estimator.output_noise_std'), p.real('estimator.input_noise_std'),
-                np.array(p.triple('estimator.drift_std')) * p.real('sample_period')**0.5,
+                p.get_float('estimator.output_noise_std'), p.get_float('estimator.input_noise_std'),
+                np.array(p.get_triple('estimator.drift_std')) * p.get_float('sample_period')**0.5,
             )
         if any(p[name] != before[name] for name in OF_THE_STRUCTURE):
             structure = build_structure(p)
@@ -244,9 +244,10 @@ class ControlLoop:
 
     def _interrupt_if_long(self) -> None:
         """Begin with a new core where there is too much to step over."""
-        timeout = self._p.real('timeout.plant_output')
+        timeout = self._p.get_float('timeout.plant_output')
         too_long = self._missing > LONGEST_GAP or (
-            not self._lockstep and 0.0 < timeout < self._missing * self._p.real('sample_period')
+            not self._lockstep
+            and 0.0 < timeout < self._missing * self._p.get_float('sample_period')
         )
         if self.silent or self._restarted or (too_long and self._begun):
             self.statistics.interruptions += 1

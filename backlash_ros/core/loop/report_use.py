@@ -26,9 +26,9 @@ def report_use(p: Parameters) -> ReportUse:
     With control.delay_samples a driver may report v before or after that delay: auto leaves it
     alone then. In lockstep every v is applied at once.
     """
-    use = ReportUse(p.word('estimator.use_applied_control'))
-    delayed = use is ReportUse.AUTO and p.integer('control.delay_samples') > 0
-    return ReportUse.NEVER if delayed or p.flag('lockstep') else use
+    use = ReportUse(p.get_str('estimator.use_applied_control'))
+    delayed = use is ReportUse.AUTO and p.get_int('control.delay_samples') > 0
+    return ReportUse.NEVER if delayed or p.get_bool('lockstep') else use
 
 
 class ReportTrust:

@@ -31,9 +31,9 @@ class Parameters(Mapping[str, Value]):
         if NOISE not in given:
             # Whoever simulates noise means the estimator to know it, unless told otherwise.
             simulated = hypot(
-                self.real('output_noise_std'), self.real('output_quantum') / sqrt(12.0)
+                self.get_float('output_noise_std'), self.get_float('output_quantum') / sqrt(12.0)
             )
-            self._values[NOISE] = max(self.real(NOISE), simulated)
+            self._values[NOISE] = max(self.get_float(NOISE), simulated)
 
     def __getitem__(self, name: str) -> Value:
         return self._values[name]
@@ -44,50 +44,50 @@ class Parameters(Mapping[str, Value]):
     def __len__(self) -> int:
         return len(self._values)
 
-    def real(self, name: str) -> float:
+    def get_float(self, name: str) -> float:
         """Value of a parameter of type float."""
         value = self._values[name]
         assert isinstance(value, float)
         return value
 
-    def integer(self, name: str) -> int:
+    def get_int(self, name: str) -> int:
         """Value of a parameter of type int."""
         value = self._values[name]
         assert isinstance(value, int)
         return value
 
-    def flag(self, name: str) -> bool:
+    def get_bool(self, name: str) -> bool:
         """Value of a parameter of type bool."""
         value = self._values[name]
         assert isinstance(value, bool)
         return value
 
-    def word(self, name: str) -> str:
+    def get_str(self, name: str) -> str:
         """Value of a parameter of type str."""
         value = self._values[name]
         assert isinstance(value, str)
         return value
 
-    def reals(self, name: str) -> tuple[float, ...]:
+    def get_floats(self, name: str) -> tuple[float, ...]:
         """Value of a list parameter."""
         value = self._values[name]
         assert isinstance(value, tuple)
         return cast(tuple[float, ...], value)
 
-    def names(self, name: str) -> tuple[str, ...]:
+    def get_strs(self, name: str) -> tuple[str, ...]:
         """Value of a parameter that is a list of names."""
         value = self._values[name]
         assert isinstance(value, tuple)
         return cast(tuple[str, ...], value)
 
-    def pair(self, name: str) -> tuple[float, float]:
+    def get_pair(self, name: str) -> tuple[float, float]:
         """Value of a list parameter of length 2."""
-        low, high = self.reals(name)
+        low, high = self.get_floats(name)
         return low, high
 
-    def triple(self, name: str) -> tuple[float, float, float]:
+    def get_triple(self, name: str) -> tuple[float, float, float]:
         """Value of a list parameter of length 3."""
-        first, second, third = self.reals(name)
+        first, second, third = self.get_floats(name)
         return first, second, third
 
     def replaced(self, changes: Mapping[str, object]) -> Parameters:
@@ -97,7 +97,7 @@ class Parameters(Mapping[str, Value]):
 
 def missing_limits(p: Parameters) -> list[str]:
     """Names of the limits of v that are infinite."""
-    return [name for name in LIMITS if isinf(p.real(name))]
+    return [name for name in LIMITS if isinf(p.get_float(name))]
 
 
 def check_names(names: Iterable[str]) -> None:

@@ -31,7 +31,7 @@ class FirstCommand:
         """The v that acts as far as this node can know, None if it cannot."""
         if self.before is not None:
             return self.before
-        initial = p.real('control.initial')
+        initial = p.get_float('control.initial')
         # In lockstep there is the simulated plant alone, which begins at 0.
         return initial if isfinite(initial) and self._reports is not None else None
 

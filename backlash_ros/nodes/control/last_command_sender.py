@@ -25,7 +25,7 @@ class LastCommandSender:
 
     @property
     def _step_s(self) -> float:
-        return max(self._node.settings.real('sample_period'), SHORTEST_STEP_S)
+        return max(self._node.settings.get_float('sample_period'), SHORTEST_STEP_S)
 
     def begin(self, loop: ControlLoop, action: str) -> None:
         """Send them from a timer while the node goes on."""

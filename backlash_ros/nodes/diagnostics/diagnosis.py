@@ -74,15 +74,15 @@ class Diagnosis:
         if status != Status.INCONSISTENT:
             self._consistent_at = time.monotonic()
         gap = loop.estimate.c_r - loop.estimate.c_l
-        timeout = p.real('timeout.reference')
-        overdue = reference_at_s is not None and not p.flag('lockstep') \
+        timeout = p.get_float('timeout.reference')
+        overdue = reference_at_s is not None and not p.get_bool('lockstep') \
             and 0.0 < timeout < time.monotonic() - reference_at_s
         control = io.topics.control
         estimator = loop.core.estimator
         unexplained, wrong_sign = (estimator.unexplained, estimator.wrong_sign) \
             if isinstance(estimator, MovingHorizon) else (nan, False)
         return LoopFigures(
-            p.real('sample_period'),
+            p.get_float('sample_period'),
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
             publishers_of(node, topics.REFERENCE, Float64, self._reference_qos),
             subscribers_of(node, control, io.topics.control_type), rivals,
@@ -90,14 +90,14 @@ class Diagnosis:
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
             unexplained=unexplained, wrong_sign=wrong_sign, adapting=loop.adapting,
             given=was_given(loop.estimate),
-            silent_s=p.real('timeout.plant_output') if loop.silent else 0.0,
-            on_timeout=p.word('on_timeout'),
+            silent_s=p.get_float('timeout.plant_output') if loop.silent else 0.0,
+            on_timeout=p.get_str('on_timeout'),
             referred=isfinite(loop.y_m),
             reference_silent_s=timeout if overdue else 0.0,
             # In lockstep the outputs come as fast as the machine goes.
-            intervals_s=(nan, nan, nan) if p.flag('lockstep') else statistics.intervals_s(),
+            intervals_s=(nan, nan, nan) if p.get_bool('lockstep') else statistics.intervals_s(),
             # Stamps of simulated time have nothing to do with the time of arrival.
-            age_s=nan if p.flag('lockstep') or io.simulated_time else statistics.age_s(),
+            age_s=nan if p.get_bool('lockstep') or io.simulated_time else statistics.age_s(),
             still=statistics.still,
             v_swing=statistics.still_swing / gap if gap > 0.0 else 0.0,
             **lately,
@@ -108,7 +108,7 @@ class Diagnosis:
         if not io.skipped:
             return []
         text = (
-            f'{io.topics.output} has no {p.word("io.field")} of joint {p.word("io.joint")!r} but '
+            f'{io.topics.output} has no {p.get_str("io.field")} of joint {p.get_str("io.joint")!r} but '
             f'{io.seen}: set io.joint, io.field'
         )
         return [Finding(Level.ERROR, 'joint', text[:LONGEST_TEXT])]

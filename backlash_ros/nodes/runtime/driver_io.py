@@ -41,7 +41,7 @@ STYLES = {
 
 def output_qos(p: Parameters, depth: int) -> QoSProfile:
     """How y is listened to."""
-    best_effort = p.flag('io.best_effort')
+    best_effort = p.get_bool('io.best_effort')
     return QoSProfile(depth=depth, reliability=(
         ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
     ))
@@ -57,8 +57,8 @@ class DriverIo:
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
         self.skipped, self.seen = 0, ''
         self._node, self._p = node, p
-        self.topics = STYLES[p.word('io.style')]
-        self._joint, self._field = p.word('io.joint'), p.word('io.field')
+        self.topics = STYLES[p.get_str('io.style')]
+        self._joint, self._field = p.get_str('io.joint'), p.get_str('io.field')
         # On simulated time the stamps of the middleware, which are real time, say nothing.
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._publisher: Publisher | None = None

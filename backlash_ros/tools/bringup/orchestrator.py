@@ -57,7 +57,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     if len(names) > MOST_AXES:
         raise InputError(f'{len(names)} axes are too many for one machine: at most {MOST_AXES}')
     parameters = {name: _parameters(configuration, name, options) for name in names}
-    if options.unlimited and not any(values.word(DRIVER) for values in parameters.values()):
+    if options.unlimited and not any(values.get_str(DRIVER) for values in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
     live_port = _live_port(options)
     _check_files(parameters)
@@ -91,20 +91,23 @@ def _parameters(
     parameters = configuration.parameters(axis)
     try:
         changes: dict[str, object] = {
-            'lockstep': options.lockstep or parameters.flag('lockstep'),
+            'lockstep': options.lockstep or parameters.get_bool('lockstep'),
             'samples': _samples(parameters, options.duration),
         }
         if options.driver is not None:
             changes[DRIVER] = options.driver
         parameters = check_driver(axis, parameters.replaced(changes))
-        if parameters.word(DRIVER) and not options.unlimited:
+        if parameters.get_str(DRIVER) and not options.unlimited:
             check_limits(parameters)
-        if parameters.word('bag'):
+        if parameters.get_str('bag'):
             raise ParameterError(
-                'bag', parameters.word('bag'), 'is made by bringup', 'choose its folder with --out'
+                'bag',
+                parameters.get_str('bag'),
+                'is made by bringup',
+                'choose its folder with --out',
             )
         build_controller(parameters)
-        if not parameters.word(DRIVER):
+        if not parameters.get_str(DRIVER):
             build_plant(parameters)
         build_reference(parameters)
     except (ParameterError, InputError) as error:
@@ -135,7 +138,7 @@ def _check_files(parameters: Mapping[str, Parameters]) -> None:
     """Raise ParameterError where two axes would save their estimates in one file."""
     users: dict[str, str] = {}
     for axis, values in parameters.items():
-        file = values.word(ESTIMATES)
+        file = values.get_str(ESTIMATES)
         if file and users.setdefault(file, axis) != axis:
             raise ParameterError(
                 ESTIMATES, file, f'is the file of {users[file]} and of {axis}',
@@ -145,13 +148,13 @@ def _check_files(parameters: Mapping[str, Parameters]) -> None:
 
 def _samples(parameters: Parameters, duration: float | None) -> int:
     """Samples of the run, 0 for a run without end."""
-    samples = parameters.integer('samples')
+    samples = parameters.get_int('samples')
     if duration is None and samples > 0:
         return samples
     if duration is not None and isinf(duration) and duration > 0.0:
         return 0
     return whole_samples(
-        DEFAULT_DURATION_S if duration is None else duration, parameters.real('sample_period')
+        DEFAULT_DURATION_S if duration is None else duration, parameters.get_float('sample_period')
     )
 
 
@@ -160,9 +163,9 @@ def _say_unused(configuration: Configuration, parameters: Mapping[str, Parameter
     unused: set[str] = set()
     noisy = False
     for axis, values in parameters.items():
-        if values.word(DRIVER):
+        if values.get_str(DRIVER):
             given = configuration.given(axis)
-            follows = NOISE not in given and values.real(NOISE) != BY_NAME[NOISE].default
+            follows = NOISE not in given and values.get_float(NOISE) != BY_NAME[NOISE].default
             noisy = noisy or follows
             # What stands in a section of the plant was never meant for a run without one.
             meant = given if follows else configuration.given(axis, without=PLANT)

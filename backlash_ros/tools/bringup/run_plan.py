@@ -37,12 +37,12 @@ class AxisPlan:
     @property
     def samples(self) -> int:
         """Samples of the whole run, 0 for a run without end."""
-        return self.parameters.integer('samples')
+        return self.parameters.get_int('samples')
 
     @property
     def sample_period(self) -> float:
         """T [s]."""
-        return self.parameters.real('sample_period')
+        return self.parameters.get_float('sample_period')
 
     @property
     def bag(self) -> Path:
@@ -57,17 +57,17 @@ class AxisPlan:
     @property
     def has_driver(self) -> bool:
         """Whether something else stands in the place of the simulated plant."""
-        return bool(self.parameters.word(DRIVER))
+        return bool(self.parameters.get_str(DRIVER))
 
     @property
     def driver_is_elsewhere(self) -> bool:
         """Whether somebody else starts the driver."""
-        return self.parameters.word(DRIVER) == ELSEWHERE
+        return self.parameters.get_str(DRIVER) == ELSEWHERE
 
     @property
     def is_managed(self) -> bool:
         """Whether somebody else activates the controller."""
-        return not self.parameters.flag('autostart')
+        return not self.parameters.get_bool('autostart')
 
     def titled(self, text: str) -> str:
         """The text, with the name of the axis where there are axes."""
@@ -102,14 +102,14 @@ class RunPlan:
 
 def check_driver(axis: str, parameters: Parameters) -> Parameters:
     """The set with the name of the axis in the command of its driver; raises ParameterError."""
-    text = parameters.word(DRIVER).strip()
+    text = parameters.get_str(DRIVER).strip()
     if not text:
         return parameters.replaced({DRIVER: ''})
     try:
         shlex.split(text)
     except ValueError as error:
         raise ParameterError(DRIVER, text, 'is not a command', str(error)) from None
-    if parameters.flag('lockstep'):
+    if parameters.get_bool('lockstep'):
         raise ParameterError(
             DRIVER, text, 'excludes lockstep', 'a real plant does not wait for its control'
         )
@@ -123,7 +123,9 @@ def check_limits(parameters: Parameters) -> None:
     missing = missing_limits(parameters)
     if missing:
         raise ParameterError(
-            missing[0], parameters.real(missing[0]), 'is no limit, and a driver moves an actuator',
+            missing[0],
+            parameters.get_float(missing[0]),
+            'is no limit, and a driver moves an actuator',
             f'set {", ".join(missing)}, or give --unlimited',
         )
 
@@ -175,14 +177,14 @@ def _nodes(axis: AxisPlan, environment: Mapping[str, str]) -> dict[str, ProcessP
     }
     if not axis.has_driver:
         # In real time the reference follows plant_output as well, in lockstep it follows /clock.
-        outputs = '2' if axis.parameters.flag('lockstep') else '3'
+        outputs = '2' if axis.parameters.get_bool('lockstep') else '3'
         own['plant'] = {'wait_for_subscribers': outputs}
     return {
         name: ProcessPlan(
             axis.process_name(name), _node_command(axis, name, values),
             axis.logs / f'{name}.log', environment, axis.name,
             # The controller may end with a ramp, and then saves what it has learned.
-            farewell_s=axis.parameters.real('timeout.ramp') if name == 'controller' else 0.0,
+            farewell_s=axis.parameters.get_float('timeout.ramp') if name == 'controller' else 0.0,
         )
         for name, values in own.items()
     }
@@ -197,7 +199,7 @@ def _node_command(axis: AxisPlan, node: str, own: Mapping[str, str]) -> tuple[st
         command += ['-p', f'{parameter}:={value}']
     if axis.name:
         command += ['-r', f'__ns:=/{axis.name}']
-    if axis.name and axis.parameters.flag('lockstep'):
+    if axis.name and axis.parameters.get_bool('lockstep'):
         command += ['-r', '/clock:=clock']  # each axis has a time of its own
     return tuple(command)
 
@@ -207,7 +209,7 @@ def _drivers(plan: RunPlan, domain: int | None) -> list[ProcessPlan]:
     served: dict[tuple[str, ...], list[AxisPlan]] = {}
     for axis in plan.axes:
         if axis.has_driver and not axis.driver_is_elsewhere:
-            served.setdefault(tuple(shlex.split(axis.parameters.word(DRIVER))), []).append(axis)
+            served.setdefault(tuple(shlex.split(axis.parameters.get_str(DRIVER))), []).append(axis)
     return [_driver(plan, command, axes, domain) for command, axes in served.items()]
 
 

@@ -88,11 +88,11 @@ def whole_samples(duration: float, sample_period: float) -> int:
 
 def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     """Length of a run: duration [s] if given, else the parameter samples, else 10 s."""
-    if duration is None and parameters.integer('samples') > 0:
-        return parameters.integer('samples')
+    if duration is None and parameters.get_int('samples') > 0:
+        return parameters.get_int('samples')
     if duration is None:
         duration = DEFAULT_DURATION_S
-    return whole_samples(duration, parameters.real('sample_period'))
+    return whole_samples(duration, parameters.get_float('sample_period'))
 
 
 def run_tool(name: str, tool: Callable[[], None]) -> int:

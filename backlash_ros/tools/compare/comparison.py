@@ -69,7 +69,7 @@ class Result:
 
 def contenders(scenario: Parameters) -> list[Contender]:
     """The loops to compare, from the paper's to the one without a backlash."""
-    m, c_r, c_l = (scenario.real(f'backlash.{name}') for name in ('m', 'c_r', 'c_l'))
+    m, c_r, c_l = (scenario.get_float(f'backlash.{name}') for name in ('m', 'c_r', 'c_l'))
     paper = {'structure': 'proportional'}
     tracks = {'structure': 'tracking'}
     return [
@@ -121,10 +121,10 @@ def _parameters(contender: Contender, scenario: Parameters) -> Parameters:
     changed = scenario.replaced(contender.changes)
     if not contender.follows:
         return changed
-    z = np.exp(1j * scenario.real('frequency') * scenario.real('sample_period'))
+    z = np.exp(1j * scenario.get_float('frequency') * scenario.get_float('sample_period'))
     gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
     return changed.replaced({
-        name: gain * scenario.real(name) for name in ('amplitude', 'bias')
+        name: gain * scenario.get_float(name) for name in ('amplitude', 'bias')
     })
 
 
@@ -147,7 +147,7 @@ def _measure(contender: Contender, parameters: Parameters, samples: int) -> Resu
     since = _since(run)
     error = _number(delayed_tracking_error_rms(run, delay, since))
     gapless = run_loop(build_closed_loop(parameters.replaced({
-        **_NO_GAP, **_fixed(parameters.real('backlash.m'), 0.0, 0.0), 'fixed.doubt': 0.0,
+        **_NO_GAP, **_fixed(parameters.get_float('backlash.m'), 0.0, 0.0), 'fixed.doubt': 0.0,
     })), samples)
     best = _number(delayed_tracking_error_rms(gapless, delay, since))
     return replace(result, tracking_error=error, penalty=error - best)

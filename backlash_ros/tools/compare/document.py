@@ -68,12 +68,13 @@ def comparison_document(
         *('| ' + ' | '.join(row(result)) + ' |' for result in results), '',
     ]
     lines += [f'- {result.contender.name}: {result.note}.' for result in results if result.note]
-    noise = scenario.real('output_noise_std')
+    noise = scenario.get_float('output_noise_std')
     lines += [
-        f'Scenario: the plant of the configuration, m = {scenario.real("backlash.m"):g}, '
-        f'c_r = {scenario.real("backlash.c_r"):g}, c_l = {scenario.real("backlash.c_l"):g}, '
-        f'{scenario.word("waveform")} at {scenario.real("frequency"):g} rad/s, noise on y with '
-        f'standard deviation {noise:g}. Written by `compare --out docs`; do not edit.', '',
+        f'Scenario: the plant of the configuration, m = {scenario.get_float("backlash.m"):g}, '
+        f'c_r = {scenario.get_float("backlash.c_r"):g}, c_l = {scenario.get_float("backlash.c_l"):g}, '
+        f'{scenario.get_str("waveform")} at {scenario.get_float("frequency"):g} rad/s, noise on y with '
+        f'standard deviation {noise:g}. Written by `compare --out docs`; do not edit.',
+        '',
         "- In the paper's structure y_m sets u_d, elsewhere y follows y_m scaled by |G| at its "
         'frequency: every loop asks for about the same motion.',
         '- Control error: RMS of u - u_d over the last second. Tracking error: relative RMS of '
@@ -84,6 +85,7 @@ def comparison_document(
         'often v turns back by more than half of the gap, for each reversal of y_m.',
         '- Time: median of one step of the controller on the machine that wrote this.',
         '- No compensation and wrong constants (the crossings 30 % too large) know the slope, '
-        'and have an observer that allows for a disturbance of u.', '',
+        'and have an observer that allows for a disturbance of u.',
+        '',
     ]
     return '\n'.join(lines)

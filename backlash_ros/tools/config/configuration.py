@@ -101,7 +101,7 @@ def read_configuration(
     axes = file.axes
     for setting in parsed:
         if setting.name == AXES:
-            axes = Parameters({AXES: setting.value}).names(AXES)
+            axes = Parameters({AXES: setting.value}).get_strs(AXES)
     for setting in parsed:
         if setting.axis and setting.axis not in axes:
             raise InputError(f'--set {setting.axis}/{setting.name}: '

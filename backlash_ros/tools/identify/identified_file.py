@@ -87,8 +87,8 @@ def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
     """What a controller may begin with, as if it had learned it itself."""
     least = LEAST_DEVIATION * max(found.gap, abs(found.c_r), abs(found.c_l))
     return Estimate(
-        found.m, parameters.real('estimator.initial.c_r'),
-        parameters.real('estimator.initial.c_l'), parameters.real('proportional.f'),
+        found.m, parameters.get_float('estimator.initial.c_r'),
+        parameters.get_float('estimator.initial.c_l'), parameters.get_float('proportional.f'),
         max(found.std['m'], LEAST_DEVIATION * found.m), max(found.std['c_r'], least),
         max(found.std['c_l'], least),
     )

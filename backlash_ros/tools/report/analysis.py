@@ -53,9 +53,9 @@ def control_error(run: RunRecord) -> Array:
 
 def reference_period(parameters: Parameters | None) -> float | None:
     """Period of y_m [s]; None where it has none or is not known."""
-    if parameters is None or parameters.word('waveform') not in PERIODIC:
+    if parameters is None or parameters.get_str('waveform') not in PERIODIC:
         return None
-    return 2.0 * pi / parameters.real('frequency')
+    return 2.0 * pi / parameters.get_float('frequency')
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,10 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
     samples = compared_samples(run)
     compared = times < (samples - 0.5) * run.sample_period
     window = max(round((reference_period(parameters) or 1.0) / run.sample_period), 1)
-    own = parameters.word('estimator.law')
+    own = parameters.get_str('estimator.law')
     traces = []
     for law in ESTIMATORS:
-        if not law_fits(law, parameters.word('structure')):
+        if not law_fits(law, parameters.get_str('structure')):
             continue
         if law == own:
             t, e, note = times[compared], control_error(run)[compared], ''

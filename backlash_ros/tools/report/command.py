@@ -86,7 +86,7 @@ def report_run(run: RunRecord, out: Path, parameters: Parameters) -> dict[str, A
 def _from_bag(
     bag: Path, parameters: Parameters | None, span: Span = WHOLE, axis: str = '',
 ) -> Source:
-    period = parameters.real('sample_period') if parameters else None
+    period = parameters.get_float('sample_period') if parameters else None
     found = read_bag(bag, period, span, axis)
     warnings = [f'The bag: {note}.' for note in found.notes]
     if found.damage:
@@ -211,7 +211,7 @@ def open_source(
         return Source(_part(read_record(path), span), parameters)
     if path.suffix != '.csv':
         raise InputError(f'{path}: is no bag folder, no results folder and no {SAMPLES}')
-    run = read_samples(path, parameters.real('sample_period') if parameters else None)
+    run = read_samples(path, parameters.get_float('sample_period') if parameters else None)
     run = _part(_with_truth(run, path.parent / SUMMARY, parameters), span)
     return Source(run, parameters)
 
@@ -242,7 +242,7 @@ def _parameters_beside(path: Path) -> Parameters | None:
 def _with_truth(run: RunRecord, summary: Path, parameters: Parameters | None) -> RunRecord:
     """The run with the truth of its summary.json, unless the truth changed on the way."""
     wears = parameters is None or any(
-        any(parameters.triple(name)) for name in ('backlash.rate', 'backlash.jump'))
+        any(parameters.get_triple(name)) for name in ('backlash.rate', 'backlash.jump'))
     if wears or not summary.is_file():
         return run
     try:

@@ -83,8 +83,8 @@ def summarise(
         for name in BACKLASH
     }
     return {
-        'estimator': parameters.word('estimator.law') if parameters else None,
-        'structure': parameters.word('structure') if parameters else None,
+        'estimator': parameters.get_str('estimator.law') if parameters else None,
+        'structure': parameters.get_str('structure') if parameters else None,
         'samples': run.samples,
         'sample_period': run.sample_period,
         'lost_samples': run.lost_samples,

@@ -134,7 +134,7 @@ def make_jobs(
         changed = parameters.replaced(change)
         samples = number_of_samples(changed, duration)
         build_closed_loop(changed)
-        own = [changed.integer('seed')] if 'seed' in change else seeds
+        own = [changed.get_int('seed')] if 'seed' in change else seeds
         jobs += [Job(dict(changed.replaced({'seed': seed})), samples) for seed in own]
     return jobs
 

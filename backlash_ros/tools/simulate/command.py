@@ -120,7 +120,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     if 'seed' in swept and options.seeds is not None:
         raise InputError('--seeds and --sweep seed=... exclude each other')
     changes = batch.combinations(sweeps)
-    first = parameters.integer('seed')
+    first = parameters.get_int('seed')
     seeds = range(first, first + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
     _refuse_bad(options.out)
