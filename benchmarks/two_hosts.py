@@ -115,7 +115,8 @@ def driver(host: Host | None, domain: int, log: Path) -> Iterator[None]:
     with log.open('wb') as out:
         process = subprocess.Popen(
             [*FIRST, *command] if host is None else host.command(*command),
-            stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=environment(domain, host.peer if host else ''),
+            stdin=subprocess.DEVNULL, stdout=out, stderr=out,
+            env=environment(domain, host.peer if host else ''),
         )
         try:
             yield
