@@ -21,8 +21,8 @@ from backlash_ros.tools.simulate.command import SEEDS, main
 HERE = '127.0.0.1'
 RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
 DEADLINE_S = 60.0
-# Nothing listens beyond this machine.
-ON_THIS_MACHINE = ['--host', HERE, '--port', '0', '--no-dashboard']
+# Nothing listens beyond this machine; the port for HTTP is open without a dashboard as well.
+QUIET = ['--host', HERE, '--no-dashboard', '--dashboard-address', f'{HERE}:0']
 
 
 def wait_for(condition: Callable[[], object], what: str) -> None:
@@ -38,14 +38,16 @@ class Cluster:
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self._stack = stack
         file = folder / 'scheduler.json'
-        self._start('dask_scheduler', *ON_THIS_MACHINE, '--scheduler-file', str(file))
+        self.scheduler = self._start(
+            'dask_scheduler', *QUIET, '--port', '0', '--scheduler-file', str(file)
+        )
         wait_for(file.exists, 'scheduler')
         wait_for(lambda: file.read_text().endswith('}'), 'address of the scheduler')
         self.address: str = json.loads(file.read_text())['address']
         # Without a nanny, which would start a killed worker anew.
         self.workers = {
             name: self._start(
-                'dask_worker', self.address, '--host', HERE, '--no-dashboard', '--no-nanny',
+                'dask_worker', self.address, *QUIET, '--no-nanny',
                 '--nthreads', '1', '--name', name, '--local-directory', str(folder),
             ) for name in ('first', 'second')
         }
@@ -59,6 +61,15 @@ class Cluster:
         self._stack.callback(process.wait, DEADLINE_S)
         self._stack.callback(process.kill)
         return process
+
+    def addresses(self) -> set[str]:
+        """Where its processes listen."""
+        import psutil
+        return {
+            connection.laddr.ip for process in (self.scheduler, *self.workers.values())
+            for connection in psutil.Process(process.pid).net_connections('inet')
+            if connection.status == psutil.CONN_LISTEN
+        }
 
     def runs_of(self, name: str) -> list[str]:
         """What the worker has to do at present."""
@@ -87,6 +98,7 @@ def test_killed_worker_loses_no_run_and_no_bit(cluster: Cluster, tmp_path: Path)
     )
     try:
         wait_for(lambda: cluster.runs_of('first'), 'runs of the worker')
+        assert cluster.addresses() == {HERE}
         os.kill(cluster.workers['first'].pid, signal.SIGKILL)
         assert main([*RUNS, '--out', str(local)]) == 0
         said, _ = simulation.communicate(timeout=DEADLINE_S)

@@ -155,3 +155,13 @@ def test_a_driver_that_is_too_slow_does_not_make_the_node_flood(
         passed = time.monotonic() - start
         assert len(heard) - before <= passed / PERIOD_S + 5
         assert len(heard) - before >= 0.9 * k
+
+
+def test_signal_goes_on_by_the_own_clock_once_outputs_are_no_longer_waited_for() -> None:
+    pace = ReferencePace(PERIOD_S, begins_with_output=True, now_s=0.0)
+    assert [pace.sample_to_send(k * PERIOD_S) for k in range(3)] == [0, 0, 0]
+    assert pace.waits
+    pace.wait_no_longer()
+    assert not pace.waits
+    sent = [pace.sample_to_send(k * PERIOD_S) for k in range(3, 6)]
+    assert sent == [0, 1, 2]

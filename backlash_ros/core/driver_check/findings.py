@@ -263,7 +263,8 @@ def _held_share(y: NDArray[np.float64]) -> float:
 
 def _clock(timing: Timing) -> Finding:
     age = float(np.median([m.received_ns - m.stamp_ns for m in timing.outputs])) * 1e-9
-    found = f'samples arrive {age * 1e3:.2g} ms after they left'
+    when = 'before' if age < 0.0 else 'after'
+    found = f'samples arrive {abs(age) * 1e3:.2g} ms {when} they left'
     if abs(age) <= SKEW * timing.period_s:
         return Finding('clock', FITS, found)
     return Finding(

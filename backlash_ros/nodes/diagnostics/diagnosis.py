@@ -108,8 +108,8 @@ class Diagnosis:
         if not io.skipped:
             return []
         text = (
-            f'{io.topics.output} has no {p.get_str("io.field")} of joint {p.get_str("io.joint")!r} but '
-            f'{io.seen}: set io.joint, io.field'
+            f'{io.topics.output} has no {p.get_str("io.field")} of joint {p.get_str("io.joint")!r} '
+            f'but {io.seen}: set io.joint, io.field'
         )
         return [Finding(Level.ERROR, 'joint', text[:LONGEST_TEXT])]
 
