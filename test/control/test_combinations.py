@@ -18,11 +18,11 @@ from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'docs'))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'docs'))
 
 from combinations_of_laws import AMPLITUDES, CONDITIONS, Sample, outcome, run
 
-DOCS = Path(__file__).resolve().parents[1] / 'docs'
+DOCS = Path(__file__).resolve().parents[2] / 'docs'
 PAIRS = [(law, structure) for structure in STRUCTURES for law in ESTIMATORS]
 FIT = [pair for pair in PAIRS if law_fits(*pair)]
 LARGEST_F, LARGEST_CROSSING = 0.5, 100.0  # the default bounds

@@ -19,7 +19,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 DEADLINE_S = 150.0
 LOW, HIGH, RATE, PERIOD_S = -9.0, 11.0, 200.0, 0.005
 LIMITS = (

@@ -21,7 +21,7 @@ from std_msgs.msg import Float64
 
 import backlash_ros
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXECUTABLES = {
     'controller', 'plant', 'reference', 'recorder', 'bringup', 'simulate', 'report', 'compare',
     'check_driver', 'identify', 'replay', 'monitor', 'live',

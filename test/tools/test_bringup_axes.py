@@ -20,7 +20,7 @@ from backlash_ros.tools.bringup.orchestrator import prepare
 from backlash_ros.tools.bringup.progress import ProgressDisplay
 from backlash_ros.tools.bringup.run_plan import RunPlan, plan_processes
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config' / 'two_axes.yaml'
+CONFIG = Path(__file__).resolve().parents[2] / 'config' / 'two_axes.yaml'
 TRUTH = {'pan': (1.3, 3.0, -3.0), 'tilt': (0.8, 1.0, -2.0)}
 # A plant in the place of a driver, which begins when controller, reference and recorder listen.
 DRIVER = shlex.join([

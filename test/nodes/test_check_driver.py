@@ -22,7 +22,7 @@ from backlash_ros.nodes.check_driver import main
 from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
 from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
-HERE = Path(__file__).resolve().parent
+HERE = Path(__file__).resolve().parents[1]
 DURATION_S = 6.0
 DEADLINE_S = 60.0
 # A machine under load may hold the driver up: then the check is right to find fault with it, and

@@ -32,7 +32,7 @@ from backlash_ros.core.identification.output_error import (
 from backlash_ros.core.identification.play_record import PlayRecord
 from backlash_ros.core.identification.uncertainty import response
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / 'benchmarks'))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 import identification_cases
 from identification_cases import random_case
 

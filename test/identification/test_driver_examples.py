@@ -20,7 +20,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.tools.bringup.processes import child_environment, free_domain
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / 'examples'
 BLOCKS = re.findall(
     r'^```bash\n(.*?)^```', (ROOT / 'docs' / 'driver.md').read_text(), re.MULTILINE | re.DOTALL

@@ -17,7 +17,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
 
-CONFIG = Path(__file__).resolve().parents[1] / 'config'
+CONFIG = Path(__file__).resolve().parents[2] / 'config'
 TYPES: dict[str, type[Any]] = {
     'std_msgs/msg/Float64': Float64, 'std_msgs/msg/Float64MultiArray': Float64MultiArray,
     'diagnostic_msgs/msg/DiagnosticArray': DiagnosticArray,

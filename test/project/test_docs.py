@@ -23,7 +23,7 @@ from backlash_ros.tools.replay import command as replay
 from backlash_ros.tools.simulate import batch
 from backlash_ros.tools.simulate import command as simulate
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / 'docs'
 PAGES = sorted([ROOT / 'README.md', *DOCS.glob('*.md')])
 README = (ROOT / 'README.md').read_text()

@@ -12,7 +12,7 @@ from ros_processes import ros_world
 
 from backlash_ros.nodes.runtime.unused_sections import unused
 
-CONFIGS = sorted((Path(__file__).resolve().parents[1] / 'config').glob('*.yaml'))
+CONFIGS = sorted((Path(__file__).resolve().parents[2] / 'config').glob('*.yaml'))
 
 
 @pytest.mark.parametrize(('sections', 'full_name', 'cure'), [

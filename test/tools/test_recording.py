@@ -29,7 +29,7 @@ from backlash_ros.bags.writer import STORAGE
 from backlash_ros.tools.report import command as report
 from backlash_ros.tools.run_files.bag_reading import read_bag
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NODES = ('recorder', 'controller', 'reference', 'plant')
 SAMPLE = topics.SIGNAL_LABELS.index('sample')
 LOST_S = 1.0  # what a killed recorder may lose

@@ -22,7 +22,7 @@ from backlash_ros.tools.config.configuration import (
     write_config,
 )
 
-SHIPPED = sorted((Path(__file__).resolve().parents[1] / 'config').glob('*.yaml'))
+SHIPPED = sorted((Path(__file__).resolve().parents[2] / 'config').glob('*.yaml'))
 
 
 def written(path: Path, text: str) -> Path:

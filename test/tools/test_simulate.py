@@ -25,7 +25,7 @@ from backlash_ros.tools.simulate.batch import Outcome, Sweep
 from backlash_ros.tools.simulate.command import main
 from backlash_ros.tools.simulate.simulation import run_loop
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 NOISY = ['--set', 'output_noise_std=1e-3', '--set', 'estimator.law=lms']
 DEADLINE_S = 60.0
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 # The interpreter beneath the environment that runs the tests: without packages, so without rclpy.
 BASE_PYTHON = f'{sys.base_prefix}/bin/python3.{sys.version_info.minor}'
 # Of the caller, these would change what is asked here.
@@ -80,7 +80,7 @@ def test_make_names_an_unreachable_package_index(bare_clone: Path) -> None:
 
 
 def test_make_test_runs_the_linters_and_passes_arguments_on(bare_clone: Path) -> None:
-    done = make('--dry-run', 'test', 'ARGS=-x test/test_make.py', cwd=bare_clone)
+    done = make('--dry-run', 'test', 'ARGS=-x test/project/test_make.py', cwd=bare_clone)
     modules = [line.split('-m ', 1)[1] for line in done.stdout.splitlines() if ' -m ' in line]
     assert [module.split()[0] for module in modules] == ['ruff', 'mypy', 'pytest']
-    assert modules[-1].endswith(' -x test/test_make.py')
+    assert modules[-1].endswith(' -x test/project/test_make.py')

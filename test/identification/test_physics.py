@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.txt)')
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / 'benchmarks'), str(ROOT / 'examples')]
 
 import gear_runs  # noqa: E402
