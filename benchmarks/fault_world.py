@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.loop.output import Output
+from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 
 START_NS = 1_800_000_000_000_000_000

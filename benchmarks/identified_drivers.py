@@ -22,7 +22,8 @@ from reporting import ROOT, machine, markdown_table, text_table
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.simulation.metrics import delayed_tracking_error_rms
-from backlash_ros.tools.bringup.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.report.command import open_source
 
 EXAMPLES = ROOT / 'examples'

@@ -29,12 +29,9 @@ from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.tools.bringup.processes import (
-    ProcessPlan,
-    ProcessSupervisor,
-    child_environment,
-    free_domain,
-)
+from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 
 RATES_HZ = (100.0, 1000.0)
 BLOCK, SETTLE = 50, 10  # samples of a block, and how many of them at its start do not count

@@ -28,11 +28,10 @@ from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 
 from backlash_ros.core.assembly import law_fits
-from backlash_ros.core.loop.output import Output
-from backlash_ros.core.loop.sample_counter import UNNUMBERED
+from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
-from backlash_ros.tools.bringup.processes import free_domain
+from backlash_ros.tools.bringup.domains import free_domain
 
 PERIOD_S, PERIOD_NS = 1e-3, 1_000_000
 LOW, HIGH = -20.0, 30.0

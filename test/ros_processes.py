@@ -23,7 +23,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.tools.bringup.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import child_environment
 
 prefer_loopback(os.environ)  # the nodes of the tests themselves
 

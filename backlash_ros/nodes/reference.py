@@ -10,9 +10,8 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.loop.output import Output
 from backlash_ros.core.loop.reference_pace import ReferencePace
-from backlash_ros.core.loop.sample_counter import SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import REFERENCE
 from backlash_ros.core.reference.signal import PERIODIC

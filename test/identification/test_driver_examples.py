@@ -18,7 +18,8 @@ from ros_processes import Probe, RosWorld, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import child_environment
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / 'examples'

@@ -17,7 +17,8 @@ from ros_processes import Probe
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import child_environment
 
 ROOT = Path(__file__).resolve().parents[2]
 DEADLINE_S = 150.0

@@ -15,7 +15,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.bringup.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.identify.measured_record import read_measured
 from backlash_ros.tools.replay.command import main
 from backlash_ros.tools.report.command import open_source

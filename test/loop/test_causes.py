@@ -10,17 +10,8 @@ from typing import Any
 import pytest
 
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.loop.causes import (
-    LONGEST_TEXT,
-    STATES,
-    UNNAMED,
-    Finding,
-    Level,
-    LoopFigures,
-    Peer,
-    TopicFigures,
-    findings_of,
-)
+from backlash_ros.core.loop.causes import LONGEST_TEXT, STATES, UNNAMED, findings_of
+from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer, TopicFigures
 
 DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
 WELL = LoopFigures(

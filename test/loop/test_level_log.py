@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from backlash_ros.core.loop.causes import Finding, Level
+from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.loop.level_log import AGAIN_S, LASTS_S, LevelLog
 
 WELL = Finding(Level.OK, 'learned', 'learned')

@@ -20,7 +20,8 @@ from std_msgs.msg import Float64
 
 from backlash_ros.nodes.check_driver import main
 from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
-from backlash_ros.tools.bringup.processes import child_environment, free_domain
+from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import child_environment
 
 HERE = Path(__file__).resolve().parents[1]
 DURATION_S = 6.0

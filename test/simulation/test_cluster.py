@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from backlash_ros.tools.bringup.processes import with_source
+from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.simulate import cluster as tools_cluster
 from backlash_ros.tools.simulate.command import SEEDS, main
 

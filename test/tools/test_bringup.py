@@ -20,8 +20,9 @@ from bringup_processes import Session, bag_counts, marked_processes, wait_until
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup import command as bringup
-from backlash_ros.tools.bringup import processes, supervision
-from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor, child_environment
+from backlash_ros.tools.bringup import domains, environment, supervision
+from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.bringup.progress import ProgressDisplay, describe
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
 from backlash_ros.tools.config.configuration import effective_parameters
@@ -183,7 +184,7 @@ def test_ctrl_c_is_heard_before_the_libraries_are_loaded() -> None:
 
 
 def test_processes_find_this_package_behind_what_the_user_has_set() -> None:
-    user, source = processes.with_source({'PYTHONPATH': '/of/the/user'})['PYTHONPATH'].split(':')
+    user, source = environment.with_source({'PYTHONPATH': '/of/the/user'})['PYTHONPATH'].split(':')
     assert user == '/of/the/user'
     assert (Path(source) / 'backlash_ros' / '__init__.py').is_file()
 
@@ -327,13 +328,13 @@ def test_lines_that_are_no_events_stand_in_the_log(
 
 
 def test_two_runs_get_two_domains_and_none_that_somebody_uses() -> None:
-    with processes.free_domain() as first:
-        with processes.free_domain() as second:
+    with domains.free_domain() as first:
+        with domains.free_domain() as second:
             assert first != second
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
-            port = processes.DOMAIN_0_PORT + processes.PORTS_PER_DOMAIN * second + 12
+            port = domains.DOMAIN_0_PORT + domains.PORTS_PER_DOMAIN * second + 12
             participant.bind(('127.0.0.1', port))
-            with processes.free_domain() as third:
+            with domains.free_domain() as third:
                 assert third not in (first, second)
 
 

@@ -14,13 +14,9 @@ import pytest
 from bringup_processes import DEADLINE_S, Session, wait_until
 from ros_processes import ros_world
 
-from backlash_ros.tools.bringup import processes, supervision
-from backlash_ros.tools.bringup.processes import (
-    ProcessPlan,
-    ProcessSupervisor,
-    child_environment,
-    foreign_environment,
-)
+from backlash_ros.tools.bringup import process_groups, supervision
+from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
+from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.bringup.progress import ProgressDisplay
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan, plan_processes
 from backlash_ros.tools.config.configuration import effective_parameters
@@ -293,7 +289,7 @@ def test_process_with_a_long_farewell_gets_the_time_for_it(
     small: Callable[..., list[list[ProcessPlan]]], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(processes, 'ESCALATION', ((signal.SIGINT, 0.1), (signal.SIGKILL, 3.0)))
+    monkeypatch.setattr(process_groups, 'ESCALATION', ((signal.SIGINT, 0.1), (signal.SIGKILL, 3.0)))
     begun = tmp_path / 'begun'
     ramp = ON_SIGINT.format(begun=str(begun)) + 'time.sleep(0.5); print("at zero")'
     with ProcessSupervisor(small(ramp, farewell_s=DEADLINE_S), lambda: False) as supervisor:
@@ -306,7 +302,7 @@ def test_driver_that_ignores_sigint_gets_ever_firmer_signals(
     small: Callable[..., list[list[ProcessPlan]]], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(processes, 'ESCALATION', (
+    monkeypatch.setattr(process_groups, 'ESCALATION', (
         (signal.SIGINT, 0.2), (signal.SIGTERM, 0.2), (signal.SIGKILL, DEADLINE_S),
     ))
     begun = [tmp_path / 'begun0', tmp_path / 'begun1']

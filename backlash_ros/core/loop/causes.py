@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from enum import IntEnum
 from math import inf, isfinite, nan
-from typing import NamedTuple
 
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.loop.figures import Finding, Level, LoopFigures
 
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
 # Share by which the rate of y may differ from that of the model.
@@ -22,97 +20,6 @@ STILL_SAMPLES = 20  # equal values of y in a row, while v moves on
 SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
 # A contradiction between y and G(z) that lasts longer is not put down to late or lost samples [s].
 PATIENCE_S = 3.0
-
-
-class Level(IntEnum):
-    """How bad it is, in the numbers of diagnostic_msgs/DiagnosticStatus."""
-
-    OK = 0
-    WARN = 1
-    ERROR = 2
-
-
-class Finding(NamedTuple):
-    """One line of what goes on. kind: the same word for the same cause, whatever its figures.
-
-    lasting: worth a line of the log only once it has lasted, as it passes by itself as a rule.
-    """
-
-    level: Level
-    kind: str
-    text: str
-    lasting: bool = False
-
-
-class Peer(NamedTuple):
-    """Another publisher or subscriber of a topic; unfit: why no message passes, empty if it does.
-
-    kind: its message type without the package. unfit is one of '', 'type', 'reliability', 'qos'.
-    """
-
-    name: str
-    kind: str
-    unfit: str = ''
-
-
-@dataclass(frozen=True)
-class TopicFigures:
-    """A topic of the loop: its name, the wanted type without the package, who else is on it."""
-
-    name: str
-    kind: str = 'Float64'
-    peers: tuple[Peer, ...] = ()
-
-    @property
-    def heard(self) -> list[Peer]:
-        """Those whose messages pass."""
-        return [peer for peer in self.peers if not peer.unfit]
-
-
-@dataclass(frozen=True)
-class LoopFigures:
-    """What the controller knows of the last few seconds; counts are samples or messages.
-
-    output, reference: with those who publish it. control: with those who receive it; rivals: who
-    else publishes it. intervals_s: those between messages of y, low, mean and high, of which a
-    tenth is shorter and longer [s], nan while they are not known. still: newest values of y in a
-    row that are equal, and v_swing: how far v has moved meanwhile, in gaps.
-    """
-
-    sample_period: float
-    output: TopicFigures = field(default_factory=lambda: TopicFigures('plant_output'))
-    reference: TopicFigures = field(default_factory=lambda: TopicFigures('reference'))
-    control: TopicFigures = field(default_factory=lambda: TopicFigures('control'))
-    rivals: tuple[str, ...] = ()
-    standing_down: bool = False  # because of them
-    status: Status | None = None  # None before the first command
-    inconsistent_s: float = 0.0  # how long that status has been INCONSISTENT
-    unexplained: float = nan  # motion of u that no G and no backlash explains, over m times the gap
-    wrong_sign: bool = False  # whether y moves against v
-    adapting: bool = True
-    given: bool = False  # whether the estimates are taken as the parameters give them
-    silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not
-    on_timeout: str = 'hold'
-    referred: bool = True  # whether a y_m has come
-    reference_silent_s: float = 0.0
-    intervals_s: tuple[float, float, float] = (nan, nan, nan)
-    age_s: float = nan  # median time from the stamp of y to its arrival, nan while not known
-    used: int = 0
-    without_reference: int = 0
-    lost: int = 0
-    unsent: int = 0
-    late: int = 0
-    bad_outputs: int = 0
-    bad_references: int = 0
-    limited: int = 0
-    unreported: int = 0
-    still: int = 0
-    v_swing: float = 0.0
-
-    @property
-    def heard(self) -> int:
-        """Samples that have come, whatever they were worth."""
-        return self.used + self.without_reference + self.bad_outputs
 
 
 def findings_of(f: LoopFigures) -> list[Finding]:

@@ -21,9 +21,8 @@ from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHor
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
-from backlash_ros.core.loop.output import Output
 from backlash_ros.core.loop.report_use import report_use
-from backlash_ros.core.loop.sample_counter import Arrival, SampleCounter
+from backlash_ros.core.loop.sample_counter import Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.state_model import StateModel
 

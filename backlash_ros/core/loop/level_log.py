@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
-from backlash_ros.core.loop.causes import Finding, Level
+from backlash_ros.core.loop.figures import Finding, Level
 
 # What passes by itself as a rule is told only after so long: at the third of the looks, which come
 # once a second, be it a little early.

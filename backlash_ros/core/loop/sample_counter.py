@@ -24,6 +24,16 @@ NUMBER_SLACK, PATIENCE = 3, 1.5
 STRANGERS, SILENCE = 5, 3.0
 
 
+class Output(NamedTuple):
+    """A measured y, when it was sampled, sent and received [ns], and its number."""
+
+    y: float
+    stamp_ns: int
+    sent_ns: int
+    received_ns: int
+    sequence: int
+
+
 class Arrival(NamedTuple):
     """What a message is.
 

@@ -6,7 +6,7 @@ from math import isfinite
 
 from backlash_ros import topics
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.output import Output
+from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters, missing_limits
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.inbox import Inbox

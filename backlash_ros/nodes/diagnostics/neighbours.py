@@ -7,7 +7,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 
-from backlash_ros.core.loop.causes import Peer, TopicFigures
+from backlash_ros.core.loop.figures import Peer, TopicFigures
 
 
 def publishers_of(

@@ -15,8 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.output import Output
-from backlash_ros.core.loop.sample_counter import UNNUMBERED
+from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.spin import ProcessNode

@@ -15,7 +15,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
-from backlash_ros.core.loop.causes import Finding, Level
+from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.loop.level_log import LevelLog
 
 # Deep enough that a recorder which is held up for a second misses nothing.

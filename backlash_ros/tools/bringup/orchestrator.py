@@ -15,7 +15,7 @@ from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import BY_NAME, PLANT
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
-from backlash_ros.tools.bringup import processes
+from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.processes import ProcessSupervisor, RunError
 from backlash_ros.tools.bringup.progress import ProgressDisplay
 from backlash_ros.tools.bringup.run_plan import (
@@ -223,7 +223,7 @@ def _announced_domain(plan: RunPlan, stack: ExitStack) -> int | None:
         return None
     if os.environ.get('ROS_DOMAIN_ID'):
         return None
-    free = stack.enter_context(processes.free_domain())
+    free = stack.enter_context(free_domain())
     print(
         f'to listen in: export ROS_DOMAIN_ID={free} ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}',
         flush=True,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from backlash_ros.core.parameters import Parameters, missing_limits
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.tools.bringup import processes
+from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.processes import ProcessPlan
 from backlash_ros.tools.run_files.results import CONFIG
 
@@ -139,7 +139,7 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
     """
     stages: list[list[ProcessPlan]] = [[], [], [], []]
     for axis in plan.axes:
-        environment = processes.child_environment(axis.logs, domain)
+        environment = child_environment(axis.logs, domain)
         nodes = _nodes(axis, environment)
         first, second, third = (
             ('controller', DRIVER, 'reference') if axis.has_driver
@@ -162,7 +162,7 @@ def _page(plan: RunPlan, port: int, domain: int | None) -> ProcessPlan:
         sys.executable, '-m', 'backlash_ros.nodes.live.command', '--port', str(port), *shown
     )
     return ProcessPlan(
-        LIVE, command, logs / f'{LIVE}.log', processes.child_environment(logs, domain),
+        LIVE, command, logs / f'{LIVE}.log', child_environment(logs, domain),
         plan.axes[0].name, spectator=True,
     )
 
@@ -223,7 +223,7 @@ def _driver(
     linger = LAST_COMMAND_PERIODS * max(axis.sample_period for axis in axes)
     return ProcessPlan(
         name, command, log,
-        processes.foreign_environment(processes.child_environment(log.parent, domain)),
+        foreign_environment(child_environment(log.parent, domain)),
         foreign=True, linger_s=min(linger, LONGEST_LINGER_S),
     )
 
