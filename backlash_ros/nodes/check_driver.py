@@ -66,6 +66,8 @@ class CheckDriverNode(ProcessNode):
     to rest at the end, whatever ends it.
     """
 
+    program = EXECUTABLE  # as messages name it
+
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__(EXECUTABLE, parameters_of=CONTROLLER)
         build_controller(self.settings)
@@ -79,6 +81,7 @@ class CheckDriverNode(ProcessNode):
         self._heard, self._graph = Heard(), Graph()
         self._range_left: float | None = None
         self._rivals = ''  # who else publishes control
+        self._silent_s = 0.0  # how long the driver was when it was given up, 0 where it was not
         self._heard_at = inf  # on the steady clock [s]
         self._names = {
             topic: self.resolve_topic_name(topic)
@@ -96,7 +99,7 @@ class CheckDriverNode(ProcessNode):
                 self._come_to_rest(executor)
         if self._rivals:
             print(
-                f'{EXECUTABLE}: {self._names[topics.CONTROL]} is published by {self._rivals}: '
+                f'{self.program}: {self._names[topics.CONTROL]} is published by {self._rivals}: '
                 'stop that first, or leave --drive out', file=sys.stderr,
             )
             self.exit_code = BAD_INPUT
@@ -208,7 +211,7 @@ class CheckDriverNode(ProcessNode):
         known = [v for v in told if plausible(v)]
         if not known:
             print(
-                f'{EXECUTABLE}: nobody says which v acts now, so the drive goes on from 0: '
+                f'{self.program}: nobody says which v acts now, so the drive goes on from 0: '
                 f'publish {topics.APPLIED_CONTROL}, or set control.initial', file=sys.stderr,
             )
         return known[-1] if known else 0.0
@@ -231,6 +234,7 @@ class CheckDriverNode(ProcessNode):
                 self._look_at_graph()
                 self._driving = self._may_drive(now - begin)
             silent = self._driving and now > self._heard_at + patience
+            self._silent_s = patience if silent else 0.0
             if now > end or silent or self._rivals or self._range_left is not None:
                 break
         self._look_at_graph()
@@ -259,7 +263,7 @@ class CheckDriverNode(ProcessNode):
             if late or self.signals > before:
                 why = f'not at rest within --rest={self._options.rest:g} s' if late \
                     else 'another signal came'
-                print(f'{EXECUTABLE}: v is held at {drive.v:.6g}: {why}', file=sys.stderr)
+                print(f'{self.program}: v is held at {drive.v:.6g}: {why}', file=sys.stderr)
                 break
         else:
             self._control.publish(Float64(data=drive.v))
@@ -311,7 +315,7 @@ class CheckDriverNode(ProcessNode):
         timing = timing_of(self._heard, self._period)
         record = None if timing is None else record_of(self._heard, timing)
         if record is None:
-            print(f'{EXECUTABLE}: nothing to save in {path}: v and y were not both heard',
+            print(f'{self.program}: nothing to save in {path}: v and y were not both heard',
                   file=sys.stderr)
             return
         try:
@@ -321,7 +325,7 @@ class CheckDriverNode(ProcessNode):
                 for k, (v, y) in enumerate(zip(record.v, record.y, strict=True)):
                     writer.writerow((repr(k * self._period), repr(float(v)), repr(float(y))))
         except OSError as error:
-            print(f'{EXECUTABLE}: {path}: cannot be written: {error.strerror}', file=sys.stderr)
+            print(f'{self.program}: {path}: cannot be written: {error.strerror}', file=sys.stderr)
             return
         print(f'saved {len(record.v)} samples of v and y in {path}')
 

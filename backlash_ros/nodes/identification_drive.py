@@ -26,6 +26,8 @@ class IdentificationDriveNode(CheckDriverNode):
     Each line of the file is a message: topic, time stamp [ns], value.
     """
 
+    program = EXECUTABLE
+
     def __init__(self, options: argparse.Namespace) -> None:
         super().__init__(options)
         self._file = options.messages.open('w', encoding='ascii')
@@ -59,8 +61,11 @@ class IdentificationDriveNode(CheckDriverNode):
         if self._range_left is not None:
             print(f'{EXECUTABLE}: y = {self._range_left:.4g} left --output-range: drive ended',
                   file=sys.stderr)
+        outputs = self._names[topics.PLANT_OUTPUT]
+        if self._drive is not None and self._silent_s:
+            print(f'{EXECUTABLE}: nothing was heard on {outputs} for {self._silent_s:g} s: drive '
+                  'ended', file=sys.stderr)
         if self._drive is None:
-            outputs = self._names[topics.PLANT_OUTPUT]
             why = 'nobody subscribes to ' + self._names[topics.CONTROL] if self._heard.outputs \
                 else f'nothing was heard on {outputs}'
             print(f'{EXECUTABLE}: the actuator was not moved: {why}', file=sys.stderr)

@@ -109,10 +109,10 @@ def test_an_unknown_actuator_is_found(tmp_path: Path) -> None:
 
 def test_a_precise_result_ends_the_motion_early(tmp_path: Path) -> None:
     with bench(tmp_path) as made:
-        code, text = made.finish(made.start('--duration', '150', '--precision', '50%'))
+        code, text = made.finish(made.start('--duration', '60', '--precision', '50%'))
     assert code == 0, text
     with (tmp_path / 'out' / 'record.csv').open() as record:
-        assert sum(1 for _ in record) * PERIOD_S < 145.0
+        assert sum(1 for _ in record) * PERIOD_S < 55.0
     assert ' s  gap 0.' in text
 
 
@@ -136,6 +136,18 @@ def test_a_y_that_leaves_its_range_ends_the_motion(tmp_path: Path) -> None:
         sent = made.sent()
     assert 'left --output-range' in text
     assert sent[-1] == 0.0
+
+
+def test_a_driver_that_falls_silent_ends_the_motion(tmp_path: Path) -> None:
+    with bench(tmp_path) as made:
+        process = made.start('--duration', '60', '--order', '1', '--integrator', 'no')
+        made.probe.wait_until(lambda: len(made.control) > 300, 'some motion')
+        assert made.driver is not None
+        made.driver.kill()
+        _, text = made.finish(process)
+    assert 'nothing was heard on /plant_output for' in text
+    assert 'drive ended' in text
+    assert (tmp_path / 'out' / 'record.csv').exists()
 
 
 def test_without_a_driver_nothing_is_moved(tmp_path: Path) -> None:
