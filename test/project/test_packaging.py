@@ -86,7 +86,7 @@ def test_installation_holds_what_ros2_run_and_the_tools_look_for(installation: P
         beside = {path.name for path in (share / 'backlash_ros' / folder).glob(pattern)}
         assert beside == {path.name for path in (ROOT / folder).glob(pattern)} != set()
     beside_modules = {path.name for path in installation.rglob('lib/python*/**/*.[hx]*ml')}
-    assert beside_modules == {'loopback.xml', 'page.html'}
+    assert beside_modules == {'loopback.xml', 'network.xml', 'page.html'}
     executables = installation / 'lib' / 'backlash_ros'
     assert {path.name for path in executables.iterdir()} == EXECUTABLES
     assert all(os.access(path, os.X_OK) for path in executables.iterdir())

@@ -20,7 +20,7 @@ from bringup_processes import Session, bag_counts, marked_processes, wait_until
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup import command as bringup
-from backlash_ros.tools.bringup.command import domains, environment, supervision
+from backlash_ros.tools.bringup import domains, environment, supervision
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.bringup.progress import ProgressDisplay, describe

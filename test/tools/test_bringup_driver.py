@@ -14,7 +14,7 @@ import pytest
 from bringup_processes import DEADLINE_S, Session, wait_until
 from ros_processes import ros_world
 
-from backlash_ros.tools.bringup.command import process_groups, supervision
+from backlash_ros.tools.bringup import process_groups, supervision
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.bringup.progress import ProgressDisplay
