@@ -6,12 +6,14 @@ The page is served to this machine alone, at an address that is printed.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.nodes.live.node import EXECUTABLE, LiveNode
 from backlash_ros.nodes.live.page_server import LARGEST_PORT, bound_socket
+from backlash_ros.nodes.monitor.followed import NICENESS
 from backlash_ros.nodes.runtime.arguments import OptionParser, ros_arguments
 from backlash_ros.nodes.runtime.spin import run
 
@@ -35,6 +37,7 @@ def main(args: list[str] | None = None) -> int:
         bound = bound_socket(options.port)
     except OSError as error:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
+    os.nice(NICENESS)
     with bound:
         return run(
             EXECUTABLE, lambda: LiveNode(options.name, bound), ros_arguments(arguments)

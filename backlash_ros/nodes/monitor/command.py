@@ -6,10 +6,12 @@ Without a terminal a line per controller is printed once a second.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 
 from rclpy.utilities import remove_ros_args
 
+from backlash_ros.nodes.monitor.followed import NICENESS
 from backlash_ros.nodes.monitor.node import EXECUTABLE, MonitorNode
 from backlash_ros.nodes.runtime.arguments import OptionParser, ros_arguments
 from backlash_ros.nodes.runtime.spin import run
@@ -27,6 +29,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('name', nargs='*', metavar='NAME',
                         help='a controller or a namespace, as /pan (default: all there are)')
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
+    os.nice(NICENESS)
     return run(EXECUTABLE, lambda: MonitorNode(options.name), ros_arguments(arguments))
 
 

@@ -14,6 +14,7 @@ from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.spin import ProcessNode
 
 LOOK_S = 1.0  # between two looks for further controllers
+NICENESS = 10  # of a process that only shows: the loop comes first
 STATUSES = 100  # of all nodes of the domain that may wait: some robots have many
 MARK = topics.of_node(topics.watched(NAMES[0])).removeprefix('~')  # of a controller
 
