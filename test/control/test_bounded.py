@@ -23,7 +23,12 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.structure import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, Structure
+from backlash_ros.core.control.structure import (
+    LARGEST_FEEDBACK,
+    LARGEST_IN_ACQUISITION,
+    ControlInput,
+    Structure,
+)
 from backlash_ros.core.control.tracking.design import Weights, design
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
@@ -104,7 +109,8 @@ class Told:
     def __init__(self) -> None:
         self.estimate = Estimate(1.0, 1.0, -1.0, 0.1)
         self.adapting, self.u_hat, self.innovation = True, 0.0, 0.0
-        self.x_hat, self.x_cov = [0.0, 0.0], None
+        self.x_hat: list[float] = [0.0, 0.0]
+        self.x_cov: np.ndarray | None = None
 
     def update(self, y: float | None, interval: Interval) -> None:
         if y is not None:
@@ -124,6 +130,21 @@ def structure_named(name: str) -> Structure:
     if name == 'tracking':
         return Tracking(DESIGN, WEIGHTS, 1.0, 1e-3)
     return Proportional() if name == 'proportional' else PolePlacement(BLOCKS)
+
+
+@pytest.mark.parametrize('status', [Status.TRACKING, Status.ACQUIRING, Status.INCONSISTENT])
+def test_a_state_far_from_the_trajectory_moves_a_loop_at_rest_no_further(status: Status) -> None:
+    structure, source = structure_named('tracking'), Told()
+    inverse = BacklashInverse()
+    source.x_cov = 1e-12 * np.eye(2)
+    known = Estimate(1.0, 1.0, -1.0, 0.1, 1e-6, 1e-6, 1e-6, status)
+    asked = 2.0  # the u that the gap takes
+    rng = np.random.default_rng(1)
+    for k in range(600):
+        # A sensor that shows something else, once the reference has rested for long.
+        source.x_hat = (1e6 * rng.standard_normal(2)).tolist() if k > 300 else [0.0, 0.0]
+        command = structure.control(ControlInput(0.0, 0.0, known, source), inverse)
+        assert abs(command.u_d) <= (1.0 + LARGEST_FEEDBACK) * asked, k
 
 
 numbers = st.floats(-1e6, 1e6)

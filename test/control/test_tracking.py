@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -176,7 +178,7 @@ def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
 def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> None:
     rest, inverse, estimate = resting(std=0.01)
     x = [0.0, 0.0]
-    assert rest.decide(0.0, np.zeros(1), x, x, x, 0.0, inverse.side) is Mode.HOLD
+    assert rest.decide(0.0, np.zeros(1), x, x, x, 0.0, inverse.side, inf) is Mode.HOLD
     rest.step(estimate, 0.0, x, inverse, begins=True)
     c_r, c_l = shrunk_crossings(estimate, rest.shrinkage, known=True)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.

@@ -74,6 +74,7 @@ class Rest:
         self._turns, self._side = 0, Region.GAP  # since x* rests; line in use the sample before
         self._near = 0  # samples since y was last away
         self._pull = 0.0  # u - u* with which leading back began
+        self._most = inf  # largest u - u*
         self._low, self._high = inf, -inf  # of the window, where it was still the sample before
 
     def use(self, design: TrackingDesign) -> None:
@@ -91,13 +92,15 @@ class Rest:
 
     def decide(
         self, y: float, window: Array, x: Sequence[float], onward: Sequence[float],
-        deviation: Sequence[float], x_std: float | None, side: Region,
+        deviation: Sequence[float], x_std: float | None, side: Region, most: float,
     ) -> Mode:
         """Set the mode for this sample.
 
         window: r from now on. x, onward: x* now and at the next sample. deviation: x_hat - x*.
-        x_std: standard deviation of x_hat, None where it is unknown. side: line in use.
+        x_std: standard deviation of x_hat, None where it is unknown. side: line in use. most: u may
+        be no further than that from u*, whatever x_hat says.
         """
+        self._most = most
         self._largest_square = max(self._largest_square, dot(x, x))
         least = SHARE * sqrt(self._largest_square)
         tolerance = max(TOLERANCE * self._noise_std, least)
@@ -186,7 +189,8 @@ class Rest:
             self._aim(ideal, u, SHORT, inverse)
 
     def _pull_back(self, deviation: Sequence[float]) -> float:
-        return -dot(self._gain, deviation)
+        pull = -dot(self._gain, deviation)
+        return min(max(pull, -self._most), self._most) if pull == pull else 0.0
 
     def _aim(self, u_d: float, u: float, shrinkage: float, inverse: BacklashInverse) -> None:
         self.u_d, self.shrinkage = u_d, shrinkage

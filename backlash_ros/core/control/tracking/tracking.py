@@ -192,6 +192,7 @@ class Tracking:
         mode = rest.decide(
             inputs.y, window, x, onward, deviation,
             None if x_cov is None else self._x_std, inverse.side,
+            most if self._trusted_for > 0 else self._width * self._scale,
         )
         shrinkage = self._shrinkage
         if mode is Mode.FOLLOW:
