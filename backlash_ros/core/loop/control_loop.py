@@ -62,6 +62,7 @@ class ControlLoop:
         self._unsent = 0  # those of them that were never published
         self._restarted = False  # whether sender or clock restarted since then
         self._begun = False  # whether the present core has taken a step
+        self._other_ns = 0  # when another controller was last heard to command
         self.core = build_controller(p, inherited)
         self.told = build_model(p)
 
@@ -126,7 +127,9 @@ class ControlLoop:
         Returns whether it is known now which one acts.
         """
         reported = self.commands.newest_report(stamp_ns)
-        if isfinite(reported):
+        # A report is about the interval before it, which a command that was heard in it outdates.
+        period_ns = self._p.get_float('sample_period') * 1e9
+        if isfinite(reported) and stamp_ns > self._other_ns + period_ns:
             self._go_on_from(reported)
         return self.knows_v
 
@@ -200,6 +203,7 @@ class ControlLoop:
         """Take in a command of the controller that is in charge."""
         if self.standing_down and plausible(v):
             self._go_on_from(v)
+            self._other_ns = self._now_ns()
 
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""

@@ -1,0 +1,47 @@
+"""Where the commands go on after another controller was in charge."""
+
+from __future__ import annotations
+
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
+from backlash_ros.core.parameters import Parameters
+
+PERIOD_NS = 10_000_000
+MOVE = 0.5  # at most, from sample to sample
+
+
+def first_command(heard_at: int, reported_at: int) -> float:
+    """v after another controller commanded 4.0, and the driver reported -4.0, at these samples."""
+    sent: list[float] = []
+    now = [0]
+    p = Parameters({'control.min': -10.0, 'control.max': 10.0, 'control.rate_max': 100.0 * MOVE})
+    loop = ControlLoop(
+        p, sent.append, lambda: now[0] * PERIOD_NS, None,
+        SampleCounter(0.01, from_zero=False), 0.0,
+    )
+
+    def answer(k: int) -> None:
+        now[0] = k
+        stamp_ns = k * PERIOD_NS
+        loop.take_reference(0.0)
+        loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, k))
+
+    answer(1)
+    loop.stand_down()
+    for k in range(2, 8):
+        now[0] = k
+        if k == heard_at:
+            loop.hear_other(4.0)
+        if k == reported_at:
+            loop.take_applied(-4.0, k * PERIOD_NS - 1)
+    loop.resume()
+    answer(8)
+    return sent[-1]
+
+
+def test_a_command_that_was_heard_last_is_where_v_goes_on() -> None:
+    assert abs(first_command(heard_at=7, reported_at=7) - 4.0) <= MOVE
+
+
+def test_a_newer_report_says_what_the_driver_made_of_it() -> None:
+    assert abs(first_command(heard_at=5, reported_at=7) + 4.0) <= MOVE
