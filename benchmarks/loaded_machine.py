@@ -25,9 +25,11 @@ from pathlib import Path
 # Before rclpy reads it, and before numpy is imported.
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('OMP_NUM_THREADS', '1')
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
 
 import numpy as np
 import rclpy
+import simulated_motor
 from loop_latency import NODES, processes
 from numpy.typing import NDArray
 from rclpy.context import Context
@@ -45,7 +47,7 @@ Array = NDArray[np.float64]
 CONFIG = ROOT / 'config' / 'geared_motor.yaml'
 DRIVER = ROOT / 'examples' / 'motor_driver.py'
 PERIOD_S = 0.005  # of both
-TRUTH = 0.55, -0.35  # c_r and c_l of examples/simulated_motor.py
+TRUTH = simulated_motor.C_R, simulated_motor.C_L
 LOADS = (0.5, 0.8)
 LIMITS = {'auto': 0.01, 'false': 0.03}  # relative error, by estimator.use_applied_control
 BOUND_S = 5.0

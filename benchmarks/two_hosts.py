@@ -23,6 +23,9 @@ from math import isfinite
 from pathlib import Path
 from typing import NamedTuple
 
+sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
+
+import simulated_motor
 from linked_hosts import FIRST, Cable, Host, linked_hosts, why_not
 from reporting import ROOT, machine, markdown_table, text_table
 
@@ -32,7 +35,7 @@ from backlash_ros.tools.bringup.environment import with_source
 
 DRIVER = ROOT / 'examples' / 'motor_driver.py'
 CONFIG = 'geared_motor.yaml'
-TRUTH = {'m': 0.098, 'c_r': 0.55, 'c_l': -0.35}  # examples/simulated_motor.py
+TRUTH = {'m': simulated_motor.SLOPE, 'c_r': simulated_motor.C_R, 'c_l': simulated_motor.C_L}
 WITHIN = 0.01  # of the truth, as in summary.json
 # Fast DDS may miss for good who starts at the same moment.
 DRIVER_FIRST_S = 2.0

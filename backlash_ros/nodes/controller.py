@@ -40,13 +40,13 @@ from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.lifecycle import ManagedNode
 from backlash_ros.nodes.runtime.messages import (
     DEPTH,
+    DIAGNOSTICS_PERIOD_S,
     KEPT,
     DiagnosticsPublisher,
     stamp_ns_of,
 )
 from backlash_ros.nodes.runtime.spin import run
 
-DIAGNOSTICS_PERIOD_S = 1.0
 # A controller that was held up for so long, or so many samples, still learns from them; after a
 # longer stall it goes on with the newest ones.
 KEPT_S, KEPT_OUTPUTS = 0.1, 20

@@ -23,6 +23,7 @@ from backlash_ros.nodes.runtime.declare import LiveParameters
 from backlash_ros.nodes.runtime.events import emit
 from backlash_ros.nodes.runtime.messages import (
     DEPTH,
+    DIAGNOSTICS_PERIOD_S,
     KEPT,
     DiagnosticsPublisher,
     LabelledArrayPublisher,
@@ -32,7 +33,6 @@ from backlash_ros.nodes.runtime.messages import (
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
 from backlash_ros.nodes.runtime.spin import ProcessNode, run, spin_paced
 
-DIAGNOSTICS_PERIOD_S = 1.0
 # Share of a period after which it is too late to publish an output: it would look like the next.
 LATEST = 0.75
 LATE, MISSED, NOT_FINITE = 'late controls', 'missed outputs', 'non-finite controls dropped'

@@ -31,14 +31,18 @@ from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters.table import RECORDER
 from backlash_ros.nodes.runtime.driver_io import STYLES, output_qos
 from backlash_ros.nodes.runtime.events import ENABLED, emit
-from backlash_ros.nodes.runtime.messages import KEPT, DiagnosticsPublisher, stamp_ns_of
+from backlash_ros.nodes.runtime.messages import (
+    DIAGNOSTICS_PERIOD_S,
+    KEPT,
+    DiagnosticsPublisher,
+    stamp_ns_of,
+)
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
 from backlash_ros.nodes.runtime.spin import BAD_INPUT, FAILED, ProcessNode, run
 
 DEPTH = 10_000  # messages that may wait while the disk is slow
 PROGRESS_PERIOD_S = 0.2
 FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that a flush takes
-DIAGNOSTICS_PERIOD_S = 1.0
 # Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
 DRAIN_S = 0.3
 IDLE_SPINS = 5  # without a message, timers being served in between

@@ -9,11 +9,11 @@ from rclpy.timer import Timer
 
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.runtime.messages import DIAGNOSTICS_PERIOD_S
 from backlash_ros.nodes.runtime.spin import ProcessNode
 
 SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
 CONFIRMED_WITHIN_S = 0.1  # longest wait for the driver to confirm the last command
-TOLD_EVERY_S = 1.0  # at least, while a ramp takes its time
 
 
 class LastCommandSender:
@@ -69,7 +69,7 @@ class LastCommandSender:
                 )
                 break
             time.sleep(step_s)
-            if time.monotonic() > told + TOLD_EVERY_S:
+            if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
                 told = time.monotonic()
                 tell()
         self._io.wait_until_received(CONFIRMED_WITHIN_S)

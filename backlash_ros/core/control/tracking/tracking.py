@@ -192,7 +192,7 @@ class Tracking:
         mode = rest.decide(
             inputs.y, window, x, onward, deviation,
             None if x_cov is None else self._x_std, inverse.side,
-            most if self._trusted_for > 0 else self._width * self._scale,
+            most if self._trusted_for > 0 else self._acquisition_bound,
         )
         shrinkage = self._shrinkage
         if mode is Mode.FOLLOW:
@@ -288,15 +288,20 @@ class Tracking:
         to be crossed some day.
         """
         feedback = self._bounded(deviation)
-        if abs(feedback) == self._width * self._scale:
+        if abs(feedback) == self._acquisition_bound:
             self._width = min(WIDENING * self._width, LARGEST_IN_ACQUISITION)
         return feedback
+
+    @property
+    def _acquisition_bound(self) -> float:
+        """Largest |u - u*| while the backlash is unknown."""
+        return self._width * self._scale
 
     def _bounded(self, deviation: Sequence[float]) -> float:
         """Feedback of the acquisition within its bound."""
         if self._acquisition_gain is None:
             return 0.0
-        bound = self._width * self._scale
+        bound = self._acquisition_bound
         return min(max(dot(self._acquisition_gain, deviation), -bound), bound)
 
     def _is_trusted(self, estimate: Estimate, first: bool) -> bool:
@@ -313,7 +318,7 @@ class Tracking:
         if first:
             self._trusted_for = TRUSTED_AFTER
         if self._trusted_for < TRUSTED_AFTER:
-            sharp = _is_sharp(estimate, self._width * self._scale)
+            sharp = _is_sharp(estimate, self._acquisition_bound)
             self._trusted_for += self._sharp_counts if sharp else 1
         return self._trusted_for >= TRUSTED_AFTER
 
