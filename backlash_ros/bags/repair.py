@@ -28,8 +28,8 @@ from backlash_ros.bags.content import (
     the_message_file,
 )
 from backlash_ros.bags.remains import damage, open_remains
+from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
-DONE, FAILED, BAD_INPUT = 0, 1, 2
 STORAGE = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
 

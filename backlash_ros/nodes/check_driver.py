@@ -42,14 +42,14 @@ from backlash_ros.core.driver_check.verdict import all_fit, judge, similar_topic
 from backlash_ros.core.parameters.table import CONTROLLER, RECORDER
 from backlash_ros.nodes.diagnostics.presence import Presence
 from backlash_ros.nodes.diagnostics.rivals import identity_made_by, names_of
-from backlash_ros.nodes.runtime.arguments import OptionParser, ros_arguments
+from backlash_ros.nodes.runtime.arguments import ros_arguments
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
-from backlash_ros.nodes.runtime.spin import BAD_INPUT, DONE, ProcessNode, run
+from backlash_ros.nodes.runtime.spin import ProcessNode, run
+from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser, positive
 from backlash_ros.shipped import find_config
 
 EXECUTABLE = 'check_driver'
-UNFIT = 1
 LOOK_S = 0.1  # between two looks at the graph
 SETTLE_S = 1.0  # after which everybody should have found everybody
 REMIND_S = 3.0  # between two lines that say what is missing
@@ -87,7 +87,7 @@ class CheckDriverNode(ProcessNode):
             topic: self.resolve_topic_name(topic)
             for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL)
         }
-        self.exit_code = UNFIT
+        self.exit_code = FAILED
 
     def work(self, executor: NodeExecutor) -> None:
         """Wait for the driver, listen, come to rest, tell."""
@@ -309,7 +309,7 @@ class CheckDriverNode(ProcessNode):
         print(table(findings), flush=True)
         if self._options.save is not None:
             self._save(self._options.save)
-        self.exit_code = DONE if all_fit(findings) else UNFIT
+        self.exit_code = DONE if all_fit(findings) else FAILED
 
     def _save(self, path: Path) -> None:
         timing = timing_of(self._heard, self._period)
@@ -345,33 +345,26 @@ def _misfit(offered: QoSProfile, asked: QoSProfile) -> str:
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
 
 
-def _positive(text: str) -> float:
-    number = float(text)
-    if not 0.0 < number < inf:
-        raise argparse.ArgumentTypeError(f'{text} must be finite and > 0')
-    return number
-
-
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     """Options besides those of ROS."""
     parser = OptionParser(
-        prog=EXECUTABLE, description=__doc__,
+        EXECUTABLE, description=__doc__,
         epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.',
     )
     parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
                         'or the name of a shipped one')
-    parser.add_argument('--duration', type=_positive, default=10.0, metavar='SECONDS',
+    parser.add_argument('--duration', type=positive, default=10.0, metavar='SECONDS',
                         help='how long to listen (default: 10)')
-    parser.add_argument('--wait', type=_positive, default=10.0, metavar='SECONDS',
+    parser.add_argument('--wait', type=positive, default=10.0, metavar='SECONDS',
                         help='how long to wait for a driver (default: 10)')
     parser.add_argument('--drive', action='store_true',
                         help='move v, to and fro within control.min, control.max and '
                              'control.rate_max, to rest at the end')
-    parser.add_argument('--amplitude', type=_positive, metavar='V',
+    parser.add_argument('--amplitude', type=positive, metavar='V',
                         help='drive: keep v within ±V as well')
-    parser.add_argument('--rate', type=_positive, metavar='V_PER_S',
+    parser.add_argument('--rate', type=positive, metavar='V_PER_S',
                         help='drive: keep v slower than this as well')
-    parser.add_argument('--rest', type=_positive, default=30.0, metavar='SECONDS',
+    parser.add_argument('--rest', type=positive, default=30.0, metavar='SECONDS',
                         help='drive: longest way to rest at the end, after which v is held '
                              '(default: 30); a signal on that way holds v at once')
     parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),

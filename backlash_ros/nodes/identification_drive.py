@@ -14,10 +14,10 @@ from backlash_ros.core.driver_check.findings import Message
 from backlash_ros.core.driver_check.gentle_drive import Drive, IdentificationDrive, Range
 from backlash_ros.nodes.check_driver import CheckDriverNode
 from backlash_ros.nodes.runtime.arguments import ros_arguments
-from backlash_ros.nodes.runtime.spin import DONE, run
+from backlash_ros.nodes.runtime.spin import run
+from backlash_ros.options import DONE, FAILED
 
 EXECUTABLE = 'identify'
-UNHEARD = 1  # exit code where the actuator was never moved
 
 
 class IdentificationDriveNode(CheckDriverNode):
@@ -69,7 +69,7 @@ class IdentificationDriveNode(CheckDriverNode):
             why = 'nobody subscribes to ' + self._names[topics.CONTROL] if self._heard.outputs \
                 else f'nothing was heard on {outputs}'
             print(f'{EXECUTABLE}: the actuator was not moved: {why}', file=sys.stderr)
-        self.exit_code = DONE if self._drive is not None else UNHEARD
+        self.exit_code = DONE if self._drive is not None else FAILED
 
 
 def _line(topic: str, message: Message) -> str:

@@ -38,7 +38,8 @@ from backlash_ros.nodes.runtime.messages import (
     stamp_ns_of,
 )
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
-from backlash_ros.nodes.runtime.spin import BAD_INPUT, FAILED, ProcessNode, run
+from backlash_ros.nodes.runtime.spin import ProcessNode, run
+from backlash_ros.options import BAD_INPUT, FAILED
 
 DEPTH = 10_000  # messages that may wait while the disk is slow
 PROGRESS_PERIOD_S = 0.2

@@ -15,7 +15,8 @@ PACKAGE = 'backlash_ros'
 SHARED = {
     PACKAGE,
     *(f'{PACKAGE}.{name}' for name in (
-        'atomic_file', 'middleware.installed', 'middleware.loopback', 'shipped', 'topics',
+        'atomic_file', 'middleware.installed', 'middleware.loopback', 'options',
+        'shipped', 'topics',
     )),
 }
 LAYERS = ('core', 'bags', 'nodes', 'tools')

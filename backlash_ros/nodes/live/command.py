@@ -14,15 +14,16 @@ from rclpy.utilities import remove_ros_args
 from backlash_ros.nodes.live.node import EXECUTABLE, LiveNode
 from backlash_ros.nodes.live.page_server import LARGEST_PORT, bound_socket
 from backlash_ros.nodes.monitor.followed import NICENESS
-from backlash_ros.nodes.runtime.arguments import OptionParser, ros_arguments
+from backlash_ros.nodes.runtime.arguments import ros_arguments
 from backlash_ros.nodes.runtime.spin import run
+from backlash_ros.options import OptionParser
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     parser = OptionParser(
-        prog=EXECUTABLE, description=__doc__,
+        EXECUTABLE, description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog='From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )

@@ -13,15 +13,16 @@ from rclpy.utilities import remove_ros_args
 
 from backlash_ros.nodes.monitor.followed import NICENESS
 from backlash_ros.nodes.monitor.node import EXECUTABLE, MonitorNode
-from backlash_ros.nodes.runtime.arguments import OptionParser, ros_arguments
+from backlash_ros.nodes.runtime.arguments import ros_arguments
 from backlash_ros.nodes.runtime.spin import run
+from backlash_ros.options import OptionParser
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     parser = OptionParser(
-        prog=EXECUTABLE, description=__doc__,
+        EXECUTABLE, description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog='keys: f freezes or goes on learning, c compensates or not, r (twice) resets the '
                'estimates,\n      s saves them, Tab takes the next controller, q ends.',

@@ -20,7 +20,8 @@ from backlash_ros.nodes.monitor.followed import FollowedControllers, time_of_day
 from backlash_ros.nodes.monitor.keys import pressed_keys
 from backlash_ros.nodes.monitor.state import NAMES, ControllerState
 from backlash_ros.nodes.monitor.view import ASCII_BLOCKS, BLOCKS, plain_line, screen
-from backlash_ros.nodes.runtime.spin import DONE, ProcessNode
+from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.options import DONE
 
 EXECUTABLE = 'monitor'
 REFRESH_S = 0.2  # of the screen

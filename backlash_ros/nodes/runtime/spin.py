@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, NoReturn, cast
+from typing import Any, cast
 
 import rclpy
 from rclpy.clock import Clock
@@ -32,8 +32,8 @@ from backlash_ros.nodes.runtime.declare import declare_parameters
 from backlash_ros.nodes.runtime.forced_exit import exit_at_the_latest
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, make_executor
 from backlash_ros.nodes.runtime.unused_sections import complaints
+from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 
-DONE, FAILED, BAD_INPUT = 0, 1, 2
 LOOK_S = 0.01  # between two looks at a condition of start-up
 AGAIN_S = 0.1  # between two requests to stop, until the node has heard one
 GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node in a second
@@ -207,20 +207,13 @@ class _SignalPipe:
         threading.Thread(target=wait, daemon=True).start()
 
 
-class _Parser(argparse.ArgumentParser):
-    """Reports errors in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f'{self.prog}: {message}: parameters are given as '
-                             '--ros-args -p NAME:=VALUE or --params-file FILE\n')
-
-
 def _parse_plain_arguments(
     executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None,
 ) -> None:
     """Refuse what is no argument of ROS; print help where asked for."""
-    parser = _Parser(
-        prog=executable, usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
+    parser = OptionParser(
+        executable, ': parameters are given as --ros-args -p NAME:=VALUE or --params-file FILE',
+        usage=f'{executable} [--ros-args -p NAME:=VALUE --params-file FILE ...]',
         description=sys.modules[make_node.__module__].__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter, epilog=_parameter_help(executable),
     )

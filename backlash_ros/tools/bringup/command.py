@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from backlash_ros.options import DONE, OptionParser
 from backlash_ros.tools.cli import command_line
-from backlash_ros.tools.cli.command_line import DEFAULT_DURATION_S, DONE, OptionParser
+from backlash_ros.tools.cli.command_line import DEFAULT_DURATION_S
 
 EPILOG = """
 driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
@@ -37,9 +38,9 @@ environment: the processes inherit it. Unless you set them yourself,
 
 
 def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Options of the command line; raises InputError."""
+    """Options of the command line."""
     parser = OptionParser(
-        prog='bringup', description=__doc__, epilog=EPILOG,
+        'bringup', description=__doc__, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     command_line.add_common_options(parser)

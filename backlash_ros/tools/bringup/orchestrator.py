@@ -15,6 +15,7 @@ from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import BY_NAME, PLANT
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
+from backlash_ros.options import DONE, FAILED
 from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.processes import ProcessSupervisor, RunError
 from backlash_ros.tools.bringup.progress import ProgressDisplay
@@ -30,8 +31,6 @@ from backlash_ros.tools.bringup.run_plan import (
 from backlash_ros.tools.bringup.supervision import Run, StopRequests, complain
 from backlash_ros.tools.cli.command_line import (
     DEFAULT_DURATION_S,
-    DONE,
-    FAILED,
     print_warnings,
     whole_samples,
 )

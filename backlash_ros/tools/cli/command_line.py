@@ -1,4 +1,4 @@
-"""What the command-line tools share: options, exit codes, a bar, tables."""
+"""What the command-line tools share: options, how they end, tables."""
 
 from __future__ import annotations
 
@@ -8,27 +8,19 @@ import sys
 from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.options import BAD_INPUT, DONE, FAILED
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
 
 if TYPE_CHECKING:
     from backlash_ros.tools.run_files.bag_sections import Span
 
-DONE, FAILED, BAD_INPUT = 0, 1, 2
 DEFAULT_DURATION_S = 10.0
 # A duration may miss a whole number of sample periods by rounding alone.
 WHOLE_TOLERANCE = 1e-6
-
-
-class OptionParser(argparse.ArgumentParser):
-    """Argument parser whose errors are one line, as those of every other input."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise InputError."""
-        raise InputError(f'{message} (--help lists the options)')
 
 
 def add_common_options(parser: argparse.ArgumentParser) -> None:
@@ -105,6 +97,8 @@ def run_tool(name: str, tool: Callable[[], None]) -> int:
         tool()
     except (ParameterError, InputError) as error:
         return _fail(name, str(error), BAD_INPUT)
+    except SystemExit as ended:
+        return int(ended.code or DONE)  # the parser of the options has said why
     except KeyboardInterrupt:
         return _fail(name, 'interrupted', FAILED)
     except (BrokenOffError, OSError) as error:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from backlash_ros.atomic_file import write_atomically
+from backlash_ros.options import OptionParser
 from backlash_ros.tools.cli import command_line
 from backlash_ros.tools.cli.command_line import number_of_samples
 from backlash_ros.tools.compare.comparison import HEADER, compare, row
@@ -23,7 +24,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """The options of `compare`."""
-    parser = command_line.OptionParser('compare', description=__doc__)
+    parser = OptionParser('compare', description=__doc__)
     command_line.add_common_options(parser)
     parser.add_argument('--duration', type=float, default=10.0, metavar='SECONDS',
                         help='length of each run (default: 10)')

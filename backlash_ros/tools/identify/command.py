@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from backlash_ros.core.parameters.table import Value
+from backlash_ros.options import FAILED, OptionParser, positive
 from backlash_ros.tools.cli.command_line import (
-    FAILED,
-    OptionParser,
     add_out_option,
     add_span_options,
     run_tool,
@@ -48,7 +46,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='delays that are compared [samples] (default: 0-3)')
     parser.add_argument('--integrator', choices=sorted(INTEGRATORS), default='auto',
                         help='whether G has a pole at 1 (default: auto)')
-    parser.add_argument('--slope', type=_positive, default=1.0, metavar='M',
+    parser.add_argument('--slope', type=positive, default=1.0, metavar='M',
                         help='m, a gear ratio for instance; it cannot be told from the gain of G '
                              '(default: 1)')
     parser.add_argument('--held-out', type=_share, default=1.0 / 3.0, metavar='SHARE',
@@ -60,19 +58,19 @@ def make_parser() -> argparse.ArgumentParser:
     drive.add_argument('--drive', action='store_true',
                        help='move the actuator within control.min, control.max and '
                             'control.rate_max of --config, record, bring it to rest, identify')
-    drive.add_argument('--duration', type=_positive, metavar='S', default=20.0,
+    drive.add_argument('--duration', type=positive, metavar='S', default=20.0,
                        help='longest motion [s] (default: 20)')
     drive.add_argument('--precision', type=_percent, default=0.0, metavar='P%',
                        help='end the motion as soon as gap and G are known to this (default: 0, '
                             'the whole duration)')
-    drive.add_argument('--amplitude', type=_positive, metavar='V', help='keep v within ±V as well')
-    drive.add_argument('--rate', type=_positive, metavar='V_PER_S',
+    drive.add_argument('--amplitude', type=positive, metavar='V', help='keep v within ±V as well')
+    drive.add_argument('--rate', type=positive, metavar='V_PER_S',
                        help='keep v slower than this as well')
     drive.add_argument('--output-range', type=float, nargs=2, metavar=('LOW', 'HIGH'),
                        help='end the motion when y leaves this range')
-    drive.add_argument('--wait', type=_positive, default=10.0, metavar='S',
+    drive.add_argument('--wait', type=positive, default=10.0, metavar='S',
                        help='how long to wait for a driver (default: 10)')
-    drive.add_argument('--rest', type=_positive, default=30.0, metavar='S',
+    drive.add_argument('--rest', type=positive, default=30.0, metavar='S',
                        help='longest way to rest at the end (default: 30)')
     return parser
 
@@ -92,13 +90,6 @@ def _range_to(most: int, least: int) -> Callable[[str], tuple[int, ...]]:
             )
         return tuple(range(low, high + 1))
     return parse
-
-
-def _positive(text: str) -> float:
-    number = float(text)
-    if not 0.0 < number < inf:
-        raise argparse.ArgumentTypeError(f'{text} must be finite and > 0')
-    return number
 
 
 def _percent(text: str) -> float:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import Value
+from backlash_ros.options import OptionParser
 from backlash_ros.tools.cli.command_line import (
-    OptionParser,
     add_out_option,
     add_span_options,
     format_table,

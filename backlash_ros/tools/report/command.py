@@ -16,8 +16,8 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.bags.content import is_bag
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.options import OptionParser
 from backlash_ros.tools.cli.command_line import (
-    OptionParser,
     add_out_option,
     add_span_options,
     run_tool,

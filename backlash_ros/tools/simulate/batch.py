@@ -24,7 +24,8 @@ from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.table import BY_NAME, Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
-from backlash_ros.tools.cli.command_line import FAILED, number_of_samples
+from backlash_ros.options import FAILED
+from backlash_ros.tools.cli.command_line import number_of_samples
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
 from backlash_ros.tools.run_files.results import BACKLASH, summarise
 from backlash_ros.tools.simulate.simulation import run_loop

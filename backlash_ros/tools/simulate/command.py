@@ -14,6 +14,7 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.options import OptionParser
 from backlash_ros.tools.cli import command_line
 from backlash_ros.tools.cli.command_line import (
     DEFAULT_DURATION_S,
@@ -41,7 +42,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """The options of `simulate`."""
-    parser = command_line.OptionParser('simulate', description=__doc__)
+    parser = OptionParser('simulate', description=__doc__)
     command_line.add_common_options(parser)
     parser.add_argument(
         '--duration', type=float, metavar='SECONDS',
