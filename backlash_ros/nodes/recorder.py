@@ -7,9 +7,7 @@ import shutil
 import signal
 import sys
 import time
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -17,8 +15,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
-from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64, Float64MultiArray
 
@@ -27,8 +23,9 @@ from backlash_ros.bags.content import CURE
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.bags.writer import Bag, RecordingError
 from backlash_ros.core.loop.figures import Finding, Level
-from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters.table import RECORDER
+from backlash_ros.nodes.recording.channel import Channel
+from backlash_ros.nodes.recording.progress import Progress
 from backlash_ros.nodes.runtime.driver_io import STYLES, output_qos
 from backlash_ros.nodes.runtime.events import ENABLED, emit
 from backlash_ros.nodes.runtime.messages import (
@@ -56,72 +53,6 @@ OF_THE_LOOP: dict[str, type[Any]] = {
     topics.DIAGNOSTICS: DiagnosticArray,
 }
 NEEDED_PUBLISHERS = (topics.REFERENCE, topics.ESTIMATES, topics.SIGNALS)
-
-
-@dataclass
-class Channel:
-    """A recorded topic: what came in, and how many messages were missed on the way."""
-
-    topic: str
-    several_publishers: bool
-    name: str = ''  # with namespace and remappings, as it is recorded
-    connection: Connection | None = None
-    received: int = 0
-    recorded: int = 0
-    missed: int = 0
-    sequence: int = UNNUMBERED
-
-    def count(self, sequence: int) -> None:
-        """Take note of a message."""
-        self.received += 1
-        if sequence == UNNUMBERED or self.several_publishers:
-            return
-        if self.sequence != UNNUMBERED and sequence > self.sequence + 1:
-            self.missed += sequence - self.sequence - 1
-        self.sequence = sequence
-
-
-class Progress:
-    """The newest rows, still serialised, and what they say about the run."""
-
-    def __init__(self) -> None:
-        self._estimates = b''
-        self._truth = b''
-        # The truth of a sample follows its signals by one sample.
-        self._signals: deque[bytes] = deque(maxlen=8)
-        self._first = b''
-        self._rows = 0
-
-    def take(self, topic: str, message: bytes) -> None:
-        """Remember a row of one of the array topics."""
-        if topic == topics.ESTIMATES:
-            self._estimates = message
-        elif topic == topics.TRUTH:
-            self._truth = message
-        elif topic == topics.SIGNALS:
-            self._first = self._first or message
-            self._signals.append(message)
-            self._rows += 1
-
-    def report(self) -> dict[str, object]:
-        """Content of a progress event, empty before the first sample."""
-        if not (self._estimates and self._signals):
-            return {}
-        signals = [_row(message, topics.SIGNAL_LABELS) for message in self._signals]
-        first, newest = _row(self._first, topics.SIGNAL_LABELS), signals[-1]
-        estimates = _row(self._estimates, topics.ESTIMATE_LABELS)
-        truth = _row(self._truth, topics.TRUTH_LABELS) if self._truth else {}
-        same = [row for row in signals if row['sample'] == truth.get('sample')]
-        return {
-            'sample': int(min(newest['sample'], estimates['sample'])),
-            'status': int(newest['status']),
-            **{name: estimates[name] for name in (
-                'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
-            )},
-            **{f'true_{name}': truth.get(name) for name in ('m', 'c_r', 'c_l')},
-            'control_error': truth['u'] - same[0]['u_d'] if same else None,
-            'lost': int(newest['sample'] - first['sample']) + 1 - self._rows,
-        }
 
 
 class RecorderNode(ProcessNode):
@@ -292,10 +223,6 @@ def _free_megabytes(folder: Path) -> float:
 
 def _is_published(subscription: Any) -> bool:
     return bool(subscription.get_publisher_count() > 0)
-
-
-def _row(message: bytes, labels: tuple[str, ...]) -> dict[str, float]:
-    return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=True))
 
 
 def _type_name(message_type: type[Any]) -> str:

@@ -19,12 +19,13 @@ import yaml
 from bringup_processes import Session, bag_counts, marked_processes, wait_until
 
 from backlash_ros import topics
+from backlash_ros.tools.bringup import axis_progress, domains, environment, supervision
 from backlash_ros.tools.bringup import command as bringup
-from backlash_ros.tools.bringup import domains, environment, supervision
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.bringup.progress import ProgressDisplay, describe
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
+from backlash_ros.tools.cli.stop_requests import StopRequests
 from backlash_ros.tools.config.configuration import effective_parameters
 
 NODES = ('controller', 'plant', 'recorder', 'reference')
@@ -244,7 +245,7 @@ def watch(
         with ProcessSupervisor(stages, lambda: hurry) as supervisor:
             displays = {'': ProgressDisplay(100, 0.01, sys.stderr)}
             plan = RunPlan((axis,), tmp_path)
-            run = supervision.Run(plan, supervisor, supervision.StopRequests(), displays)
+            run = supervision.Run(plan, supervisor, StopRequests(), displays)
             run.execute()
         return Watched(run.failure, capsys.readouterr().err, mark)
 
@@ -267,7 +268,7 @@ def test_process_that_is_never_ready_is_named_with_the_end_of_its_log(
 def test_standstill_is_an_error_that_names_the_last_sample(
     watch: Callable[..., Watched], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervision, 'STALL_DEADLINE_S', 0.5)
+    monkeypatch.setattr(axis_progress, 'STALL_DEADLINE_S', 0.5)
     run = watch(recorder=f'{READY}; {progress(41)}; {WAIT}')
     assert 'no new sample for' in run.failure
     assert 'after sample 41' in run.failure

@@ -14,11 +14,12 @@ import pytest
 from bringup_processes import DEADLINE_S, Session, wait_until
 from ros_processes import ros_world
 
-from backlash_ros.tools.bringup import process_groups, supervision
+from backlash_ros.tools.bringup import axis_progress, process_groups, supervision
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.bringup.progress import ProgressDisplay
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan, plan_processes
+from backlash_ros.tools.cli.stop_requests import StopRequests
 from backlash_ros.tools.config.configuration import effective_parameters
 
 PLANT = f'{shlex.quote(sys.executable)} -m backlash_ros.nodes.plant'
@@ -353,7 +354,7 @@ def watched(
         ]
         with ProcessSupervisor(stages, lambda: False) as supervisor:
             displays = {'': ProgressDisplay(100, 0.01, sys.stderr)}
-            run = supervision.Run(run_plan, supervisor, supervision.StopRequests(), displays)
+            run = supervision.Run(run_plan, supervisor, StopRequests(), displays)
             run.execute()
         return run.failure, capsys.readouterr().err
     return watch
@@ -369,8 +370,8 @@ def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(
 def test_too_few_samples_of_a_driver_are_an_error_when_the_time_is_over(
     watched: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervision, 'LATE_DEADLINE_S', 0.5)
-    monkeypatch.setattr(supervision, 'STALL_DEADLINE_S', 0.1)
+    monkeypatch.setattr(axis_progress, 'LATE_DEADLINE_S', 0.5)
+    monkeypatch.setattr(axis_progress, 'STALL_DEADLINE_S', 0.1)
     failure, said = watched(recorder=f'{READY}; {PROGRESS.format(7)}; {PROGRESS.format(48)}')
     assert failure.startswith('only 42 of 100 samples')
     # A silent driver may come back: that alone does not end the run.
@@ -380,7 +381,7 @@ def test_too_few_samples_of_a_driver_are_an_error_when_the_time_is_over(
 def test_driver_without_a_first_sample_is_an_error(
     watched: Callable[..., tuple[str, str]], monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 1.0)
+    monkeypatch.setattr(axis_progress, 'FIRST_SAMPLE_DEADLINE_S', 1.0)
     failure, _ = watched(recorder=READY)
     assert failure.startswith('no sample within 1 s: does the driver publish its output?')
 

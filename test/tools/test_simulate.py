@@ -24,6 +24,7 @@ from backlash_ros.tools.simulate import batch
 from backlash_ros.tools.simulate.batch import Outcome, Sweep
 from backlash_ros.tools.simulate.command import main
 from backlash_ros.tools.simulate.simulation import run_loop
+from backlash_ros.tools.simulate.statistics import statistics
 
 ROOT = Path(__file__).resolve().parents[2]
 NOISY = ['--set', 'output_noise_std=1e-3', '--set', 'estimator.law=lms']
@@ -113,7 +114,7 @@ def test_seeds_give_a_table_and_a_row_each(
     expected = [batch.run_job(job) for job in jobs]
     assert [float(row['c_r']) for row in rows] == [outcome.final[1] for outcome in expected]
     out = capsys.readouterr().out
-    rmse = batch.statistics(expected)['m'].rmse
+    rmse = statistics(expected)['m'].rmse
     assert out.splitlines()[1].split()[:3][2] == f'{rmse:.3g}'
     assert 'not within 1 % at the end: 3 runs, seed 10, 11, 12' in out
 
@@ -216,7 +217,7 @@ def outcome(error: float, settling: float, std: float = nan) -> Outcome:
 
 
 def test_statistics_are_those_of_the_errors() -> None:
-    of = batch.statistics([outcome(0.01, 1.0, 0.01), outcome(-0.025, inf, 0.01),
+    of = statistics([outcome(0.01, 1.0, 0.01), outcome(-0.025, inf, 0.01),
                            outcome(0.015, 2.0, 0.015)])
     m = of['m']
     assert m.bias == pytest.approx(0.0, abs=1e-15)
@@ -229,15 +230,15 @@ def test_statistics_are_those_of_the_errors() -> None:
 
 
 def test_nees_needs_every_standard_deviation() -> None:
-    of = batch.statistics([outcome(0.01, 1.0, 0.01), outcome(0.01, 1.0)])
+    of = statistics([outcome(0.01, 1.0, 0.01), outcome(0.01, 1.0)])
     assert isnan(of['m'].nees)
 
 
 def test_run_that_broke_off_is_left_out_of_the_statistics() -> None:
-    of = batch.statistics([outcome(0.01, 1.0), Outcome(problem='y=inf')])
+    of = statistics([outcome(0.01, 1.0), Outcome(problem='y=inf')])
     assert of['m'].rmse == pytest.approx(0.01)
     with pytest.raises(InputError, match='every run broke off, the first one with: y=inf'):
-        batch.statistics([Outcome(problem='y=inf')])
+        statistics([Outcome(problem='y=inf')])
 
 
 def test_run_that_breaks_off_says_why() -> None:

@@ -28,13 +28,14 @@ from backlash_ros.tools.bringup.run_plan import (
     check_limits,
     plan_processes,
 )
-from backlash_ros.tools.bringup.supervision import Run, StopRequests, complain
+from backlash_ros.tools.bringup.supervision import Run, complain
 from backlash_ros.tools.cli.command_line import (
     DEFAULT_DURATION_S,
     print_warnings,
     whole_samples,
 )
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
+from backlash_ros.tools.cli.stop_requests import StopRequests
 from backlash_ros.tools.config.configuration import Configuration, read_configuration, write_config
 from backlash_ros.tools.run_files.results import CONFIG, result_directory
 

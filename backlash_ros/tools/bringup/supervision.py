@@ -6,22 +6,19 @@ import signal
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from math import inf, isfinite
-from types import FrameType, TracebackType
-from typing import Any
 
 from backlash_ros import topics
+from backlash_ros.tools.bringup.axis_progress import AxisProgress
 from backlash_ros.tools.bringup.processes import Child, Event, ProcessSupervisor, RunError
-from backlash_ros.tools.bringup.progress import ProgressDisplay, counts, number
+from backlash_ros.tools.bringup.progress import ProgressDisplay, counts
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
+from backlash_ros.tools.cli.stop_requests import StopRequests
 
 READY_DEADLINE_S = 30.0
-LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
+CATCH_UP_DEADLINE_S = 10.0  # for the recorder, after the last sample
 # Reports without anything that was unheard, after which nothing is to come. The middleware sends
 # again what got lost on the way to a recorder that was held up, with its own settings every 3 s.
 STANDS_STILL = 20
-STALL_DEADLINE_S = 10.0  # without a new sample
 LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
 
 # Where y may come from, as the ends of full names.
@@ -31,108 +28,6 @@ OUTPUTS = (f'/{topics.PLANT_OUTPUT}', f'/{topics.JOINT_STATES}')
 TOLD_TO_END = {
     code for number in (signal.SIGINT, signal.SIGTERM) for code in (-number, 128 + number)
 }
-
-
-class StopRequests:
-    """Counts SIGINT, SIGTERM and SIGHUP as long as the context lasts, instead of dying of them."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.last = ''
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> StopRequests:
-        for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # Under nohup a hang-up stays ignored.
-            if caught != signal.SIGHUP or signal.getsignal(caught) is not signal.SIG_IGN:
-                self._before[caught] = signal.signal(caught, self._note)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        for caught, handler in self._before.items():
-            signal.signal(caught, handler)
-
-    def insist(self) -> bool:
-        """Whether there was a second request."""
-        return self.count > 1
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.count += 1
-        self.last = signal.Signals(number).name
-
-
-@dataclass
-class AxisProgress:
-    """How far an axis has come.
-
-    made: samples so far. first: number of the sample that counts as the first one. moved: when
-    the newest sample was heard of, on the monotonic clock [s]. published: samples and messages by
-    topic that can have been heard of a simulated plant, once it is done; heard: those that the
-    recorder has told of.
-    """
-
-    plan: AxisPlan
-    display: ProgressDisplay
-    made: int = 0
-    first: int = 0
-    began: float = 0.0
-    moved: float = 0.0
-    published: Mapping[str, int] | None = None
-    heard: dict[str, int] = field(default_factory=dict)
-    repeats: int = 0  # times in a row that the recorder has told of nothing that was unheard
-    silence_told: bool = False
-
-    @property
-    def patience(self) -> float:
-        """How long to wait for a new sample [s]."""
-        # A plant of long sample periods may take its time.
-        return STALL_DEADLINE_S + 2.0 * self.plan.sample_period
-
-    @property
-    def deadline(self) -> float:
-        """When the last sample must have come, on the monotonic clock [s]."""
-        if self.plan.samples == 0 or self.plan.parameters.get_bool('lockstep'):
-            return inf
-        return self.began + self.plan.samples * self.plan.sample_period + LATE_DEADLINE_S
-
-    @property
-    def complete(self) -> bool:
-        """Whether all samples were made; a driver does not say so, the recorder hears it."""
-        if self.plan.has_driver:
-            return 0 < self.plan.samples <= self.made
-        return self.published is not None
-
-    @property
-    def unheard(self) -> dict[str, int]:
-        """What is missing of the published ones."""
-        missing = {
-            what: count - self.heard.get(what, 0) for what, count in (self.published or {}).items()
-        }
-        return {what: count for what, count in missing.items() if count > 0}
-
-    def begin(self) -> None:
-        """The time starts to run."""
-        self.began = self.moved = time.monotonic()
-
-    def take(self, progress: Mapping[str, object]) -> None:
-        """Take in what the recorder says."""
-        sample = number(progress, 'sample')
-        if not isfinite(sample):
-            return
-        if self.made == 0:
-            self.begin()
-            # A driver may have been running before; a simulated plant begins with sample 0.
-            self.first = int(sample) if self.plan.has_driver else 0
-        made = int(sample) + 1 - self.first
-        before = self.unheard
-        self.heard = {'samples': made, **counts(progress, 'received')}
-        self.repeats = self.repeats + 1 if self.unheard == before else 0
-        if made > self.made:
-            self.made, self.moved, self.silence_told = made, time.monotonic(), False
-            self.display.show(progress, made)
 
 
 class Run:
@@ -165,7 +60,7 @@ class Run:
             while not (self._over or all(axis.complete for axis in self._axes.values())):
                 self._listen()
                 for axis in self._axes.values():
-                    self._check_pace(axis)
+                    axis.check_pace()
             self._catch_up()
             if self._over:
                 self._say(f'{self._requests.last} ends the run')
@@ -222,37 +117,11 @@ class Run:
             waiting.append(axis.process_name('plant'))
         return child.plan.name in waiting
 
-    def _check_pace(self, axis: AxisProgress) -> None:
-        """Raise RunError for samples that do not come."""
-        now = time.monotonic()
-        plan = axis.plan
-        if plan.has_driver and axis.made == 0:
-            if not plan.driver_is_elsewhere and now > axis.began + READY_DEADLINE_S:
-                raise RunError(plan.titled(
-                    f'no sample within {READY_DEADLINE_S:g} s: does the driver publish its output? '
-                    f'see {plan.logs}; where it needs longer, start it yourself (--driver none)'
-                ))
-            return
-        if now > axis.deadline and not axis.complete:
-            raise RunError(plan.titled(
-                f'only {axis.made} of {plan.samples} samples, '
-                f'{LATE_DEADLINE_S:g} s after the end was due, see {plan.logs}'
-            ))
-        if now > axis.moved + axis.patience and not axis.complete:
-            at = f' after sample {axis.first + axis.made - 1}' if axis.made else ''
-            silence = plan.titled(f'no new sample for {axis.patience:g} s{at}')
-            if not plan.has_driver:
-                raise RunError(f'{silence}, see {plan.logs}')
-            # The controller knows what to do when a real plant falls silent.
-            if not axis.silence_told:
-                axis.silence_told = True
-                axis.display.say(f'bringup: {silence}, waiting for the driver')
-
     def _catch_up(self) -> None:
         """Wait until the recorder has told of all that was published, and say what is missing."""
         for axis in self._axes.values():
             axis.repeats = 0
-        deadline = time.monotonic() + STALL_DEADLINE_S
+        deadline = time.monotonic() + CATCH_UP_DEADLINE_S
         while not self._over and any(
             axis.unheard and axis.repeats < STANDS_STILL for axis in self._axes.values()
         ):

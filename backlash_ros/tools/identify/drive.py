@@ -27,8 +27,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import BAD_INPUT
-from backlash_ros.tools.bringup.supervision import StopRequests
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
+from backlash_ros.tools.cli.stop_requests import StopRequests
 from backlash_ros.tools.config.configuration import write_config
 from backlash_ros.tools.identify.measured_record import MeasuredRecord, from_messages
 from backlash_ros.tools.identify.outcome import options_of

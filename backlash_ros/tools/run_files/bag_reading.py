@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.bags.content import CURE, BagError, is_being_written
-from backlash_ros.bags.remains import open_remains, visible_damage
 from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel, from_fields
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.run_files.bag_content import Content, read_content
 from backlash_ros.tools.run_files.bag_sections import WHOLE, Span, Table, choose, choose_namespace
 
 LABELS = {
@@ -36,7 +33,6 @@ SOURCES: dict[str, dict[str, str]] = {
     },
 }
 ARRAY, NUMBER = 'std_msgs/msg/Float64MultiArray', 'std_msgs/msg/Float64'
-Wanted = Callable[[str, str], bool]  # whether a topic of this name and type is to be read
 MODEL_LABELS = ('numerator', 'denominator', 'delay_samples')  # by which a renamed one is known
 TRUE_BACKLASH = {'true_m': 'm', 'true_c_r': 'c_r', 'true_c_l': 'c_l'}
 
@@ -58,18 +54,6 @@ class BagRun:
     notes: tuple[str, ...] = ()
 
 
-@dataclass
-class _Content:
-    """Stamps and messages of the array topics, under their recorded names; see BagRun."""
-
-    names: set[str] = field(default_factory=set)
-    messages: dict[str, list[tuple[int, Any]]] = field(default_factory=dict)
-    damage: str = ''
-
-    def add(self, name: str, stamp_ns: int, message: Any) -> None:
-        self.messages.setdefault(name, []).append((stamp_ns, message))
-
-
 def read_bag(
     path: Path, sample_period: float | None = None, span: Span = WHOLE, axis: str = '',
 ) -> BagRun:
@@ -81,7 +65,7 @@ def read_bag(
     did within the span. axis: of several, empty for the first one. Raises InputError, in one line,
     for a bag that cannot be read or holds no run.
     """
-    content = _read_content(path, _is_array_topic)
+    content = read_content(path, _is_array_topic)
     try:
         tables, note, models = _find_tables(path, content, axis)
     except InputError as error:
@@ -181,7 +165,7 @@ def read_plain_numbers(
     def wanted(name: str, message_type: str) -> bool:
         return message_type == NUMBER and _last_part(name) in ends
 
-    content = _read_content(path, wanted)
+    content = read_content(path, wanted)
     found = {}
     for name, pairs in sorted(content.messages.items()):
         messages = [(stamp, float(message.data)) for stamp, message in pairs]
@@ -218,23 +202,6 @@ def read_reports(path: Path, y: NDArray[np.float64], axis: str = '') -> list[lis
     return [[], *(values[a:b].tolist() for a, b in pairwise(until.tolist()))]
 
 
-def _read_content(path: Path, wanted_topic: Wanted) -> _Content:
-    if not path.is_dir():
-        rule = 'is a file: give the folder of the bag' if path.exists() else 'does not exist'
-        raise InputError(f'{path}: {rule}')
-    reason = visible_damage(path)
-    if not reason:
-        try:
-            return _read_complete(path, wanted_topic)
-        # Whatever a damaged file makes the library stumble over, the file is damaged.
-        except Exception as error:
-            reason = f'is damaged ({" ".join(str(error).split()) or type(error).__name__})'
-    try:
-        return _read_remains(path, reason, wanted_topic)
-    except BagError as error:
-        raise InputError(f'{path}: {reason}, and nothing of it can be read: {error}') from None
-
-
 def _is_array_topic(name: str, message_type: str) -> bool:
     return message_type == ARRAY and any(
         _last_part(name) == _last_part(topic) for topic in (*LABELS, topics.MODEL)
@@ -243,45 +210,6 @@ def _is_array_topic(name: str, message_type: str) -> bool:
 
 def _last_part(name: str) -> str:
     return name.rpartition('/')[2]
-
-
-def _read_complete(path: Path, wanted_topic: Wanted) -> _Content:
-    content = _Content()
-    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-        content.names = {connection.topic for connection in reader.connections}
-        wanted = [
-            found for found in reader.connections if wanted_topic(found.topic, found.msgtype)
-        ]
-        # No choice would be all of them.
-        for connection, stamp_ns, raw in reader.messages(wanted) if wanted else ():
-            message = reader.deserialize(raw, connection.msgtype)
-            content.add(connection.topic, stamp_ns, message)
-    return content
-
-
-def _read_remains(path: Path, reason: str, wanted_topic: Wanted) -> _Content:
-    content, types = _Content(), get_typestore(Stores.ROS2_JAZZY)
-    remains = open_remains(path)
-    first, last, count, garbled = 2**63, 0, 0, 0
-    for topic, stamp_ns, raw in remains.messages():
-        if wanted_topic(topic.name, topic.message_type):
-            try:
-                message = types.deserialize_cdr(raw, topic.message_type)
-            # Whatever the damaged bytes make the library stumble over, the message is lost.
-            except Exception:
-                garbled += 1
-                continue
-            content.add(topic.name, stamp_ns, message)
-        first, last, count = min(first, stamp_ns), max(last, stamp_ns), count + 1
-    if not count:
-        raise BagError('it holds no message')
-    content.names = {topic.name for topic in remains.topics.values()}
-    cure = 'stop the recorder' if is_being_written(path) else f'{CURE} {path}'
-    content.damage = (
-        f'{path} {reason}: this is what is left, {count} messages of {(last - first) * 1e-9:.1f} '
-        f's{f", {garbled} more cannot be decoded" if garbled else ""}. To have it complete: {cure}'
-    )
-    return content
 
 
 def _newest_model(
@@ -305,7 +233,7 @@ def _newest_model(
 
 
 def _find_tables(
-    path: Path, content: _Content, axis: str,
+    path: Path, content: Content, axis: str,
 ) -> tuple[dict[str, Table], str, list[tuple[int, Any]]]:
     """The array topics of one axis, what other axes there are, and its models."""
     tables, about = {}, ''
@@ -328,7 +256,7 @@ def _find_tables(
     return tables, about, content.messages.get(name, [])
 
 
-def _names_of(content: _Content, topic: str, labels: Sequence[str]) -> list[str]:
+def _names_of(content: Content, topic: str, labels: Sequence[str]) -> list[str]:
     """Under which names a topic was recorded; nodes that were renamed stand behind the others."""
     kept = {name for name in content.names if f'/{name}'.endswith(f'/{topic}')}
     renamed = {

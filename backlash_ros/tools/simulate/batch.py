@@ -1,4 +1,4 @@
-"""Many simulated runs in parallel processes: seeds, sweeps, and their statistics."""
+"""Many simulated runs in parallel processes: seeds and sweeps."""
 
 from __future__ import annotations
 
@@ -14,26 +14,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf, isfinite, nan
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
-from scipy.special import chdtri
 from tqdm import tqdm
 
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.table import BY_NAME, Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.options import FAILED
 from backlash_ros.tools.cli.command_line import number_of_samples
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
 from backlash_ros.tools.run_files.results import BACKLASH, summarise
 from backlash_ros.tools.simulate.simulation import run_loop
 
-# The matrices are tiny: threads of the linear algebra would only disturb the other processes.
 PATIENCE_S = 5.0  # after an interruption, until the process ends whatever it waits for
+# The matrices are tiny: threads of the linear algebra would only disturb the other processes.
 ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -68,24 +63,6 @@ class Outcome:
     tracking_error_rms: float = nan
     lost_samples: int = 0
     problem: str = ''
-
-
-@dataclass(frozen=True)
-class ParameterStatistics:
-    """Statistics of one estimated parameter over runs.
-
-    settling times [s]: inf for never. within: share of runs within 1 % at the end.
-    nees: mean of (error / std)^2, nan without standard deviations; honest ones put it into
-    nees_interval with 95 %.
-    """
-
-    bias: float
-    rmse: float
-    settling_median: float
-    settling_max: float
-    within: float
-    nees: float
-    nees_interval: tuple[float, float]
 
 
 def parse_sweep(text: str) -> Sweep:
@@ -250,35 +227,6 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
-    """Statistics of each estimated parameter over the runs that did not break off.
-
-    Raises InputError where all of them did.
-    """
-    whole = [outcome for outcome in outcomes if not outcome.problem]
-    if not whole:
-        raise InputError(f'every run broke off, the first one with: {outcomes[0].problem}')
-    return {name: _statistics(whole, i) for i, name in enumerate(BACKLASH)}
-
-
-def _statistics(outcomes: Sequence[Outcome], i: int) -> ParameterStatistics:
-    truth = np.array([outcome.truth[i] for outcome in outcomes])
-    error = np.array([outcome.final[i] for outcome in outcomes]) - truth
-    std = np.array([outcome.std[i] for outcome in outcomes])
-    settling = np.array([outcome.settling[i] for outcome in outcomes])
-    # The median of a number and "never" is never, not the nan of inf - inf.
-    median = float(np.sort(settling)[len(settling) // 2])
-    known = bool(np.all(np.isfinite(std) & (std > 0.0)))
-    n = len(outcomes)
-    # Quantiles of chi squared with n degrees of freedom: n times the mean has that distribution.
-    low, high = chdtri(n, [0.975, 0.025]) / n
-    return ParameterStatistics(
-        float(error.mean()), float(np.sqrt(np.mean(error**2))), median, float(settling.max()),
-        float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),
-        float(np.mean((error / std) ** 2)) if known else nan, (float(low), float(high)),
-    )
 
 
 def outcome_header(swept: Sequence[str]) -> list[str]:

@@ -30,6 +30,7 @@ from backlash_ros.tools.simulate import batch
 from backlash_ros.tools.simulate.batch import Job, Outcome
 from backlash_ros.tools.simulate.cluster import run_on_cluster
 from backlash_ros.tools.simulate.simulation import run_loop
+from backlash_ros.tools.simulate.statistics import statistics
 
 SEEDS, SWEEP, SWEEP_FIGURE = 'seeds.csv', 'sweep.csv', 'sweep.png'
 NAMED_SEEDS = 10  # that an answer lists before it refers to the CSV
@@ -160,7 +161,7 @@ def group(
 def seeds_table(outcomes: Sequence[Outcome]) -> str:
     """Statistics of each parameter over the seeds, as text; raises InputError if all broke off."""
     header = ['', 'bias', 'RMSE', 'settled, median', 'settled, last', 'within 1 %']
-    of = batch.statistics(outcomes)
+    of = statistics(outcomes)
     known = all(isfinite(s.nees) for s in of.values())
     if known:
         low, high = of['m'].nees_interval
@@ -184,7 +185,7 @@ def sweep_table(
         if all(outcome.problem for outcome in outcomes):
             rows.append([*row, *['-'] * 3, 'broke off', '-'])
             continue
-        of = batch.statistics(outcomes)
+        of = statistics(outcomes)
         rows.append([
             *row, *(f'{of[name].rmse:.3g}' for name in BACKLASH),
             _seconds(max(s.settling_median for s in of.values())),
