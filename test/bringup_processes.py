@@ -17,6 +17,7 @@ from rosbags.highlevel import AnyReader
 
 from backlash_ros.tools.bringup import command as bringup
 
+UNDRAWN = Path(__file__).with_name('undrawn.py')
 DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
 
 
@@ -85,10 +86,15 @@ class Session:
 
 @contextmanager
 def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
-    """Start bringup with arguments; whatever is left of it at the end is killed."""
+    """Start bringup with arguments; whatever is left of it at the end is killed.
+
+    drawn: with the pictures of the report, which take longer than most runs.
+    """
     sessions: list[Session] = []
 
-    def start_session(*arguments: str, variables: Mapping[str, str] | None = None) -> Session:
+    def start_session(
+        *arguments: str, variables: Mapping[str, str] | None = None, drawn: bool = False,
+    ) -> Session:
         own = folder / str(len(sessions))
         own.mkdir()
         mark = f'BACKLASH_TEST_RUN={uuid.uuid4()}'
@@ -98,10 +104,11 @@ def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
             environment.pop(variable, None)
         environment.update(variables or {})
         stdout, stderr = own / 'stdout.txt', own / 'stderr.txt'
+        whole = drawn or '--no-record' in arguments
+        program = ['-m', 'backlash_ros.tools.bringup'] if whole else [str(UNDRAWN)]
         with stdout.open('wb') as out, stderr.open('wb') as err:
             process = subprocess.Popen(
-                [sys.executable, '-m', 'backlash_ros.tools.bringup', '--out',
-                 str(own / 'results'), *arguments],
+                [sys.executable, *program, '--out', str(own / 'results'), *arguments],
                 stdout=out, stderr=err, env=environment,
                 cwd=Path(bringup.__file__).resolve().parents[2],
             )

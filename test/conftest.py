@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 from bringup_processes import Session, bringup_sessions
 from hypothesis import HealthCheck, settings
-
-from backlash_ros.tools.report import command as report
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from undrawn import leave_out
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 settings.register_profile(
     'repeatable', derandomize=True, database=None, deadline=None, max_examples=60,
@@ -21,10 +23,9 @@ settings.load_profile('repeatable')
 STARTS_PROCESSES = {'bringup_processes', 'paced_driver', 'ros_processes'}
 # Their tests look at the same runs, so one worker of pytest-xdist makes these for all of them.
 SHARE_RUNS = {
-    'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify', 'test_packaging',
-    'test_replay', 'test_report', 'test_report_sections',
+    'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify', 'test_live',
+    'test_packaging', 'test_replay', 'test_report', 'test_report_sections', 'test_two_hosts',
 }
-NO_PICTURE = b'\x89PNG'
 
 
 def pytest_configure() -> None:
@@ -36,7 +37,21 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+class SharedRuns(LoadScopeScheduling):
+    """Gives the next test to the worker that is free, and the files of SHARE_RUNS as a whole."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = nodeid.split('::')[0]
+        return file if Path(file).stem in SHARE_RUNS else nodeid
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> SharedRuns:
+    """The scheduler of pytest-xdist."""
+    return SharedRuns(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put tests with processes at the end: beside each other, not beside those that compute.
 
     They run against the clock of a machine that they do not have to themselves, so each may be
@@ -46,10 +61,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if _starts_processes(item):
             item.add_marker(pytest.mark.flaky(reruns=1))
-    if config.pluginmanager.hasplugin('xdist'):
-        for item in items:
-            if item.path.stem in SHARE_RUNS:
-                item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 def _starts_processes(item: pytest.Item) -> bool:
@@ -61,7 +72,7 @@ def _starts_processes(item: pytest.Item) -> bool:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports without what takes most of their time, for tests of all else that they hold."""
-    monkeypatch.setattr(report, 'png', lambda figure: NO_PICTURE)
+    monkeypatch.setattr(FigureCanvasAgg, 'print_png', leave_out)
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from typing import Any
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import rclpy
+from forked_nodes import ForkedNode
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -44,6 +45,7 @@ class NodeProcess:
 
     def __init__(
         self, executable: str, arguments: list[str], folder: Path, environment: dict[str, str],
+        forked: bool,
     ) -> None:
         self.executable = executable
         number = len(list(folder.glob('*.stderr')))
@@ -51,7 +53,9 @@ class NodeProcess:
             folder / f'{number}-{executable}.{kind}' for kind in ('stdout', 'stderr')
         )
         with self._stdout.open('wb') as out, self._stderr.open('wb') as err:
-            self.process = subprocess.Popen(
+            self.process = ForkedNode(
+                executable, arguments, self._stdout, self._stderr, environment
+            ) if forked else subprocess.Popen(
                 [sys.executable, '-m', f'backlash_ros.nodes.{executable}', *arguments],
                 stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=environment,
             )
@@ -147,14 +151,18 @@ class RosWorld:
 
     def start(
         self, executable: str, parameters: Mapping[str, object] | None = None, *arguments: str,
+        forked: bool = True,
     ) -> NodeProcess:
-        """Start a node with parameters, and further arguments as they are."""
+        """Start a node with parameters, and further arguments as they are.
+
+        forked: begin where the imports have been done, instead of with the interpreter.
+        """
         ros_arguments = ['--ros-args'] if parameters else []
         for name, value in (parameters or {}).items():
             text = value if isinstance(value, str) else json.dumps(value)
             ros_arguments += ['-p', f'{name}:={text}']
         process = NodeProcess(
-            executable, [*ros_arguments, *arguments], self.folder, self.environment
+            executable, [*ros_arguments, *arguments], self.folder, self.environment, forked
         )
         self._stack.callback(process.kill)
         return process

@@ -113,6 +113,7 @@ def test_a_controller_begins_with_what_was_found(result: Path) -> None:
     assert estimate.c_r == pytest.approx(0.5, abs=0.02)
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_the_loop_with_the_file_follows(result: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
     assert simulate.main(['--config', str(result / 'identified.yaml'), '--duration', '5',
@@ -126,6 +127,7 @@ def test_the_page_needs_nothing_else(result: Path) -> None:
     assert 'http' not in page.replace('http-equiv', '')
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -187,6 +189,7 @@ def test_bad_options_are_told_in_one_line(
     assert capsys.readouterr().err.count('\n') == 1
 
 
+@pytest.mark.usefixtures('undrawn')
 @settings(max_examples=60, deadline=None,
           suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.binary(max_size=200) | st.text(alphabet='tvy,.0123456789-e\n "na', max_size=200))
@@ -248,6 +251,7 @@ def test_a_truncated_bag_is_told_or_read(
         assert 'Traceback' not in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_results_of_a_simulation_are_a_record(tmp_path: Path) -> None:
     assert simulate.main(['--duration', '2', '--set', 'output_loss=0.1',
                           '--out', str(tmp_path / 'run')]) == 0
@@ -309,6 +313,7 @@ def test_a_span_is_cut_out(tmp_path: Path) -> None:
         read_measured(source, span=Span(50.0, 60.0))
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_what_the_controller_refuses_is_of_no_use(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -320,6 +325,7 @@ def test_what_the_controller_refuses_is_of_no_use(
     assert 'the controller does not take it: structure' in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_an_axis_gets_a_file_of_its_own(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -338,6 +344,7 @@ def test_an_axis_gets_a_file_of_its_own(
     assert found.get_float('control.max') == 5.0
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_a_longer_record_than_is_searched_is_fitted_as_a_whole(tmp_path: Path) -> None:
     v, y = record(8000)
     y[7000] = 40.0

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bringup_processes import UNDRAWN
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from undrawn import leave_out
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -95,8 +98,10 @@ def test_a_row_without_numbers_is_refused() -> None:
 @pytest.fixture(scope='module')
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('run') / 'run'
-    assert simulate.main(['--duration', '3', '--set', 'output_noise_std=1e-3',
-                          '--out', str(folder)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FigureCanvasAgg, 'print_png', leave_out)
+        assert simulate.main(['--duration', '3', '--set', 'output_noise_std=1e-3',
+                              '--out', str(folder)]) == 0
     return folder
 
 
@@ -113,6 +118,7 @@ def test_the_command_says_that_nothing_parts(
     assert again['truth'] == own['truth']
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_the_command_says_where_it_parts(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
@@ -120,6 +126,7 @@ def test_the_command_says_where_it_parts(
     assert 'part from those of the run at t = 0.' in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_several_runs_and_values_give_a_table(recorded: Path, tmp_path: Path) -> None:
     assert main([str(recorded), str(recorded), '--sweep', 'plant.uncertainty=0,0.1',
                  '--out', str(tmp_path)]) == 0
@@ -134,7 +141,7 @@ def test_several_runs_and_values_give_a_table(recorded: Path, tmp_path: Path) ->
 def test_the_bag_of_a_run_in_lockstep_is_replayed_and_read(tmp_path: Path) -> None:
     with free_domain() as domain:
         done = subprocess.run(
-            [sys.executable, '-m', 'backlash_ros.tools.bringup', '--duration', '2', '--lockstep',
+            [sys.executable, str(UNDRAWN), '--duration', '2', '--lockstep',
              '--set', 'output_loss=0.1', '--set', 'output_noise_std=1e-4',
              '--out', str(tmp_path / 'run')],
             env=child_environment(tmp_path, domain), capture_output=True, text=True, timeout=150.0,

@@ -185,7 +185,7 @@ def test_a_signal_during_start_up_ends_the_process_with_code_0(
 ) -> None:
     with ros_world(tmp_path) as world:
         for i in range(4):
-            node = world.start('controller')
+            node = world.start('controller', forked=False)
             # Before the interpreter has come to this package, nothing can be done about it;
             # SIGINT it catches by itself.
             wait_until(

@@ -88,6 +88,7 @@ def test_backlash_is_learned_through_the_messages_of_ros2_control(
         assert controller.stop() == 0
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_the_loop_through_ros2_control_is_recorded_and_reported(tmp_path: Path) -> None:
     style = {'io.style': 'ros2_control', 'estimator.output_noise_std': NOISE}
     with ros_world(tmp_path) as world:

@@ -32,7 +32,7 @@ NODES = ('controller', 'plant', 'recorder', 'reference')
 
 
 def test_lockstep_run_ends_with_all_files_and_no_process(start: Callable[..., Session]) -> None:
-    session = start('--lockstep', '--duration', '1', '--seed', '5')
+    session = start('--lockstep', '--duration', '1', '--seed', '5', drawn=True)
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
 

@@ -62,7 +62,7 @@ def drivers(session: Session) -> list[int]:
     """Process ids of the drivers of a session."""
     return [
         pid for pid, command in session.survivors().items()
-        if 'driver.py' in command and 'tools.bringup' not in command
+        if 'driver.py' in command and '--driver' not in command
     ]
 
 

@@ -102,6 +102,7 @@ def float_message(value: float) -> bytes:
     return bytes(TYPES.serialize_cdr(TYPES.types[FLOAT](data=value), FLOAT))
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize(('use', 'reach'), [('true', LIMIT), ('auto', LIMIT), ('auto', np.inf)])
 def test_the_estimates_of_the_run_come_out_to_the_last_bit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], use: str, reach: float,
@@ -118,6 +119,7 @@ def test_the_estimates_of_the_run_come_out_to_the_last_bit(
     assert 'warning' not in told.err
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_without_its_reports_a_limiting_driver_is_learned_wrongly(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:

@@ -14,6 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 from rosbags.rosbag2 import StoragePlugin, Writer
@@ -356,8 +357,8 @@ def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) ->
 
 def texts_and_axes(figure: Figure) -> tuple[list[tuple[str, Bbox]], list[tuple[str, Bbox]]]:
     """Boxes of all texts, and of the legends and data areas."""
+    renderer = FigureCanvasAgg(figure).get_renderer()
     figure.draw_without_rendering()
-    renderer = figure.canvas.get_renderer()  # type: ignore[attr-defined]
     texts, areas = [], []
     for axes in figure.axes:
         legend = axes.get_legend()

@@ -33,15 +33,14 @@ UNITS = {'m': 'unit of u/v', 'c_r': 'unit of v', 'c_l': 'unit of v'}
 
 def new_figure(height: float) -> Figure:
     """Figure of the common width that needs no display."""
-    figure = Figure(figsize=(WIDTH, height), layout='constrained')
-    FigureCanvasAgg(figure)
-    return figure
+    return Figure(figsize=(WIDTH, height), dpi=DPI, layout='constrained')
 
 
 def png(figure: Figure) -> bytes:
     """The figure as a PNG file."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format='png', dpi=DPI)
+    # savefig would lay it out, and go through all there is to draw, once more.
+    FigureCanvasAgg(figure).print_png(buffer)
     return buffer.getvalue()
 
 
