@@ -14,6 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from forked_nodes import ForkedNode
 from made_up_driver import LIMITS, PERIOD_S, parameters
 from ros_processes import Probe, wait_until
 from std_msgs.msg import Float64
@@ -32,6 +33,25 @@ HELD_UP, ATTEMPTS = 0.3, 5
 REMAP = ['--ros-args', '-r', 'plant_output:=/motor/plant_output']
 
 
+class Check(ForkedNode):
+    """A check_driver, and what it prints."""
+
+    def __init__(self, folder: Path, options: list[str], environment: dict[str, str]) -> None:
+        number = len(list(folder.glob('*.out')))
+        self._files = [folder / f'{number}.{kind}' for kind in ('out', 'err')]
+        super().__init__('check_driver', options, *self._files, environment)
+
+    @property
+    def stdout(self) -> str:
+        """What it has printed so far."""
+        return self._files[0].read_text() if self._files[0].exists() else ''
+
+    def communicate(self) -> tuple[str, str]:
+        """All that it has printed and complained of, once it has ended."""
+        self.wait(DEADLINE_S)
+        return self.stdout, self._files[1].read_text()
+
+
 class Bench:
     """A domain with a driver in it, and check_driver to be run beside it."""
 
@@ -43,22 +63,17 @@ class Bench:
         # JSON is YAML.
         self.config.write_text(json.dumps({'/**': {'ros__parameters': parameters()}}))
 
-    def start(self, *options: str) -> subprocess.Popen[str]:
+    def start(self, *options: str) -> Check:
         """Start check_driver with the parameters of the plant."""
-        command = [
-            sys.executable, '-m', 'backlash_ros.nodes.check_driver',
+        return Check(self.folder, [
             '--config', str(self.config), '--duration', str(DURATION_S), *options,
-        ]
-        return subprocess.Popen(
-            command, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True,
-        )
+        ], self.environment)
 
-    def check(self, *options: str) -> tuple[int, str]:
+    def check(self, *options: str) -> tuple[int | None, str]:
         """Run check_driver; return its exit code and what it printed."""
         process = self.start(*options)
         try:
-            out, err = process.communicate(timeout=DEADLINE_S)
+            out, err = process.communicate()
         finally:
             process.kill()
         return process.returncode, out + err
@@ -145,11 +160,11 @@ def test_a_topic_of_another_name_is_pointed_out(tmp_path: Path) -> None:
     with bench(tmp_path, 'delay') as beside:
         process = beside.start('--wait', str(DEADLINE_S))
         try:
-            assert process.stdout is not None
-            assert any(' '.join(REMAP) in line for line in process.stdout)
+            wait_until(
+                lambda: ' '.join(REMAP) in process.stdout, 'a hint', lambda: time.sleep(0.02)
+            )
         finally:
             process.kill()
-            process.communicate()
 
 
 def test_nobody_there_is_said(tmp_path: Path) -> None:
@@ -186,7 +201,7 @@ def test_sigint_brings_v_to_rest(tmp_path: Path) -> None:
 
 
 def way_to_rest(
-    folder: Path, act: Callable[[subprocess.Popen[str], float], None], *options: str,
+    folder: Path, act: Callable[[Check, float], None], *options: str,
 ) -> tuple[float, str]:
     """Let v come to rest very slowly, and act; return how long the end took, and what was said."""
     slow = ('--rate', '0.5', '--ros-args', '-p', 'control.initial:=4.0')
@@ -210,7 +225,7 @@ def way_to_rest(
 
 
 def test_a_signal_on_the_way_to_rest_holds_v(tmp_path: Path) -> None:
-    def interrupt_twice(process: subprocess.Popen[str], begin: float) -> None:
+    def interrupt_twice(process: Check, begin: float) -> None:
         process.send_signal(signal.SIGINT)
         time.sleep(0.5)
         assert process.poll() is None  # on its way, which takes 8 s
@@ -223,7 +238,7 @@ def test_a_signal_on_the_way_to_rest_holds_v(tmp_path: Path) -> None:
 
 
 def test_the_way_to_rest_has_a_deadline(tmp_path: Path) -> None:
-    def interrupt(process: subprocess.Popen[str], begin: float) -> None:
+    def interrupt(process: Check, begin: float) -> None:
         process.send_signal(signal.SIGINT)
 
     took, err = way_to_rest(tmp_path, interrupt, '--rest', '1')
@@ -292,7 +307,7 @@ def test_a_controller_that_discovery_has_not_found_is_not_disturbed(tmp_path: Pa
         process = beside.start('--drive')
         # Who comes after it knows of it likewise.
         wait_until(hidden.others, 'its presence', lambda: time.sleep(0.02))
-        err = process.communicate(timeout=DEADLINE_S)[1]
+        err = process.communicate()[1]
     assert process.returncode == 2
     assert '/control is published by a controller of this machine' in err
 
