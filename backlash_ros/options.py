@@ -6,7 +6,8 @@ import argparse
 from math import inf
 from typing import Any, NoReturn
 
-DONE, FAILED, BAD_INPUT = 0, 1, 2
+DONE, FAILED, BAD_INPUT = 0, 1, 2  # exit codes
+LARGEST_PORT = 65535
 
 
 class OptionParser(argparse.ArgumentParser):

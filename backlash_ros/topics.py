@@ -15,7 +15,7 @@ TRUTH = 'plant/truth'
 CLOCK = '/clock'
 DIAGNOSTICS = '/diagnostics'
 
-
+BACKLASH = ('m', 'c_r', 'c_l')
 # `sample` counts the plant outputs, lost or not, and joins rows of different topics. It begins with
 # 0, or with the time in sample periods where the controller may have been restarted. std_f is
 # always nan: f is given, or adapted by a law that knows no deviations.

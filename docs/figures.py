@@ -24,6 +24,7 @@ from backlash_ros.tools.pages.drawing import (
     COLOURS,
     ESTIMATES,
     STYLES,
+    TIME,
     UNITS,
     band,
     curve,
@@ -42,7 +43,6 @@ DOCS = Path(__file__).resolve().parent
 IMAGES = DOCS / 'images'
 PAGES = [DOCS.parent / 'README.md', *DOCS.glob('*.md')]
 MARK = re.compile(r'(<!-- (\w+): made by docs/figures\.py -->\n).*?(<!-- end -->)', re.DOTALL)
-TIME = 'time t [s]'
 NAMES = ('m', 'c_r', 'c_l')
 WITH_COLOUR, WITHOUT_COLOUR = '#0072B2', '#D55E00'
 SMALL = {'structure': 'tracking', 'amplitude': '0.2'}

@@ -28,9 +28,8 @@ from backlash_ros.bags.content import (
     the_message_file,
 )
 from backlash_ros.bags.remains import damage, open_remains
+from backlash_ros.bags.writer import STORAGE
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
-
-STORAGE = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import Finding, Level
-from backlash_ros.core.loop.sample_counter import Output, SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter, kept_outputs
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import CONTROLLER
@@ -47,9 +47,6 @@ from backlash_ros.nodes.runtime.messages import (
 )
 from backlash_ros.nodes.runtime.spin import run
 
-# A controller that was held up for so long, or so many samples, still learns from them; after a
-# longer stall it goes on with the newest ones.
-KEPT_S, KEPT_OUTPUTS = 0.1, 20
 # Share of a period for which the controller sleeps after the command: on a busy processor the
 # driver, woken by the command, would have to wait for it otherwise.
 POST_COMMAND_SLEEP = 0.05
@@ -239,8 +236,8 @@ class ControllerNode(ManagedNode):
         # Whoever is activated twice before everybody is there has two that wait.
         if self._driver is None:
             self._rivals.look()
-            kept = max(KEPT_S / self.settings.get_float('sample_period'), KEPT_OUTPUTS)
-            self._driver = self._io.listen(self._on_output, round(min(kept, DEPTH)))
+            kept = kept_outputs(self.settings.get_float('sample_period'))
+            self._driver = self._io.listen(self._on_output, min(kept, DEPTH))
             emit('ready')
 
     def _on_reference(self, message: Float64) -> None:

@@ -10,6 +10,7 @@ from backlash_ros.core.parameters import Parameters
 # without, after which they are given up. Messages that have nothing to do with the samples fit an
 # interval every other time at most: 20 times in a row by a chance of one in a million.
 CONSISTENT = 20
+AWAITED_REPORTS = 20  # outputs that stay without an answer while the driver may yet report its v
 
 
 class ReportUse(Enum):

@@ -22,6 +22,9 @@ NUMBER_SLACK, PATIENCE = 3, 1.5
 # Another sender, or a clock that was set back, is believed after so many messages and periods
 # without a sample in between.
 STRANGERS, SILENCE = 5, 3.0
+# A controller that was held up for so long, or for so many samples, still learns from them; after
+# a longer stall it goes on with the newest ones.
+KEPT_S, KEPT_OUTPUTS = 0.1, 20
 
 
 class Output(NamedTuple):
@@ -138,3 +141,8 @@ class SampleCounter:
         self._sequence = self._repeated = sequence
         self.due_ns, self._stamp_ns = float(stamp_ns), stamp_ns
         self._on_time = self._strange = 0
+
+
+def kept_outputs(sample_period: float) -> int:
+    """How many outputs wait for a controller that is held up; sample_period [s]."""
+    return round(max(KEPT_S / sample_period, KEPT_OUTPUTS))

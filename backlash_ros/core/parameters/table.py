@@ -9,6 +9,8 @@ Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
 CONTROLLER, PLANT, REFERENCE, RECORDER = 'controller', 'plant', 'reference', 'recorder'
 BRINGUP = 'bringup'
+# Whose names the sections of a parameter file have.
+NODES = (CONTROLLER, PLANT, REFERENCE, RECORDER, BRINGUP)
 
 
 @dataclass(frozen=True)

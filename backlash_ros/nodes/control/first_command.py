@@ -6,13 +6,12 @@ from math import isfinite
 
 from backlash_ros import topics
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.report_use import AWAITED_REPORTS
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters, missing_limits
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.spin import ProcessNode
-
-AWAITED_REPORTS = 20  # that stay without an answer at most while the driver may yet report its v
 
 
 class FirstCommand:

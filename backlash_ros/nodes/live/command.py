@@ -12,11 +12,11 @@ import sys
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.nodes.live.node import EXECUTABLE, LiveNode
-from backlash_ros.nodes.live.page_server import LARGEST_PORT, bound_socket
+from backlash_ros.nodes.live.page_server import bound_socket
 from backlash_ros.nodes.monitor.followed import NICENESS
 from backlash_ros.nodes.runtime.arguments import ros_arguments
 from backlash_ros.nodes.runtime.spin import run
-from backlash_ros.options import OptionParser
+from backlash_ros.options import LARGEST_PORT, OptionParser
 
 
 def main(args: list[str] | None = None) -> int:

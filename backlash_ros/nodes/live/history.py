@@ -9,7 +9,6 @@ from math import isfinite
 
 V, U = 'v', 'u_hat'
 LOOP = 'loop'
-NS_TO_S = 1e-9
 FLOAT_DIGITS = 7  # more than a picture can show
 
 Curves = dict[str, list[float | None]]
@@ -38,7 +37,7 @@ class CurvePoints:
         curves: Curves = {}
         reconstructed: list[tuple[int, float]] = []
         for label, at_ns, value in messages:
-            t = round(NS_TO_S * (at_ns - self._start_ns), 3)
+            t = round(1e-9 * (at_ns - self._start_ns), 3)
             curves.setdefault(label, []).extend((t, rounded(value)))
             if label == V:
                 self._v.append((at_ns, value))

@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from backlash_ros.nodes.live.history import CurvePoints, History, rounded
 from backlash_ros.nodes.live.page_server import HOST, PageServer
 from backlash_ros.nodes.monitor.followed import FollowedControllers
-from backlash_ros.nodes.monitor.state import NAMES, ControllerState
+from backlash_ros.nodes.monitor.state import ControllerState
 from backlash_ros.nodes.runtime import events
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
 from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.topics import BACKLASH
 
 EXECUTABLE = 'live'
 REFRESH_S = 0.1
@@ -22,7 +23,7 @@ SHOWN_S = 10.0  # width of the curves
 # A machine that is held up for a second loses no point.
 DEPTH = 30
 LABELS = (
-    *NAMES, *(f'{name}_{end}' for name in NAMES for end in ('low', 'high')),
+    *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
     'y_m', 'y', 'u_d', 'v', 'u_hat',
 )
 

@@ -9,14 +9,15 @@ from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.nodes.monitor.state import NAMES, ControllerState
+from backlash_ros.nodes.monitor.state import ControllerState
 from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.topics import BACKLASH
 
 LOOK_S = 1.0  # between two looks for further controllers
 NICENESS = 10  # of a process that only shows: the loop comes first
 STATUSES = 100  # of all nodes of the domain that may wait: some robots have many
-MARK = topics.of_node(topics.watched(NAMES[0])).removeprefix('~')  # of a controller
+MARK = topics.of_node(topics.watched(BACKLASH[0])).removeprefix('~')  # of a controller
 
 
 class Followed:
@@ -36,7 +37,7 @@ class Followed:
         """What has come: label, time of arrival [ns], value; m, c_r and c_l go to the state."""
         for label, inbox in self._inboxes.items():
             for message, info in inbox.take_all():
-                if label in NAMES:
+                if label in BACKLASH:
                     self.state.take_estimate(label, message.data)
                 yield label, info['received_timestamp'], message.data
 

@@ -18,10 +18,11 @@ from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.nodes.monitor.followed import FollowedControllers, time_of_day
 from backlash_ros.nodes.monitor.keys import pressed_keys
-from backlash_ros.nodes.monitor.state import NAMES, ControllerState
+from backlash_ros.nodes.monitor.state import ControllerState
 from backlash_ros.nodes.monitor.view import ASCII_BLOCKS, BLOCKS, plain_line, screen
 from backlash_ros.nodes.runtime.spin import ProcessNode
 from backlash_ros.options import DONE
+from backlash_ros.topics import BACKLASH
 
 EXECUTABLE = 'monitor'
 REFRESH_S = 0.2  # of the screen
@@ -50,7 +51,7 @@ class MonitorNode(ProcessNode):
 
     def __init__(self, wanted: Sequence[str]) -> None:
         super().__init__(EXECUTABLE)
-        self._followed = FollowedControllers(self, wanted, NAMES, depth=1)
+        self._followed = FollowedControllers(self, wanted, BACKLASH, depth=1)
         self._service_clients: dict[str, dict[str, Client]] = {}  # of controllers, by service
         self._selected = 0
         self._notice, self._notice_ends_s = '', 0.0

@@ -8,7 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 
-NAMES = ('m', 'c_r', 'c_l')
+from backlash_ros.topics import BACKLASH
+
 REMEMBERED = 20  # events
 DIGITS = re.compile(r'[\d.]+')  # a text in which a figure has changed tells nothing new
 SILENT_S = 3.0  # without diagnostics, which come every second, nobody is there any more
@@ -29,9 +30,9 @@ class ControllerState:
     heard_at_s: float = -inf  # on the steady clock
     values: dict[str, str] = field(default_factory=dict)
     estimates: dict[str, tuple[float, float]] = field(
-        default_factory=lambda: dict.fromkeys(NAMES, (nan, nan))
+        default_factory=lambda: dict.fromkeys(BACKLASH, (nan, nan))
     )
-    scales: dict[str, float] = field(default_factory=lambda: dict.fromkeys(NAMES, 0.0))
+    scales: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BACKLASH, 0.0))
     events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
 
     def take_diagnostics(
@@ -42,7 +43,7 @@ class ControllerState:
             self.note(clock, message)
         self.level, self.message, self.heard_at_s = level, message, now_s
         self.values = dict(values)
-        for name in NAMES:
+        for name in BACKLASH:
             self.take_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
 
     def take_estimate(self, name: str, value: float, half_width: float | None = None) -> None:

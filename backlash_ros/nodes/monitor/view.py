@@ -10,7 +10,8 @@ from rich.console import Group
 from rich.panel import Panel
 from rich.text import Text
 
-from backlash_ros.nodes.monitor.state import NAMES, ControllerState
+from backlash_ros.nodes.monitor.state import ControllerState
+from backlash_ros.topics import BACKLASH
 
 KEYS = 'f freeze/learn  c compensate  r reset  s save  q quit'
 COLOURS = ('green', 'yellow', 'red')  # of the levels of /diagnostics
@@ -90,7 +91,7 @@ def panel(
     # Often the cure stands in the second line.
     for line in [*wrap(state.message, inner), '', ''][:2]:
         text.append('\n' + line)
-    for name in NAMES:
+    for name in BACKLASH:
         text.append('\n' + estimate_line(state, name, inner, blocks))
     for line in figures(state):
         text.append('\n' + line)

@@ -17,7 +17,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 SIGEV_THREAD = 2  # <signal.h>: the timer calls a function, in a thread of its own
-S_TO_NS = 1e9
 
 
 class _SignalEvent(ctypes.Structure):
@@ -57,7 +56,7 @@ def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
         return
     seconds, fraction = divmod(within_s, 1.0)
     c.timer_settime(
-        timer, 0, ctypes.byref(_TimerSpec(0, 0, int(seconds), int(fraction * S_TO_NS))), None
+        timer, 0, ctypes.byref(_TimerSpec(0, 0, int(seconds), int(fraction * 1e9))), None
     )
     try:
         yield

@@ -25,7 +25,6 @@ from backlash_ros.nodes.runtime.inbox import Polled
 KNOWN_RCLPY = ('7.1.',)  # begin of the versions: those of ROS 2 Jazzy
 # Services and events may wait so long.
 LOOK_NS = 50_000_000
-S_TO_NS = 1e9
 
 
 class NodeExecutor(SingleThreadedExecutor):
@@ -38,7 +37,7 @@ class NodeExecutor(SingleThreadedExecutor):
 
     def serve_urgent(self, wait_ns: int) -> None:
         """Serve one message of each topic, and wait for the first one so long at most."""
-        self.spin_once(timeout_sec=wait_ns / S_TO_NS)
+        self.spin_once(timeout_sec=wait_ns / 1e9)
         for _ in list(self._served_node.subscriptions)[1:]:
             self.spin_once(timeout_sec=0.0)
 
@@ -93,7 +92,7 @@ class PromptExecutor(NodeExecutor):
         """
         wait_ns = self._look_at_ns - time.monotonic_ns()
         if timeout_sec is not None:
-            wait_ns = min(wait_ns, int(timeout_sec * S_TO_NS))
+            wait_ns = min(wait_ns, int(timeout_sec * 1e9))
         self.serve_urgent(max(wait_ns, 0))
         self.look_if_due()
 

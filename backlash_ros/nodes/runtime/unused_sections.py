@@ -14,9 +14,8 @@ from typing import Any
 
 import yaml
 
-from backlash_ros.core.parameters.table import BRINGUP, CONTROLLER, PLANT, RECORDER, REFERENCE
+from backlash_ros.core.parameters.table import NODES
 
-NODES = (CONTROLLER, PLANT, REFERENCE, RECORDER, BRINGUP)
 SIMILAR = 0.8  # of difflib: a misspelt name rather than somebody else's node
 OPTION = '--params-file'
 

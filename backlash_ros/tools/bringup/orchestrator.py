@@ -15,7 +15,7 @@ from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import BY_NAME, PLANT
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
-from backlash_ros.options import DONE, FAILED
+from backlash_ros.options import DONE, FAILED, LARGEST_PORT
 from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.processes import ProcessSupervisor, RunError
 from backlash_ros.tools.bringup.progress import ProgressDisplay
@@ -42,7 +42,6 @@ from backlash_ros.tools.run_files.results import CONFIG, result_directory
 # Each node takes one of the places that discovery on one machine has; some stay for listeners.
 MOST_AXES = 7
 ESTIMATES = 'estimates.file'
-LARGEST_PORT = 65535
 
 
 def prepare(options: argparse.Namespace) -> RunPlan:

@@ -10,7 +10,8 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-SHOWN = ('m', 'c_r', 'c_l')
+from backlash_ros.topics import BACKLASH
+
 PLAIN_LINE_PERIOD_S = 2.0
 
 
@@ -77,7 +78,7 @@ def _has_room(stream: TextIO) -> bool:
 def describe(progress: Mapping[str, object]) -> str:
     """The estimates with their errors in % of the truth, where that is known."""
     words = []
-    for name in SHOWN:
+    for name in BACKLASH:
         estimate, truth = number(progress, name), number(progress, f'true_{name}')
         words.append(f'{name} {estimate:.4g}')
         if isfinite(truth) and truth != 0.0:

@@ -16,16 +16,13 @@ from backlash_ros.core.parameters.table import (
     BRINGUP,
     BY_NAME,
     CONTROLLER,
-    PLANT,
-    RECORDER,
-    REFERENCE,
+    NODES,
     Value,
 )
 from backlash_ros.tools.cli.errors import InputError
 
 ANY = '**'
 EVERY_NODE = f'/{ANY}'
-NODES = (CONTROLLER, PLANT, REFERENCE, RECORDER, BRINGUP)
 AXES = 'axes'
 
 

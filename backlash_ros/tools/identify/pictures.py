@@ -15,6 +15,7 @@ from backlash_ros.core.identification.uncertainty import autocorrelation
 from backlash_ros.tools.identify.model_pictures import SURE, draw_bode, draw_poles
 from backlash_ros.tools.pages.drawing import (
     COLOURS,
+    TIME,
     curve,
     label,
     legend_above,
@@ -27,7 +28,6 @@ from backlash_ros.tools.pages.html_page import Picture
 
 Array = NDArray[np.float64]
 
-TIME = 'time t [s]'
 LAGS = 60  # of the autocorrelation
 MEASURED, SIMULATED, RESIDUAL = COLOURS['y'], COLOURS['u_d'], COLOURS['e']
 ORDER_COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#332288')

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 
 WIDTH = 10.0  # inches
 DPI = 130
+TIME = 'time t [s]'  # label of an axis
 # Okabe-Ito and Tol: told apart with every kind of colour vision.
 COLOURS = {
     'm': '#0072B2', 'c_r': '#D55E00', 'c_l': '#009E73',

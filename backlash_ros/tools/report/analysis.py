@@ -14,6 +14,7 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import delayed_reference, delayed_tracking_error_rms
 from backlash_ros.core.simulation.run_record import RunRecord
@@ -27,7 +28,6 @@ LONGEST_COMPARISON = 10_000  # samples for which the other laws are simulated
 POINTS = 4_000  # of a curve in a figure: more cannot be told apart
 # RMS of the error over that of the reference below which y counts as following it.
 FOLLOWING = 0.5
-PERIODIC = ('sine', 'square', 'triangle', 'multisine')
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,6 @@ from backlash_ros.tools.report.analysis import (
 from backlash_ros.tools.run_files.bag_reading import read_bag
 from backlash_ros.tools.run_files.bag_sections import WHOLE, Span
 from backlash_ros.tools.run_files.results import (
-    BACKLASH,
     CONFIG,
     RECORD,
     SAMPLES,
@@ -49,6 +48,7 @@ from backlash_ros.tools.run_files.results import (
     write_run,
     write_summary,
 )
+from backlash_ros.topics import BACKLASH
 
 PAGE = 'report.html'
 BAG = 'bag'

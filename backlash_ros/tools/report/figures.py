@@ -18,6 +18,7 @@ from backlash_ros.tools.pages.drawing import (
     LAW_COLOURS,
     OTHER_LAW,
     STYLES,
+    TIME,
     UNITS,
     band,
     curve,
@@ -39,11 +40,10 @@ from backlash_ros.tools.report.analysis import (
     estimated_loop,
     frozen,
 )
+from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
 
-TIME = 'time t [s]'
-NAMES = ('m', 'c_r', 'c_l')
 WHOLE = Part('Whole run', slice(None))
 DECADES = 8.0  # that a logarithmic axis shows at most: what is below them is as good as zero
 DIVERGED = 1e3  # times the largest error of the best law: more need not be told apart
@@ -71,7 +71,7 @@ def draw_parameter_errors(
 
 def _draw_absolute_errors(axes: Axes, run: RunRecord, part: Part) -> None:
     t = run.column('t')[part.rows]
-    for name in NAMES:
+    for name in BACKLASH:
         error = (run.column(f'true_{name}') - run.column(name))[part.rows]
         std = run.column(f'std_{name}')[part.rows]
         unit = UNITS[name].removeprefix('unit of ')
@@ -80,7 +80,7 @@ def _draw_absolute_errors(axes: Axes, run: RunRecord, part: Part) -> None:
         band(axes, t, error - 2 * std, error + 2 * std, COLOURS[name])
     shade(axes, t, frozen(run)[part.rows], 'frozen')
     zero_line(axes)
-    everything = [run.column(f'true_{name}') - run.column(name) for name in NAMES]
+    everything = [run.column(f'true_{name}') - run.column(name) for name in BACKLASH]
     axes.set_ylim(*limits(everything, margin=0.08))
 
 
@@ -89,7 +89,7 @@ def _draw_relative_errors(
 ) -> None:
     t = run.column('t')[part.rows]
     percent = {}
-    for name in NAMES:
+    for name in BACKLASH:
         truth = run.column(f'true_{name}')
         # Nothing is a percentage of zero, and the logarithm has no zero.
         truth = np.where(truth == 0.0, np.nan, truth)
@@ -111,7 +111,7 @@ def draw_estimates(run: RunRecord) -> Figure:
     """Estimates over time with two standard deviations, and the truth where it is known."""
     figure = new_figure(7.0)
     t = run.column('t')
-    for axes, name in zip(figure.subplots(3, 1, sharex=True), NAMES, strict=True):
+    for axes, name in zip(figure.subplots(3, 1, sharex=True), BACKLASH, strict=True):
         estimate, std = run.column(name), run.column(f'std_{name}')
         title = f'${ESTIMATES[name]}$ = {estimate[-1]:.6g}'
         if run.has_truth:

@@ -27,13 +27,13 @@ from backlash_ros.core.simulation.metrics import (
 )
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.topics import BACKLASH
 
 RESULTS = Path('results')
 LATEST = 'latest'
 SAMPLES, RECORD, SUMMARY, CONFIG = 'samples.csv', 'record.npz', 'summary.json', 'parameters.yaml'
 LEARNED = 'learned.'  # before the names of what record.npz has of G
 SAMPLE_COLUMNS = ('t', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f')
-BACKLASH = ('m', 'c_r', 'c_l')
 
 
 def result_directory(out: Path | None) -> Path:

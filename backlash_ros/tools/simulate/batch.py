@@ -23,8 +23,9 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import FAILED
 from backlash_ros.tools.cli.command_line import number_of_samples
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
-from backlash_ros.tools.run_files.results import BACKLASH, summarise
+from backlash_ros.tools.run_files.results import summarise
 from backlash_ros.tools.simulate.simulation import run_loop
+from backlash_ros.topics import BACKLASH
 
 PATIENCE_S = 5.0  # after an interruption, until the process ends whatever it waits for
 # The matrices are tiny: threads of the linear algebra would only disturb the other processes.

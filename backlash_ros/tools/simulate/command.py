@@ -25,12 +25,13 @@ from backlash_ros.tools.cli.command_line import (
 from backlash_ros.tools.cli.errors import InputError
 from backlash_ros.tools.config.configuration import effective_parameters, write_config
 from backlash_ros.tools.pages.html_page import relative_error
-from backlash_ros.tools.run_files.results import BACKLASH, CONFIG, result_directory, write_table
+from backlash_ros.tools.run_files.results import CONFIG, result_directory, write_table
 from backlash_ros.tools.simulate import batch
 from backlash_ros.tools.simulate.batch import Job, Outcome
 from backlash_ros.tools.simulate.cluster import run_on_cluster
 from backlash_ros.tools.simulate.simulation import run_loop
 from backlash_ros.tools.simulate.statistics import statistics
+from backlash_ros.topics import BACKLASH
 
 SEEDS, SWEEP, SWEEP_FIGURE = 'seeds.csv', 'sweep.csv', 'sweep.png'
 NAMED_SEEDS = 10  # that an answer lists before it refers to the CSV

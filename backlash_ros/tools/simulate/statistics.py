@@ -11,8 +11,8 @@ from scipy.special import chdtri
 
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.tools.cli.errors import InputError
-from backlash_ros.tools.run_files.results import BACKLASH
 from backlash_ros.tools.simulate.batch import Outcome
+from backlash_ros.topics import BACKLASH
 
 
 @dataclass(frozen=True)

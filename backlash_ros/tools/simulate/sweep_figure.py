@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from backlash_ros.core.parameters.table import BY_NAME, Value
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.tools.pages.drawing import label, legend_below, new_figure
-from backlash_ros.tools.run_files.results import BACKLASH
 from backlash_ros.tools.simulate.batch import Outcome, Sweep, value_text
 from backlash_ros.tools.simulate.statistics import statistics
+from backlash_ros.topics import BACKLASH
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#332288', '#777777', '#000000')
 MARKERS = 'osD^vP*X'
