@@ -7,7 +7,7 @@ from math import inf
 from typing import Any, NoReturn
 
 DONE, FAILED, BAD_INPUT = 0, 1, 2  # exit codes
-LARGEST_PORT = 65535
+LARGEST_PORT = 65535  # of TCP
 
 
 class OptionParser(argparse.ArgumentParser):

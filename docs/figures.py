@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from generate_constants import write_constants
 from generate_parameters import write_parameters
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -241,6 +242,7 @@ def main() -> None:
     for name, draw in FIGURES.items():
         (IMAGES / f'{name}.png').write_bytes(png(draw()))
     write_parameters()
+    write_constants()
     for page in PAGES:
         fill_in(page)
 

@@ -19,7 +19,7 @@ from typing import BinaryIO
 from backlash_ros.bags.content import BagError, Message, Topic
 
 MAGIC = b'\x89MCAP0\r\n'
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6  # opcodes of records
 OPCODES = range(1, 16)
 RECORD = struct.Struct('<BQ')  # opcode, length
 MESSAGE_HEAD = struct.Struct('<HIQQ')  # channel, number, log time, publish time

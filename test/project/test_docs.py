@@ -98,13 +98,20 @@ def test_made_tables_are_filled_and_known_to_the_script() -> None:
     assert {ast.literal_eval(key) for key in tables.keys if key is not None} == set(found)
 
 
-def test_page_of_parameters_is_current() -> None:
-    code = 'import generate_parameters as g, sys; sys.stdout.write(g.parameters_page())'
+@pytest.mark.parametrize('page', ['parameters', 'constants'])
+def test_page_that_is_made_from_the_code_is_current(page: str) -> None:
+    code = f'import generate_{page} as g, sys; sys.stdout.write(g.{page}_page())'
     done = subprocess.run(
         [sys.executable, '-c', f'import sys; sys.path.insert(0, {str(DOCS)!r}); {code}'],
         cwd=ROOT, capture_output=True, text=True, check=True,
     )
-    assert (DOCS / 'parameters.md').read_text() == done.stdout, 'call make docs'
+    assert (DOCS / f'{page}.md').read_text() == done.stdout, 'call make docs'
+
+
+def test_every_constant_has_a_meaning() -> None:
+    rows = re.findall(r'^\| (.+?) \| .+? \| (.*?) \| \[', (DOCS / 'constants.md').read_text(), re.M)
+    assert len(rows) > 200
+    assert [names for names, meaning in rows if not meaning] == []
 
 
 def test_python_files_that_pages_name_exist() -> None:

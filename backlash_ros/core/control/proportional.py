@@ -17,7 +17,7 @@ LARGEST_F_OVER_M = 0.8
 
 # Turns of u_d smaller than this many of its standard deviations are noise of the estimates.
 NOISE_BAND = 3.0
-ROUNDING = 1e-12
+ROUNDING = 1e-12  # relative difference of two v that are one but for rounding
 
 
 class Proportional:

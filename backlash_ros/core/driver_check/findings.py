@@ -19,7 +19,7 @@ FLOAT64 = 'std_msgs/msg/Float64'
 
 FITS, WRONG, UNKNOWN = '✓', '✗', '–'
 
-FEWEST_SAMPLES = 20
+FEWEST_SAMPLES = 20  # for a judgement of the timing
 PERIOD_TOLERANCE = 0.01  # what the controller's count of samples follows
 UNSTEADY_TOLERANCE = 0.1  # where samples come in bursts
 LATENESS = 0.5  # of a period: beyond 0.85 the controller takes it for a loss

@@ -12,7 +12,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 
 PERIODS = 3.0  # of the slower sine, where the speed allows them
 SHARE, FASTER = 0.3, 2.7  # of the second sine; together they tell a delay from a wider gap
-STEEPEST = 1.0 - SHARE + SHARE * FASTER
+STEEPEST = 1.0 - SHARE + SHARE * FASTER  # slope of both together, in that of one of amplitude 1
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ MESSAGE_SUBJECTS = ('rate', 'jitter', 'lost samples', 'repeated samples', 'clock
 BASIC = {'publisher', 'type'}
 BLURRED_BY_JITTER = {DELAY, MODEL, NOISE}
 NEEDED_FOR_MOTION = {'listener', 'rate', 'clock'}
-SIMILAR = 0.6
+SIMILAR = 0.6  # of difflib: a topic that may be meant
 
 
 def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Finding]:

@@ -24,7 +24,7 @@ from backlash_ros.core.identification.output_error import (
 Array = NDArray[np.float64]
 
 FIRST_FILTERS = (0.5, 0.9, 0.98)  # pole of the first filter, as often as G has poles
-STEPS = 4
+STEPS = 4  # of filtering with the model of the step before
 FIRST_JUDGED = 2  # steps before a model is compared with others
 INSIDE = 0.999  # a pole outside is put back to here
 

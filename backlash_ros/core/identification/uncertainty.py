@@ -23,7 +23,7 @@ from backlash_ros.core.identification.output_error import (
 
 Array = NDArray[np.float64]
 
-LJUNG_BOX_LAGS = 20
+LJUNG_BOX_LAGS = 20  # of the residual, at most
 
 
 class Covariance(NamedTuple):

@@ -15,7 +15,7 @@ CLOCK_SLACK = 0.01
 # sample is due, by more than a share of a period, is a repetition or from someone else. Before,
 # one that came early outweighs two that were due.
 KEEPS_TIME_AFTER, OUTWEIGHED = 20, 2
-EARLY = 0.3
+EARLY = 0.3  # that share of a period
 # Samples that numbers may jump further than time has passed, and periods to wait for a message that
 # fits when they jump further still.
 NUMBER_SLACK, PATIENCE = 3, 1.5

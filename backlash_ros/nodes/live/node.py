@@ -18,7 +18,7 @@ from backlash_ros.nodes.runtime.spin import ProcessNode
 from backlash_ros.topics import BACKLASH
 
 EXECUTABLE = 'live'
-REFRESH_S = 0.1
+REFRESH_S = 0.1  # between two frames of the page
 SHOWN_S = 10.0  # width of the curves
 # A machine that is held up for a second loses no point.
 DEPTH = 30

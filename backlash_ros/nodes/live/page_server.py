@@ -12,7 +12,7 @@ from aiohttp.typedefs import Handler
 
 PAGE = Path(__file__).with_name('page.html')
 HOST = '127.0.0.1'
-MOST_READERS = 16
+MOST_READERS = 16  # pages that are open at once
 GOODBYE_S = 0.2  # for browsers that do not take what they are sent
 
 

@@ -29,7 +29,7 @@ REFRESH_S = 0.2  # of the screen
 LINE_S = 1.0  # between two plain lines
 CONFIRM_S = 3.0  # within which a second r resets
 ANSWER_S = 5.0  # longest wait for a service
-NOTICE_S = 3.0
+NOTICE_S = 3.0  # for which a notice is shown
 
 
 @dataclass

@@ -12,9 +12,9 @@ from backlash_ros.tools.bringup.processes import RunError
 # UDP ports of RTPS: a domain has 250; participant n takes 10 + 2 n and 11 + 2 n of them, and
 # domains up to 101 lie below the ports that Linux hands out to others.
 DOMAINS = 101
-DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250
+DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250  # as the standard has them
 PARTICIPANT_OFFSETS = range(10, 74, 2)  # as many as the discovery range LOCALHOST looks for
-RESERVATION_OFFSET = 5
+RESERVATION_OFFSET = 5  # port of a domain that a run holds, which no participant takes
 
 
 @contextlib.contextmanager

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from backlash_ros.topics import BACKLASH
 
-PLAIN_LINE_PERIOD_S = 2.0
+PLAIN_LINE_PERIOD_S = 2.0  # between two lines where there is no terminal
 
 
 class ProgressDisplay:

@@ -14,7 +14,7 @@ from backlash_ros.tools.bringup.progress import ProgressDisplay, counts
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
 from backlash_ros.tools.cli.stop_requests import StopRequests
 
-READY_DEADLINE_S = 30.0
+READY_DEADLINE_S = 30.0  # for the start of every process
 CATCH_UP_DEADLINE_S = 10.0  # for the recorder, after the last sample
 # Reports without anything that was unheard, after which nothing is to come. The middleware sends
 # again what got lost on the way to a recorder that was held up, with its own settings every 3 s.

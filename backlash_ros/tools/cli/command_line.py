@@ -18,7 +18,7 @@ from backlash_ros.tools.cli.errors import BrokenOffError, InputError
 if TYPE_CHECKING:
     from backlash_ros.tools.run_files.bag_sections import Span
 
-DEFAULT_DURATION_S = 10.0
+DEFAULT_DURATION_S = 10.0  # of a run
 # A duration may miss a whole number of sample periods by rounding alone.
 WHOLE_TOLERANCE = 1e-6
 

@@ -17,8 +17,8 @@ LOOK = (
     ('#999933', '-'), ('#AA4499', '--'), ('#44AA99', '-.'), ('#0072B2', '-'),
     ('#D55E00', '-'), ('#E69F00', '--'), ('#555555', ':'), ('#000000', '-'),
 )
-DECADES = 9.0
-WINDOW_S = 0.5
+DECADES = 9.0  # of an axis with errors, at most
+WINDOW_S = 0.5  # over which the error of a curve is averaged
 
 
 def draw_comparison(results: Sequence[Result]) -> Figure:

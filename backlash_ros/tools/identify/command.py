@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from backlash_ros.tools.run_files.bag_sections import Span
 
 EXECUTABLE = 'identify'
-HIGHEST_ORDER, LONGEST_DELAY = 6, 20
+HIGHEST_ORDER, LONGEST_DELAY = 6, 20  # that --order and --delay may ask for; samples
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 LAGS = 60  # of the autocorrelation
 MEASURED, SIMULATED, RESIDUAL = COLOURS['y'], COLOURS['u_d'], COLOURS['e']
 ORDER_COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#332288')
-LOOP_POINTS = 4000
+LOOP_POINTS = 4000  # samples that the curves over v show
 
 
 def draw(found: Identification) -> Iterator[Picture]:

@@ -17,7 +17,7 @@ from backlash_ros.tools.report.analysis import thinned
 Array = NDArray[np.float64]
 
 WIDTH = 10.0  # inches
-DPI = 130
+DPI = 130  # of every picture
 TIME = 'time t [s]'  # label of an axis
 # Okabe-Ito and Tol: told apart with every kind of colour vision.
 COLOURS = {
