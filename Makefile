@@ -53,7 +53,7 @@ lint: dev-environment
 	@$(CHECK_TYPES)
 
 docs: run-environment
-	@$(RUN) docs/figures.py
+	@$(RUN) docs/made_by/figures.py
 
 clean:
 	@rm -rf .venv build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

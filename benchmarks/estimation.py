@@ -15,7 +15,8 @@ from pathlib import Path
 # Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
-from estimation_points import ACCURACY_HEADER, CASES, HOUR, Benchmark, Outcome
+from accuracy.estimation_points import ACCURACY_HEADER, CASES, HOUR, Benchmark, Outcome
+from real_time.step_times import step_checks
 from reporting import (
     CHECK_HEADER,
     ROOT,
@@ -24,7 +25,6 @@ from reporting import (
     processors,
     text_table,
 )
-from step_times import step_checks
 
 DOCUMENT = ROOT / 'docs' / 'estimation_results.md'
 SEEDS, FIRST_SEED = 200, 1
@@ -83,7 +83,7 @@ def write_document(
         markdown_table(ACCURACY_HEADER, benchmark.accuracy_rows()),
         'The bound knows at every sample which side is engaged; the estimator has to find out. '
         'It is computed from the v that was applied, by code that shares nothing with the '
-        'estimator (`benchmarks/cramer_rao.py`).',
+        'estimator (`benchmarks/accuracy/cramer_rao.py`).',
         '## Bounds and verdicts',
         markdown_table(CHECK_HEADER, [check.row for check in checks]),
     ]

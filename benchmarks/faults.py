@@ -29,7 +29,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
-from fault_sequences import AFTER, PERIOD_S, Findings, Sequence
+from fault_loop.fault_sequences import AFTER, PERIOD_S, Findings, Sequence
 from reporting import ROOT, markdown_table, processors, text_table
 
 DOCUMENT = ROOT / 'docs' / 'faults.md'

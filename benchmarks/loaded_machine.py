@@ -30,11 +30,11 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
 import numpy as np
 import rclpy
 import simulated_motor
-from loop_latency import NODES, processes
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from real_time.loop_latency import NODES, processes
 from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
 from std_msgs.msg import Float64MultiArray
 
@@ -45,6 +45,7 @@ from backlash_ros.middleware.loopback import prefer_loopback
 Array = NDArray[np.float64]
 
 CONFIG = ROOT / 'config' / 'geared_motor.yaml'
+BUSY_LOOP = ROOT / 'benchmarks' / 'real_time' / 'busy_loop.py'
 DRIVER = ROOT / 'examples' / 'motor_driver.py'
 PERIOD_S = 0.005  # of both
 TRUTH = simulated_motor.C_R, simulated_motor.C_L
@@ -127,7 +128,7 @@ def measure(load: float, use: str, seconds: float) -> Run:
     node = [sys.executable, '-m']
     given = ['--ros-args', '--params-file', str(CONFIG)]
     commands = {
-        **{f'load {i}': [sys.executable, str(Path(__file__).with_name('busy_loop.py')), str(load)]
+        **{f'load {i}': [sys.executable, str(BUSY_LOOP), str(load)]
            for i in range(processors() if load else 0)},
         'controller': [
             *node, f'{NODES}.controller', *given, '-p', f'estimator.use_applied_control:={use}',

@@ -16,12 +16,10 @@ from pathlib import Path
 # Before numpy is imported: the matrices are tiny, threads would only disturb the loop.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
-import loop_latency
-import reference_rate
-import step_times
-from loop_latency import LATENCY_HEADER, RATES_HZ
+from real_time import loop_latency, reference_rate, step_times
+from real_time.loop_latency import LATENCY_HEADER, RATES_HZ
+from real_time.step_times import LAWS, MISSING, STEP_HEADER
 from reporting import CHECK_HEADER, ROOT, Check, machine, markdown_table, text_table
-from step_times import LAWS, MISSING, STEP_HEADER
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop

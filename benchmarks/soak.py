@@ -21,8 +21,14 @@ os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from loop_latency import LATENCY_HEADER, measure_latency, node_command, processes, wait_for_event
-from reporting import CHECK_HEADER, Check, text_table
+from real_time.loop_latency import (
+    LATENCY_HEADER,
+    measure_latency,
+    node_command,
+    processes,
+    wait_for_event,
+)
+from reporting import CHECK_HEADER, ROOT, Check, text_table
 from scipy import linalg, signal
 
 from backlash_ros.core.parameters import Parameters
@@ -65,7 +71,7 @@ def run_loop(seconds: float, minutes: float) -> list[Check]:
             **plant, 'wait_for_subscribers': 1, 'samples': samples, 'output_noise_std': NOISE,
         }),
         'bare clock': [
-            sys.executable, str(Path(__file__).with_name('bare_clock.py')), str(PERIOD_S),
+            sys.executable, str(ROOT / 'benchmarks' / 'real_time' / 'bare_clock.py'), str(PERIOD_S),
         ],
     }
     checks = []

@@ -26,7 +26,7 @@ from typing import NamedTuple
 sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
 
 import simulated_motor
-from linked_hosts import FIRST, Cable, Host, linked_hosts, why_not
+from hosts.linked_hosts import FIRST, Cable, Host, linked_hosts, why_not
 from reporting import ROOT, machine, markdown_table, text_table
 
 from backlash_ros.middleware.loopback import prefer_loopback

@@ -19,8 +19,8 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
+from accuracy.uncertain_points import CASE_HEADER, POINTS, Benchmark
 from reporting import CHECK_HEADER, ROOT, Check, markdown_table, processors, text_table
-from uncertain_points import CASE_HEADER, POINTS, Benchmark
 
 DOCUMENT = ROOT / 'docs' / 'uncertain_plants.md'
 BACKLASHES, FIRST_SEED = 20, 1

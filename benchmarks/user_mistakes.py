@@ -31,10 +31,10 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from loop_latency import NODES
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from real_time.loop_latency import NODES
 from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
 
 from backlash_ros import topics
@@ -43,6 +43,7 @@ from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.environment import child_environment
 
 CONFIG = ROOT / 'config' / 'geared_motor.yaml'
+BUSY_LOOP = ROOT / 'benchmarks' / 'real_time' / 'busy_loop.py'
 BOUND_S = 3.0
 LONGEST_S = 15.0  # that a line is waited for
 START_S = 30.0  # for the processes to begin
@@ -268,7 +269,7 @@ def check_load() -> Check:
         on.start_node('reference')
         on.wait_for(lambda: on.said, START_S)
         for i in range(processors()):
-            on.start(f'load {i}', [str(Path(__file__).with_name('busy_loop.py')), str(LOAD)])
+            on.start(f'load {i}', [str(BUSY_LOOP), str(LOAD)])
         on.start('driver', ['-c', DRIVER, 'none'])
         on.wait_for(lambda: on.node.count_publishers(topics.PLANT_OUTPUT), START_S)
         deadline = time.monotonic() + LOADED_S

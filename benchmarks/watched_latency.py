@@ -16,11 +16,11 @@ from pathlib import Path
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from loop_latency import RATES_HZ, Latencies, measure_latency, node_command
+from real_time.loop_latency import RATES_HZ, Latencies, measure_latency, node_command
 from reporting import machine, markdown_table
 
 LAW = 'moving_horizon'
-BESIDE = Path(__file__).resolve().parent
+BESIDE = Path(__file__).resolve().parent / 'real_time'
 BROWSER = 'browser'
 # The lowest one is that of samples which nothing else on the machine has held up.
 QUANTILES = (0.1, 0.5, 0.99)

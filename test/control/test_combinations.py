@@ -18,7 +18,7 @@ from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'docs'))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'docs' / 'made_by'))
 
 from combinations_of_laws import AMPLITUDES, CONDITIONS, Sample, outcome, run
 

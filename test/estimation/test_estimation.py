@@ -19,8 +19,8 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 
-from cramer_rao import cramer_rao
-from estimation_runs import (
+from accuracy.cramer_rao import cramer_rao
+from accuracy.estimation_runs import (
     EXACT,
     QUIET,
     SeedJob,

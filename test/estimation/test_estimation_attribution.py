@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
-from uncertain_cases import motor_jobs
+from accuracy.uncertain_cases import motor_jobs
 
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.observer.attribution import attributed

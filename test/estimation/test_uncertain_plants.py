@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.signal import cont2discrete, lfilter
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
-from coasting_load import CoastingLoad
-from uncertain_cases import (
+from accuracy.coasting_load import CoastingLoad
+from accuracy.uncertain_cases import (
     EXACT,
     FAR,
     GAPS,
@@ -25,7 +25,7 @@ from uncertain_cases import (
     near_cases,
     random_backlash,
 )
-from uncertain_runs import NAMES, _longest, _swaps, run_job
+from accuracy.uncertain_runs import NAMES, _longest, _swaps, run_job
 
 from backlash_ros.core.assembly import build_controller, build_model, build_true_model
 from backlash_ros.core.estimation.protocol import Status

@@ -33,8 +33,8 @@ from backlash_ros.core.identification.play_record import PlayRecord
 from backlash_ros.core.identification.uncertainty import response
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
-import identification_cases
-from identification_cases import random_case
+from accuracy import identification_cases
+from accuracy.identification_cases import random_case
 
 Array = NDArray[np.float64]
 PERIOD_S = 0.005

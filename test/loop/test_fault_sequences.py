@@ -10,9 +10,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 
-from fault_controller import Controller
-from fault_sequences import Sequence
-from fault_world import Actuator, Driver, Sensor
+from fault_loop.fault_controller import Controller
+from fault_loop.fault_sequences import Sequence
+from fault_loop.fault_world import Actuator, Driver, Sensor
 
 from backlash_ros.core.loop.sample_counter import KEPT_OUTPUTS
 from backlash_ros.core.parameters import Parameters

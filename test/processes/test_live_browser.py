@@ -12,7 +12,7 @@ import pytest
 from bringup_processes import Session
 from live_pages import address_of
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'docs'))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'docs' / 'made_by'))
 
 from browser import Browser, Tab, chromium, executable
 

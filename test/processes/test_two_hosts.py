@@ -9,7 +9,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 
-from linked_hosts import Cable, linked_hosts, why_not
+from hosts.linked_hosts import Cable, linked_hosts, why_not
 from two_hosts import Case, run
 
 

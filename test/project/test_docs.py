@@ -25,6 +25,7 @@ from backlash_ros.tools.simulate import command as simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / 'docs'
+MADE_BY = DOCS / 'made_by'
 PAGES = sorted([ROOT / 'README.md', *DOCS.glob('*.md')])
 README = (ROOT / 'README.md').read_text()
 BLOCK = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
@@ -32,7 +33,9 @@ LINK = re.compile(r'\]\(([^)\s]+)\)')
 CODE = re.compile(r'`([^`\n]+)`')
 DOTTED = re.compile(r'[a-z_]+(\.[a-z_0-9]+)+')
 SETTING = re.compile(r'^(?P<name>[a-z_.]+): (?P<value>\S.*)$')
-MARKS = re.compile(r'<!-- (\w+): made by docs/figures\.py -->\n(.*?)<!-- end -->', re.DOTALL)
+MARKS = re.compile(
+    r'<!-- (\w+): made by docs/made_by/figures\.py -->\n(.*?)<!-- end -->', re.DOTALL
+)
 GROUPS = {name.split('.')[0] for name in BY_NAME if '.' in name}
 # Files of a result and topics share their first word with a group of parameters.
 FILE_ENDINGS = {'py', 'yaml', 'json', 'csv', 'md', 'html', 'txt'}
@@ -89,7 +92,7 @@ def test_every_picture_is_shown() -> None:
 def test_made_tables_are_filled_and_known_to_the_script() -> None:
     found = {name: text for page in PAGES for name, text in MARKS.findall(page.read_text())}
     assert all(text.startswith('| ') for text in found.values())
-    source = ast.parse((DOCS / 'tables.py').read_text())
+    source = ast.parse((MADE_BY / 'tables.py').read_text())
     tables = next(
         node.value for node in ast.walk(source)
         if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == 'TABLES'
@@ -102,7 +105,7 @@ def test_made_tables_are_filled_and_known_to_the_script() -> None:
 def test_page_that_is_made_from_the_code_is_current(page: str) -> None:
     code = f'import generate_{page} as g, sys; sys.stdout.write(g.{page}_page())'
     done = subprocess.run(
-        [sys.executable, '-c', f'import sys; sys.path.insert(0, {str(DOCS)!r}); {code}'],
+        [sys.executable, '-c', f'import sys; sys.path.insert(0, {str(MADE_BY)!r}); {code}'],
         cwd=ROOT, capture_output=True, text=True, check=True,
     )
     assert (DOCS / f'{page}.md').read_text() == done.stdout, 'call make docs'

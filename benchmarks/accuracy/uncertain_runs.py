@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from math import inf, nan
 
 import numpy as np
-from coasting_load import CoastingLoad
 from numpy.typing import NDArray
 from scipy.signal import lfilter
-from uncertain_cases import Job
 
+from accuracy.coasting_load import CoastingLoad
+from accuracy.uncertain_cases import Job
 from backlash_ros.core.assembly import build_plant, build_true_model
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters

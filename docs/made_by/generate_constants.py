@@ -9,7 +9,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 PACKAGE = DOCS.parent / 'backlash_ros'
 # These stand in estimation.md, with what they are part of.
 ELSEWHERE = PACKAGE / 'core' / 'estimation'

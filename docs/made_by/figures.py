@@ -1,7 +1,8 @@
 """Regenerates every picture and every number of the documents: `make docs`.
 
-Pictures go to docs/images. Numbers go between the marks `<!-- name: made by docs/figures.py -->`
-and `<!-- end -->` of the pages, and docs/parameters.md is written as a whole.
+Pictures go to docs/images. Numbers go between the marks
+`<!-- name: made by docs/made_by/figures.py -->` and `<!-- end -->` of the pages; docs/parameters.md
+and docs/constants.md are written as a whole.
 """
 
 from __future__ import annotations
@@ -40,10 +41,12 @@ from backlash_ros.tools.pages.drawing import (
 from backlash_ros.tools.report.analysis import compare_laws, interesting_parts
 from backlash_ros.tools.report.figures import draw_hysteresis, draw_laws
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 IMAGES = DOCS / 'images'
 PAGES = [DOCS.parent / 'README.md', *DOCS.glob('*.md')]
-MARK = re.compile(r'(<!-- (\w+): made by docs/figures\.py -->\n).*?(<!-- end -->)', re.DOTALL)
+MARK = re.compile(
+    r'(<!-- (\w+): made by docs/made_by/figures\.py -->\n).*?(<!-- end -->)', re.DOTALL
+)
 NAMES = ('m', 'c_r', 'c_l')
 WITH_COLOUR, WITHOUT_COLOUR = '#0072B2', '#D55E00'
 SMALL = {'structure': 'tracking', 'amplitude': '0.2'}

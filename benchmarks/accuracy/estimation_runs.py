@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from math import sin
 
 import numpy as np
-from cramer_rao import cramer_rao
 from numpy.typing import NDArray
-from random_cases import Case, bound_of, random_case, uncertain_case
 
+from accuracy.cramer_rao import cramer_rao
+from accuracy.random_cases import Case, bound_of, random_case, uncertain_case
 from backlash_ros.core.control.controller import Limits
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.protocol import Estimator, Status

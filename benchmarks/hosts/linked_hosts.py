@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
-from cable import ENDS, READY
+from hosts.cable import ENDS, READY
 
 CABLE = Path(__file__).with_name('cable.py')
 DEVICE = 'eth0'

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import rclpy
-from loop_latency import DEADLINE_S, node_command, processes
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -19,6 +18,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.middleware.loopback import prefer_loopback
+from real_time.loop_latency import DEADLINE_S, node_command, processes
 
 PERIOD_S = 0.005
 DRIVERS: dict[str, dict[str, object]] = {

@@ -1,6 +1,6 @@
 """Sleeps until each next period, like a plant that has nothing to do; a yardstick for pauses.
 
-    python benchmarks/bare_clock.py PERIOD_S
+    python benchmarks/real_time/bare_clock.py PERIOD_S
 
 At the end, SIGINT, it tells how many periods it was too late for: the machine did not run it.
 """

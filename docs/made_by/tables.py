@@ -28,7 +28,7 @@ from backlash_ros.core.simulation.run_record import RunRecord
 NAMES = ('m', 'c_r', 'c_l')
 SECONDS = 10.0
 DISTURBANCE = 2.0
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 ESTIMATION = ROOT / 'backlash_ros' / 'core' / 'estimation'
 CONSTANTS = ESTIMATION / 'constants.py'
 OF_EVERY_LAW = ('protocol.py', 'storage.py')

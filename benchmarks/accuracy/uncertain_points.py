@@ -9,7 +9,8 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 from reporting import Check, parallel
-from uncertain_cases import (
+
+from accuracy.uncertain_cases import (
     EXACT,
     FAR,
     FREEZE,
@@ -23,8 +24,7 @@ from uncertain_cases import (
     near_cases,
     random_backlash,
 )
-from uncertain_runs import DEVIATIONS, Figures, run_job
-
+from accuracy.uncertain_runs import DEVIATIONS, Figures, run_job
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.config.configuration import effective_parameters

@@ -8,7 +8,11 @@ from functools import cached_property
 from math import sqrt
 
 import numpy as np
-from estimation_runs import (
+from numpy.typing import NDArray
+from reporting import Check, parallel
+from scipy.special import chdtri
+
+from accuracy.estimation_runs import (
     EXACT,
     FIVE,
     MARKS_S,
@@ -26,10 +30,6 @@ from estimation_runs import (
     run_uncertain_case,
     run_wear,
 )
-from numpy.typing import NDArray
-from reporting import Check, parallel
-from scipy.special import chdtri
-
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 

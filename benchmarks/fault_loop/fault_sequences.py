@@ -8,9 +8,7 @@ from itertools import product
 from math import inf, isfinite
 
 import numpy as np
-from fault_controller import Controller
-from fault_world import SENSOR_FAULTS, Actuator, Driver, Sensor
-from random_cases import NEAR_ONE, random_plant
+from accuracy.random_cases import NEAR_ONE, random_plant
 
 from backlash_ros.core.assembly import (
     build_controller,
@@ -27,6 +25,8 @@ from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
+from fault_loop.fault_controller import Controller
+from fault_loop.fault_world import SENSOR_FAULTS, Actuator, Driver, Sensor
 
 PERIOD_S = 0.01
 SAMPLES = (300, 800)

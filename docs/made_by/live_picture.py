@@ -1,4 +1,4 @@
-"""Takes the picture of the page in the browser: `.venv/bin/python docs/live_picture.py`.
+"""Takes the picture of the page in the browser: `.venv/bin/python docs/made_by/live_picture.py`.
 
 It needs Chromium (`apt-get install chromium`), and so is no part of `make docs`.
 """
@@ -16,7 +16,7 @@ from pathlib import Path
 
 from browser import chromium
 
-PICTURE = Path(__file__).resolve().parent / 'images' / 'live.png'
+PICTURE = Path(__file__).resolve().parents[1] / 'images' / 'live.png'
 ADDRESS = re.compile(r'^live: (http://\S+)$')
 WIDTH, HEIGHT = 1280, 800
 AFTERWARDS_S = 6.0  # so that the curves still show how the backlash was learned

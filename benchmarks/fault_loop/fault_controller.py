@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from math import isfinite
 
-from fault_world import Driver
-
 from backlash_ros.core.control.controller import ControlStep, Limits
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.report_use import AWAITED_REPORTS
 from backlash_ros.core.loop.sample_counter import KEPT_OUTPUTS, Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
+from fault_loop.fault_world import Driver
 
 
 class Controller:

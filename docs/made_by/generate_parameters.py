@@ -7,7 +7,7 @@ from pathlib import Path
 
 from backlash_ros.core.parameters.table import PARAMETERS, Parameter, as_yaml
 
-PAGE = Path(__file__).with_name('parameters.md')
+PAGE = Path(__file__).resolve().parents[1] / 'parameters.md'
 HEAD = """# Parameters
 
 Made from [table.py](../backlash_ros/core/parameters/table.py) by `make docs`; do not edit.

@@ -11,7 +11,7 @@ import signal
 import sys
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / 'docs'))
+sys.path.append(str(Path(__file__).resolve().parents[2] / 'docs' / 'made_by'))
 
 from aiohttp import ClientConnectionError, ClientSession
 from browser import LOOK_S, chromium

@@ -1,0 +1,1 @@
+"""Cases and runs behind the accuracy of estimation and identification."""

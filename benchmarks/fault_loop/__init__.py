@@ -1,0 +1,1 @@
+"""The loop that faults.py plays, in one process."""
