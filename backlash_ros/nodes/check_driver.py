@@ -7,20 +7,11 @@ import csv
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    QoSCompatibility,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_check_compatible,
-)
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Float64
 
@@ -28,35 +19,31 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.control.controller import plausible
 from backlash_ros.core.driver_check.findings import (
-    FLOAT64,
     WRONG,
     Finding,
-    Graph,
     Heard,
     Message,
     timing_of,
 )
 from backlash_ros.core.driver_check.gentle_drive import Drive, GentleDrive, Range, drive_range
 from backlash_ros.core.driver_check.motion import record_of
-from backlash_ros.core.driver_check.verdict import all_fit, judge, similar_topics, table
-from backlash_ros.core.parameters.table import CONTROLLER, RECORDER
+from backlash_ros.core.driver_check.verdict import all_fit, judge, table
+from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.diagnostics.presence import Presence
-from backlash_ros.nodes.diagnostics.rivals import identity_made_by, names_of
+from backlash_ros.nodes.diagnostics.rivals import identity_made_by
+from backlash_ros.nodes.driver_check.driver_graph import DriverGraph
+from backlash_ros.nodes.driver_check.options import EXECUTABLE, parameter_files, parse_options
 from backlash_ros.nodes.runtime.arguments import ros_arguments
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
 from backlash_ros.nodes.runtime.spin import ProcessNode, run
-from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser, positive
+from backlash_ros.options import BAD_INPUT, DONE, FAILED
 from backlash_ros.shipped import find_config
 
-EXECUTABLE = 'check_driver'
 LOOK_S = 0.1  # between two looks at the graph
 SETTLE_S = 1.0  # after which everybody should have found everybody
 REMIND_S = 3.0  # between two lines that say what is missing
-CONTROLLER_SECTIONS = ('/**/controller', 'controller', '/controller')
-NOT_OURS = {'/rosout', '/parameter_events'}
 UNSEEN = 'a controller of this machine'  # that discovery has not found yet
-COMMAND_LINE = '_ros2cli'  # how the nodes of `ros2 topic` are called
 
 
 class CheckDriverNode(ProcessNode):
@@ -78,7 +65,7 @@ class CheckDriverNode(ProcessNode):
         )
         self._drive: Drive | None = None
         self._driving = False
-        self._heard, self._graph = Heard(), Graph()
+        self._heard = Heard()
         self._range_left: float | None = None
         self._rivals = ''  # who else publishes control
         self._silent_s = 0.0  # how long the driver was when it was given up, 0 where it was not
@@ -87,6 +74,7 @@ class CheckDriverNode(ProcessNode):
             topic: self.resolve_topic_name(topic)
             for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL)
         }
+        self._graph = DriverGraph(self, self._names)
         self.exit_code = FAILED
 
     def work(self, executor: NodeExecutor) -> None:
@@ -110,46 +98,17 @@ class CheckDriverNode(ProcessNode):
         deadline = time.monotonic() + self._options.wait
         remind = time.monotonic() + REMIND_S
         while not self.stopping:
-            if self.get_publishers_info_by_topic(self._names[topics.PLANT_OUTPUT]):
+            if self._graph.outputs():
                 return True
             now = time.monotonic()
             if now > deadline:
-                self._say_what_is_missing()
+                self._graph.say_what_is_missing()
                 return False
             if now > remind:
                 remind += REMIND_S
-                self._say_what_is_missing()
+                self._graph.say_what_is_missing()
             executor.spin_once(timeout_sec=LOOK_S)
         return False
-
-    def _say_what_is_missing(self) -> None:
-        wanted = self._names[topics.PLANT_OUTPUT]
-        seen = self._topics_with(self.get_publishers_info_by_topic)
-        print(f'waiting for {wanted} ({FLOAT64})')
-        near = similar_topics(wanted, FLOAT64, seen)
-        for topic in near:
-            print(f'  sees {topic} ({", ".join(seen[topic])}); if that is it: '
-                  f'--ros-args -r {topics.PLANT_OUTPUT}:={topic}')
-        others = sorted(set(seen) - set(near))
-        print(f'  sees {"besides " if near else ""}{", ".join(others) or "no other topic"}',
-              flush=True)
-
-    def _topics_with(
-        self, endpoints: Callable[[str], list[TopicEndpointInfo]],
-    ) -> dict[str, list[str]]:
-        """Topics that have such endpoints, and their types."""
-        return {
-            topic: types for topic, types in self.get_topic_names_and_types()
-            if topic not in NOT_OURS and self._of_others(endpoints(topic))
-        }
-
-    def _of_others(self, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
-        """Without those of this node, of the recorder and of `ros2 topic`."""
-        return [
-            info for info in endpoints
-            if info.node_name not in (self.get_name(), RECORDER)
-            and not info.node_name.startswith(COMMAND_LINE)
-        ]
 
     def _listen(self) -> None:
         """Subscribe the way that hears the driver, whatever its QoS."""
@@ -163,7 +122,7 @@ class CheckDriverNode(ProcessNode):
                 self.context.get_domain_id(), self._names[topics.CONTROL], own
             )
         self.listen(
-            Float64, topics.PLANT_OUTPUT, self._on_output, self._profile(topics.PLANT_OUTPUT)
+            Float64, topics.PLANT_OUTPUT, self._on_output, self._graph.profile(topics.PLANT_OUTPUT)
         )
 
     def _advertise(self) -> Publisher:
@@ -174,16 +133,7 @@ class CheckDriverNode(ProcessNode):
         def on_message(message: Float64, info: dict[str, Any]) -> None:
             messages.append(_message(message, info))
 
-        self.listen(Float64, topic, on_message, self._profile(topic))
-
-    def _profile(self, topic: str) -> QoSProfile:
-        offered = self.get_publishers_info_by_topic(self._names[topic])
-        reliable = all(
-            info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT for info in offered
-        )
-        return QoSProfile(depth=DEPTH, reliability=(
-            ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-        ))
+        self.listen(Float64, topic, on_message, self._graph.profile(topic))
 
     def _on_output(self, message: Float64, info: dict[str, Any]) -> None:
         if self._heard.end_ns:
@@ -271,36 +221,13 @@ class CheckDriverNode(ProcessNode):
         executor.spin_once(timeout_sec=LOOK_S)
 
     def _look_at_graph(self) -> None:
-        graph = self._graph
-        outputs = self.get_publishers_info_by_topic(self._names[topics.PLANT_OUTPUT])
-        listeners = self._of_others(
-            self.get_subscriptions_info_by_topic(self._names[topics.CONTROL])
-        )
         if self._limits is not None:
-            others = self.get_publishers_info_by_topic(self._names[topics.CONTROL])
             # Once heard, a rival counts, even if it leaves.
-            self._rivals = self._rivals or names_of(
-                [info for info in others if info.node_name != self.get_name()]
-            )
-        graph.publishers = max(graph.publishers, len(outputs))
-        graph.listeners = max(graph.listeners, len(listeners))
-        if outputs:
-            graph.types = tuple(sorted({info.topic_type for info in outputs}))
-        graph.best_effort = graph.best_effort or any(
-            info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for info in outputs
-        )
-        misfits = {
-            reason for info in listeners
-            if (reason := _misfit(QoSProfile(depth=DEPTH), info.qos_profile))
-        }
-        graph.misfits = tuple(sorted({*graph.misfits, *misfits}))
+            self._rivals = self._rivals or self._graph.rivals()
+        self._graph.look()
 
     def _tell(self) -> None:
-        seen = self._topics_with(self.get_subscriptions_info_by_topic)
-        self._graph.near_control = tuple(
-            similar_topics(self._names[topics.CONTROL], FLOAT64, seen)
-        )
-        findings = judge(self._graph, self._heard, self.settings)
+        findings = judge(self._graph.in_the_end(), self._heard, self.settings)
         if self._range_left is not None:
             findings.append(Finding(
                 'range', WRONG, f'y = {self._range_left:.4g} left --output-range: drive ended',
@@ -337,65 +264,10 @@ def _message(message: Float64, info: dict[str, Any]) -> Message:
     )
 
 
-def _misfit(offered: QoSProfile, asked: QoSProfile) -> str:
-    """Why messages cannot pass from control to a subscriber, empty if they can."""
-    # What discovery does not tell (depth) or tells as "infinite" would count as a misfit.
-    bare = QoSProfile(depth=DEPTH, reliability=asked.reliability, durability=asked.durability)
-    compatibility, reason = qos_check_compatible(offered, bare)
-    return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
-
-
-def parse_options(plain: Sequence[str]) -> argparse.Namespace:
-    """Options besides those of ROS."""
-    parser = OptionParser(
-        EXECUTABLE, description=__doc__,
-        epilog='Exit codes: 0 all fits, 1 something does not, 2 bad input.',
-    )
-    parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
-                        'or the name of a shipped one')
-    parser.add_argument('--duration', type=positive, default=10.0, metavar='SECONDS',
-                        help='how long to listen (default: 10)')
-    parser.add_argument('--wait', type=positive, default=10.0, metavar='SECONDS',
-                        help='how long to wait for a driver (default: 10)')
-    parser.add_argument('--drive', action='store_true',
-                        help='move v, to and fro within control.min, control.max and '
-                             'control.rate_max, to rest at the end')
-    parser.add_argument('--amplitude', type=positive, metavar='V',
-                        help='drive: keep v within ±V as well')
-    parser.add_argument('--rate', type=positive, metavar='V_PER_S',
-                        help='drive: keep v slower than this as well')
-    parser.add_argument('--rest', type=positive, default=30.0, metavar='SECONDS',
-                        help='drive: longest way to rest at the end, after which v is held '
-                             '(default: 30); a signal on that way holds v at once')
-    parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),
-                        metavar=('LOW', 'HIGH'), help='drive: stop when y leaves this range')
-    parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
-    options = parser.parse_args(plain)
-    for name in ('amplitude', 'rate'):
-        if getattr(options, name) is not None and not options.drive:
-            parser.error(f'--{name} says how to drive: give --drive as well')
-    return options
-
-
-def parameter_files(config: str, folder: Path) -> list[str]:
-    """The file, and in folder one more with what it holds for the controller alone, if anything."""
-    try:
-        document = yaml.safe_load(Path(config).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError):
-        return [config]  # rcl says what is wrong with it
-    files = [config]
-    for section in CONTROLLER_SECTIONS:
-        if isinstance(document, dict) and section in document:
-            path = folder / f'{len(files)}.yaml'
-            path.write_text(yaml.safe_dump({'/**': document[section]}), encoding='utf-8')
-            files.append(str(path))
-    return files
-
-
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
-    options = parse_options(remove_ros_args(['', *arguments])[1:])
+    options = parse_options(remove_ros_args(['', *arguments])[1:], __doc__)
     with tempfile.TemporaryDirectory() as folder:
         files = [] if options.config is None else parameter_files(
             str(find_config(Path(options.config))), Path(folder)

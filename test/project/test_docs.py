@@ -15,7 +15,7 @@ import pytest
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.parameters.table import BY_NAME
-from backlash_ros.nodes import check_driver
+from backlash_ros.nodes.driver_check.options import parse_options
 from backlash_ros.tools.bringup import command as bringup
 from backlash_ros.tools.config.configuration import effective_parameters
 from backlash_ros.tools.identify import command as identify
@@ -188,7 +188,7 @@ def check_tool(program: str, arguments: list[str]) -> None:
         assert config is None or (ROOT / config).is_file()
         return
     if program == 'check_driver':
-        config = check_driver.parse_options(arguments).config
+        config = parse_options(arguments).config
         assert config is None or (ROOT / config).is_file()
         return
     options = (
