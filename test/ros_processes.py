@@ -142,27 +142,29 @@ class Probe:
 
 
 class RosWorld:
-    """A domain of its own with the nodes of one test in it."""
+    """A domain of its own with the nodes of one test in it.
+
+    forked: whether nodes begin where the imports have been done. Where the start of the interpreter
+    is of interest, or what it and the imports read from the environment, they must not.
+    """
 
     def __init__(self, folder: Path, domain: int, stack: ExitStack) -> None:
         self.folder = folder
         self.domain, self._stack = domain, stack
         self.environment = child_environment(folder, domain)
+        self.forked = True
 
     def start(
         self, executable: str, parameters: Mapping[str, object] | None = None, *arguments: str,
-        forked: bool = True,
     ) -> NodeProcess:
-        """Start a node with parameters, and further arguments as they are.
-
-        forked: begin where the imports have been done, instead of with the interpreter.
-        """
+        """Start a node with parameters, and further arguments as they are."""
         ros_arguments = ['--ros-args'] if parameters else []
         for name, value in (parameters or {}).items():
             text = value if isinstance(value, str) else json.dumps(value)
             ros_arguments += ['-p', f'{name}:={text}']
         process = NodeProcess(
-            executable, [*ros_arguments, *arguments], self.folder, self.environment, forked
+            executable, [*ros_arguments, *arguments], self.folder, self.environment,
+            self.forked,
         )
         self._stack.callback(process.kill)
         return process

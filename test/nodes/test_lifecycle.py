@@ -225,6 +225,7 @@ os.fsync = slowly
 def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(tmp_path: Path) -> None:
     (tmp_path / 'sitecustomize.py').write_text(SLOW_DISK)
     with ros_world(tmp_path) as world:
+        world.forked = False
         paths = [str(tmp_path), *filter(None, [world.environment.get('PYTHONPATH')])]
         world.environment['PYTHONPATH'] = os.pathsep.join(paths)
         controller, driver = another(world, str(tmp_path / 'estimates.json'))

@@ -184,8 +184,9 @@ def test_a_signal_during_start_up_ends_the_process_with_code_0(
     tmp_path: Path, number: signal.Signals,
 ) -> None:
     with ros_world(tmp_path) as world:
+        world.forked = False
         for i in range(4):
-            node = world.start('controller', forked=False)
+            node = world.start('controller')
             # Before the interpreter has come to this package, nothing can be done about it;
             # SIGINT it catches by itself.
             wait_until(

@@ -204,6 +204,7 @@ def test_v_and_the_u_after_it_make_a_point_whatever_is_missing() -> None:
 
 def test_alone_it_waits_for_a_controller_and_ends_with_ctrl_c(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
+        world.forked = False
         del world.environment['BACKLASH_ROS_EVENTS']
         live = world.start(MODULE, None, '/pan')
         wait_until(lambda: live.stdout.endswith('\n'), 'the address')
