@@ -1,8 +1,13 @@
 """For all tests: what examples property tests draw, the order of the tests, fixtures."""
 
+import os
 import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
+
+# Before numpy reads it, as `make test` has it: the workers would take the processors from each
+# other, and the matrices are tiny.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import pytest
 from bringup_processes import Session, bringup_sessions

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from conftest import SHARE_RUNS
 
 ROOT = Path(__file__).resolve().parents[2]
 # The interpreter beneath the environment that runs the tests: without packages, so without rclpy.
@@ -84,3 +85,7 @@ def test_make_test_runs_the_linters_and_passes_arguments_on(bare_clone: Path) ->
     modules = [line.split('-m ', 1)[1] for line in done.stdout.splitlines() if ' -m ' in line]
     assert [module.split()[0] for module in modules] == ['ruff', 'mypy', 'pytest']
     assert modules[-1].endswith(' -x test/project/test_make.py')
+
+
+def test_files_whose_tests_share_runs_are_there() -> None:
+    assert {path.stem for path in (ROOT / 'test').rglob('test_*.py')} >= SHARE_RUNS
