@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
+import io
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +21,6 @@ from typing import Any
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import rclpy
-from forked_nodes import ForkedNode
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -30,6 +33,14 @@ from backlash_ros.tools.bringup.environment import child_environment
 prefer_loopback(os.environ)  # the nodes of the tests themselves
 
 DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
+# Nodes begin where the imports have been done: a start costs 0.05 s, not 1 s. A process that has
+# imported everything, and has no node yet, is forked. What differs from python -m is the start of
+# the interpreter and its end; the tests of bringup and of the installation see both.
+PACKAGE = 'backlash_ros.nodes'
+FORKING = multiprocessing.get_context('forkserver')
+FORKING.set_forkserver_preload([
+    f'{PACKAGE}.{name}' for name in ('controller', 'plant', 'reference', 'recorder')
+])
 
 
 def wait_until(condition: Callable[[], object], what: str, wait: Callable[[], None]) -> None:
@@ -38,6 +49,78 @@ def wait_until(condition: Callable[[], object], what: str, wait: Callable[[], No
     while not condition():
         assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
         wait()
+
+
+class ForkedNode:
+    """A node in a process of its own, with the methods of subprocess.Popen that tests use."""
+
+    def __init__(
+        self, executable: str, arguments: Sequence[str], stdout: Path, stderr: Path,
+        environment: Mapping[str, str],
+    ) -> None:
+        # Daemons end with the tests.
+        self._process: ForkServerProcess = FORKING.Process(
+            target=_run_node, daemon=True,
+            args=(executable, list(arguments), stdout, stderr, dict(environment)),
+        )
+        before = os.environ.get('BACKLASH_ROS_EVENTS')
+        # The first start forks nothing yet, but does the imports, one of which reads this.
+        os.environ['BACKLASH_ROS_EVENTS'] = '1'
+        try:
+            self._process.start()
+        finally:
+            if before is None:
+                del os.environ['BACKLASH_ROS_EVENTS']
+            else:
+                os.environ['BACKLASH_ROS_EVENTS'] = before
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        assert self._process.pid is not None
+        return self._process.pid
+
+    @property
+    def returncode(self) -> int | None:
+        """Its exit code, the negative number of the signal that killed it, or None."""
+        return self._process.exitcode
+
+    def poll(self) -> int | None:
+        """The same."""
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """Its exit code, once it has ended; raises subprocess.TimeoutExpired."""
+        self._process.join(timeout)
+        if self.returncode is None:
+            raise subprocess.TimeoutExpired(self._process.name, timeout or 0.0)
+        return self.returncode
+
+    def send_signal(self, number: signal.Signals) -> None:
+        """Send a signal to it alone, if it is there."""
+        if self.returncode is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
+
+def _run_node(
+    executable: str, arguments: list[str], stdout: Path, stderr: Path, environment: dict[str, str],
+) -> None:
+    """Become what `python -m backlash_ros.nodes.EXECUTABLE ARGUMENTS` is."""
+    for path, number in ((stdout, 1), (stderr, 2)):
+        with path.open('ab') as file:
+            os.dup2(file.fileno(), number)
+    for stream in (sys.stdout, sys.stderr):
+        assert isinstance(stream, io.TextIOWrapper)
+        stream.reconfigure(line_buffering=True)
+    os.environ.clear()
+    os.environ.update(environment)
+    module = importlib.import_module(f'{PACKAGE}.{executable}')
+    sys.argv = [str(module.__file__), *arguments]
+    sys.exit(module.main())
 
 
 class NodeProcess:

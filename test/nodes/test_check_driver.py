@@ -14,9 +14,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from forked_nodes import ForkedNode
 from made_up_driver import LIMITS, PERIOD_S, parameters
-from ros_processes import Probe, wait_until
+from ros_processes import ForkedNode, Probe, wait_until
 from std_msgs.msg import Float64
 
 from backlash_ros.nodes.check_driver import main
