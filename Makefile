@@ -20,7 +20,7 @@ endif
 RUN := .venv/bin/python
 # Tests that start processes wait for more than half of their time, each in a ROS domain of its
 # own. Their order is that of conftest.py.
-WORKERS := -n 3 --no-loadscope-reorder
+WORKERS := -n 2 --no-loadscope-reorder
 # A Python that was not asked for by name leaves an existing .venv of another Python as it is.
 KEEP := $(if $(filter file,$(origin PYTHON)),--keep-python)
 # A sourced ROS 2 brings its own numpy, and each numpy has other types than the pinned one.
