@@ -144,3 +144,14 @@ def test_without_feedback_u_d_is_the_reference() -> None:
     inverse = BacklashInverse()
     for y_m in (1.0, 2.0, -4.0, -4.0):
         assert control(y_m, estimate, inverse).u_d == pytest.approx(y_m)
+
+
+def test_v_does_not_stay_where_estimates_far_off_have_led_it() -> None:
+    inverse = BacklashInverse()
+    before, now = Estimate(0.01, 0.0, 0.0, 0.4), Estimate(0.3, 0.0, 0.0, 0.4)
+    for y_m in (10.0, -10.0):
+        far = control(y_m, before, inverse)
+    assert far.v < -4000.0
+    command = control(-10.0, now, inverse)
+    assert command.u_d == pytest.approx(-10.0 + command.f * command.v)
+    assert abs(command.u_d) <= 1.001 * 10.0 / (1.0 - LARGEST_F_OVER_M)

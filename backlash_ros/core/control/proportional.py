@@ -95,6 +95,12 @@ class Proportional:
         if right_fits or left_fits:
             u_d = right if right_fits else left
             return Command(u_d, inverse.step(u_d, m, c_r, c_l), f)
+        if abs(held) > (abs(y_m) + abs(f) * max(c_r, -c_l)) / (1.0 - LARGEST_F_OVER_M):
+            # New estimates have moved both lines so far from v that no u_d could have led there.
+            nearest = (Region.RIGHT, right) if nearer_right else (Region.LEFT, left)
+            inverse.aim(nearest[1], nearest[0])
+            v = inverse.step(nearest[1], m, c_r, c_l)
+            return Command(y_m + f * v, v, f)
         return Command(held, inverse.hold(held), f)
 
 
