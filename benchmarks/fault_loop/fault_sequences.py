@@ -138,7 +138,7 @@ class Sequence:
         self._usual = 0.0  # largest move of v so far
         self._moves = 0
         self._v_before = 0.0  # that acted before the newest command
-        self._v_answered = 0.0  # of the newest answer
+        self._v_answered = self._y_m = 0.0  # of the newest answer
         self._last: Estimate | None = None
         self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
         self._loop: object = None
@@ -340,13 +340,16 @@ class Sequence:
         goes_on = goes_on and self._v_before == self._v_answered
         if goes_on and self._moves >= LEARNED_MOVES and self._last is not None:
             allowed = JUMP * self._usual + _shift(self._last, e, v)
+            if self.p.get_str('structure') == 'proportional':
+                # (3.2) answers at once to what y_m has done meanwhile.
+                allowed += abs(step.y_m - self._y_m) / (e.m * (1.0 - LARGEST_F_OVER_M))
             if move > allowed + ROUNDING * (1.0 + abs(v)):
                 self.findings.jumps.append(
                     f'sample {self.driver.tick}: v moved by {move:.3g}, usual {self._usual:.3g}'
                 )
         self._moves += 1
         self._usual = max(self._usual, move)
-        self._last, self._v_answered = e, v
+        self._last, self._v_answered, self._y_m = e, v, step.y_m
         if self._frozen is not None and self._moves and renewed:
             self._frozen = None
         self._judge(e)
@@ -454,7 +457,8 @@ def _shift(before: Estimate, now: Estimate, v: float) -> float:
     """By how much a new estimate may move v."""
     crossings = max(abs(now.c_r - before.c_r), abs(now.c_l - before.c_l))
     reach = abs(v) + max(now.c_r, -now.c_l)
-    return crossings + abs(now.m - before.m) / min(now.m, before.m) * reach
+    by_f = abs(now.f - before.f) / (now.m - min(now.f, LARGEST_F_OVER_M * now.m)) * reach
+    return crossings + abs(now.m - before.m) / min(now.m, before.m) * reach + by_f
 
 
 EVENTS_BY_NAME: dict[str, Callable[[Sequence, int], None]] = {
