@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import nan
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -52,6 +54,19 @@ def test_samples_that_were_taken_out_stay_what_they_are() -> None:
     record.lose(np.array([0]))
     record.append(3.0, 4.0)
     assert (v.tolist(), y.tolist()) == ([1.0], [2.0])
+
+
+def test_y_in_doubt_counts_as_lost_until_it_is_restored() -> None:
+    record = Record(CAPACITY)
+    for k in range(4):
+        record.append(float(k), nan if k in (1, 2) else float(k))
+    record.doubt(1, 11.0)
+    record.doubt(2, 12.0)
+    assert np.array_equal(record.doubted(0, 4), [nan, 11.0, 12.0, nan], equal_nan=True)
+    record.restore([0, 2])
+    assert np.array_equal(record.since(0)[1], [0.0, nan, 12.0, 3.0], equal_nan=True)
+    record.forget_before(2)
+    assert np.isnan(record.doubted(1, 3)).all()
 
 
 def test_more_than_it_holds_is_refused() -> None:

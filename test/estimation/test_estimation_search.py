@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from math import nan
+from math import nan, sqrt
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from scipy.special import chdtri
 from backlash_ros.core.estimation.constants import CANDIDATES, ENGAGED
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.prior import Prior
-from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, searched
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, searched, with_other_gaps
 from backlash_ros.core.estimation.fit.search import Found, search
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import weights_of
@@ -216,3 +216,32 @@ def test_a_constant_u_is_no_backlash() -> None:
     v = 0.1 * swing(300)
     y = NOISE * np.random.default_rng(0).standard_normal(300)
     assert drained(searched(v, y, around(0.2), 100.0, Pace())) is None
+
+
+def test_a_first_gap_is_as_well_known_as_it_says() -> None:
+    # v moves by half a gap per sample: the likelihood of 40 samples has several maxima.
+    judged = wrong = 0
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 7])
+        truth = Truth(1.0, rng.uniform(0.3, 1.0), -rng.uniform(0.3, 1.0), rng.uniform())
+        v = np.cumsum(rng.standard_normal(40))
+        v *= rng.uniform(0.9, 3.0) / np.abs(v).max()
+        y = output(MODEL, v, truth, NOISE * 10.0 ** rng.uniform(-1.0, 1.0), seed)
+        found = drained(searched(v, y, around(0.0), 10.0, Pace()))
+        crossings = None if found is None else found.solution.crossings
+        if crossings is not None and crossings.std_gap < 0.3 * crossings.gap:
+            judged += 1
+            wrong += abs(crossings.gap - truth.gap) > 5.0 * crossings.std_gap
+    assert judged > 20
+    assert wrong <= 1
+
+
+def test_gap_that_a_prior_leaves_open_is_no_better_known_for_its_labels() -> None:
+    v = np.array([0.0, 0.4, 0.8, 0.4, 0.0, 0.4, 0.8])  # never across the gap
+    truth = Truth(1.0, 1.0, -1.0, 0.5)
+    theta, cov = truth.theta, np.diag([1e-4, 0.01, 0.01])
+    known = around(0.0)._replace(prior=Prior(theta, cov))
+    y = output(MODEL, v, truth, NOISE)
+    fit = fit_from(v, y, truth, 0.0, known)
+    open_gap = drained(with_other_gaps(v, y, fit, Prior(theta, cov), Pace())).solution.std_gap
+    assert open_gap == pytest.approx(sqrt(0.02), rel=0.3)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from math import nan
 
 import numpy as np
@@ -23,6 +23,7 @@ class Record:
         self._other: Array = np.empty(2 * capacity)
         self._begin = self._end = 0
         self.first = 0
+        self._doubted: dict[int, float] = {}  # y by the number of the sample
 
     def __len__(self) -> int:
         return self._end - self._begin
@@ -64,16 +65,25 @@ class Record:
         """Count y of these samples as lost."""
         self._y[self._begin + numbers - self.first] = np.nan
 
-    def restore(self, outputs: Mapping[int, float]) -> None:
-        """Count these y as measured after all, by the number of their sample."""
-        for number, y in outputs.items():
-            if self.first <= number < self.end:
-                self._y[self._begin + number - self.first] = y
+    def doubt(self, number: int, y: float) -> None:
+        """Keep a y that counts as lost, as it seems to be an outlier."""
+        self._doubted[number] = y
+
+    def doubted(self, number: int, count: int) -> Array:
+        """The y in doubt among so many samples from this number on, nan where there is none."""
+        return np.array([self._doubted.get(k, nan) for k in range(number, number + count)])
+
+    def restore(self, numbers: Iterable[int]) -> None:
+        """Count y of these samples, which were in doubt, as measured after all."""
+        for number in numbers:
+            if number in self._doubted:
+                self._y[self._begin + number - self.first] = self._doubted.pop(number)
 
     def forget_before(self, number: int) -> None:
         """Let go of all samples older than this one."""
         self._begin += number - self.first
         self.first = number
+        self._doubted = {k: y for k, y in self._doubted.items() if k >= number}
 
     def _compact(self) -> None:
         kept = len(self)

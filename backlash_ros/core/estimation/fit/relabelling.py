@@ -24,11 +24,12 @@ from backlash_ros.core.estimation.constants import (
     WALKS,
     ZOOM,
 )
+from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.learned_error import wants_another_model
 from backlash_ros.core.estimation.fit.low_order import OutputError, low_order
 from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.fit.prior import beyond_chance
-from backlash_ros.core.estimation.fit.search import Candidate, search
+from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance
+from backlash_ros.core.estimation.fit.search import Candidate, Comparison, gap_spread, search
 from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit, weights_of
 from backlash_ros.core.estimation.regression.play import Start
@@ -68,6 +69,11 @@ class Fitted(NamedTuple):
         """Whether the samples do not deny what was known from elsewhere."""
         prior = self.around.prior
         return prior is None or not beyond_chance(self.solution.theta - prior.theta, prior.cov)
+
+    def with_gap_spread(self, spread: float) -> Fitted:
+        """The same with a gap that is no better known than by this deviation."""
+        self.fit.gap_spread = spread
+        return self._replace(solution=self.fit.solve())
 
     def beginning(self, v: Array) -> Start:
         """Where another fit of v (N,) is to begin."""
@@ -125,8 +131,28 @@ def searched(
     # With an error of G the evidence is that of the best error for each gap: too flat to tell.
     if not around.error.count:
         best = best._replace(decided=not any(_rivals(best, other) for other in fits))
+    assert found.comparison is not None
+    spread = yield from gap_spread(
+        found.comparison, found.candidates, best.solution.gap, best.solution.std_gap, None, pace
+    )
     result = yield from with_better_model(v, y, best, pace)
-    return result._replace(decided=best.decided)
+    return result.with_gap_spread(spread)._replace(decided=best.decided)
+
+
+def with_other_gaps(
+    v: Array, y: Array, result: Fitted, prior: Prior, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """A fit with a prior whose gap is no better known than over all that explain the samples."""
+    known = crossings_of(prior.theta, prior.cov)
+    gap, std = result.solution.gap, result.solution.std_gap
+    if known is None or not known.std_gap > std:
+        return result
+    around = result.around
+    comparison = Comparison(
+        v, y, weights_of(y), around.model, around.error, around.told_std
+    )
+    spread = yield from gap_spread(comparison, (), gap, std, (known.gap, known.std_gap), pace)
+    return result.with_gap_spread(spread)
 
 
 def _rivals(best: Fitted, other: Fitted) -> bool:

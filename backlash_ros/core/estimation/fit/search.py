@@ -8,7 +8,8 @@ where v moves by half a gap per sample, minima lie some 3 % of the gap apart.
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,11 @@ from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
+# Places, in standard deviations, at which the likelihood is asked for: around the gap of a fit, and
+# around that of a prior.
+NEAR: Array = np.outer([-1.0, 1.0], [0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0]).ravel()
+FAR: Array = 0.5 * np.arange(-8.0, 9.0, dtype=np.float64)
+
 
 class Candidate(NamedTuple):
     """A gap with the best start for it. evidence: log-likelihood, comparable within a search."""
@@ -35,10 +41,14 @@ class Candidate(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Candidates, best first, and the evidence that v never engaged."""
+    """Candidates, best first, and the evidence that v never engaged.
+
+    comparison: that further gaps of the same samples may be asked of; None where v rests.
+    """
 
     candidates: list[Candidate]
     null: float
+    comparison: Comparison | None = None
 
 
 def search(
@@ -51,7 +61,7 @@ def search(
     if not (top > 0.0 and NO_GAP * swing > 0.0) \
             or float(weights[np.isfinite(y)].sum()) <= model.order + 3:
         return Found([], 0.0)
-    comparison = _Comparison(v, y, weights, model, error, told_std)
+    comparison = Comparison(v, y, weights, model, error, told_std)
     null = comparison.null
     gaps: Array = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
     coarse = yield from comparison.best_per_gap(gaps, STARTS, pace)
@@ -62,10 +72,33 @@ def search(
         close[close <= top], 2 * STARTS - 1, pace
     )
     found = sorted([*coarse, *fine], reverse=True)
-    return Found(found, null)
+    return Found(found, null, comparison)
 
 
-class _Comparison:
+def gap_spread(
+    comparison: Comparison, known: Sequence[Candidate], gap: float, std: float,
+    prior: tuple[float, float] | None, pace: Pace,
+) -> Generator[None, None, float]:
+    """Root of the mean square distance from this gap over all that explain the samples.
+
+    Each counts by its likelihood. std: of the gap as the labels for it say, which know nothing of
+    what other labels would: where few samples tell, the likelihood has several maxima. known: gaps
+    that were compared already. prior: gap and its deviation from elsewhere.
+    """
+    if not 0.0 < std < inf:
+        return 0.0
+    places = gap + std * NEAR
+    if prior is not None:
+        places = np.append(places, prior[0] + prior[1] * FAR)
+    close = yield from comparison.best_per_gap(places[places > 0.0], 2 * STARTS - 1, pace)
+    gaps, evidence = np.unique([(one.gap, one.evidence) for one in (*known, *close)], axis=0).T
+    if prior is not None:
+        evidence = evidence - 0.5 * ((gaps - prior[0]) / prior[1]) ** 2
+    share = np.gradient(gaps) * np.exp(evidence - evidence.max())
+    return sqrt(float(share @ (gaps - gap) ** 2 / share.sum()))
+
+
+class Comparison:
     """The regression for given gaps, many at once."""
 
     def __init__(

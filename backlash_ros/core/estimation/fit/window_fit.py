@@ -57,6 +57,7 @@ class WindowFit:
         if len(past):
             self._regressors.begin_after(np.diff(start.labels(past).p, prepend=start.p))
         self.layout = self._regressors.layout
+        self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.length = 0  # samples
         self.reversals = 0
         self._play = begun
@@ -194,6 +195,7 @@ class WindowFit:
             lag = float(residual[1:] @ residual[:-1]) / squares
             correlation = max(0.0, lag - BY_CHANCE / sqrt(count))
         inflation = 1.0 - correlation + count * correlation
+        posterior = self._with_other_labels(posterior, inflation)
         now = self._theta_now()
         theta = now @ posterior.mean
         cov = now @ posterior.cov @ now.T * (posterior.noise_std**2 * inflation)
@@ -232,6 +234,22 @@ class WindowFit:
         tight = triangle.without(where)
         offset += tight.log_precision(where, base - 1) - leaky.log_precision(where + 1, base)
         return mixture(with_zero(of(tight, base - 1), where), other, offset)
+
+    def _with_other_labels(self, posterior: Posterior, inflation: float) -> Posterior:
+        """The same with a gap, and all that goes with it, no better known than over all labels."""
+        where, noise_var = self.layout.theta, posterior.noise_std**2 * inflation
+        m, product_r, product_l = posterior.mean[where].tolist()
+        if self.gap_spread == 0.0 or not m > 0.0 or noise_var == 0.0:
+            return posterior
+        gradient = np.array([(product_l - product_r) / m, 1.0, -1.0]) / m
+        by = posterior.cov[:, where] @ gradient
+        var = float(gradient @ by[where])
+        wanted = self.gap_spread**2 / noise_var
+        if not 0.0 < var < wanted:
+            return posterior
+        return replace(
+            posterior, cov=posterior.cov + (wanted - var) / var**2 * np.outer(by, by)
+        )
 
     def _theta_now(self) -> Array:
         """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""

@@ -232,5 +232,5 @@ class Learning:
         self.around = self.around._replace(prior=current.solution.of_theta)
         fit = current.fit.restarted(self.around, start)
         self.current = Fitted(fit, fit.solve())
-        self.refit_at = GROWTH * BLOCK[1]
+        self.refit_at = FIRST_SEARCH
         self.contradicted_from = None

@@ -22,6 +22,7 @@ from backlash_ros.core.estimation.fit.relabelling import (
     fitted_with_model,
     most_likely,
     searched,
+    with_other_gaps,
     with_walk,
 )
 from backlash_ros.core.estimation.fit.solution import Around
@@ -43,8 +44,14 @@ def take_block(learning: Learning) -> Task:
     number = record.first + fit.length
     v, y = record.since(number)
     v, y = v[:AT_ONCE * BLOCK[1]], y[:AT_ONCE * BLOCK[1]]
+    doubted = record.doubted(number, len(y))
     rows = fit.columns(v, y)
-    squares, outliers = fit.contradiction(rows, y, solution)
+    squares, outliers = fit.contradiction(rows, np.where(np.isnan(y), doubted, y), solution)
+    # The fit knows how little it knows; who follows the state from sample to sample does not.
+    explained = np.isfinite(doubted) & ~outliers
+    y[explained] = doubted[explained]
+    record.restore((number + np.flatnonzero(explained)).tolist())
+    outliers &= np.isfinite(y)
     valid = np.isfinite(y)
     if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
         valid &= ~outliers
@@ -78,8 +85,12 @@ def refit(learning: Learning) -> Task:
     if len(v) <= SEARCHED and around.prior is None:
         # The gap of a short record may be one of several.
         other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
-        if other is not None and learning.usable(other) is not None:
-            result = most_likely([result, other])
+        if other is not None:
+            result = result.with_gap_spread(other.fit.gap_spread)
+            if learning.usable(other) is not None:
+                result = most_likely([result, other])
+    elif len(v) <= SEARCHED and around.prior is not None:
+        result = yield from with_other_gaps(v, y, result, around.prior, learning.pace)
     return learning.go_on_from(result, first)
 
 

@@ -54,7 +54,7 @@ class StateFollowing:
         self._attribution: Attribution | None = None  # of this observer
         self._p = self._v = nan
         self._exact = False  # whether the fit speaks of `model`
-        self._refused: dict[int, float] = {}  # y of the newest samples, one after the other
+        self._refused: list[int] = []  # numbers of the newest samples, one after the other
 
     @property
     def begun(self) -> bool:
@@ -147,7 +147,8 @@ class StateFollowing:
     def _refuses(self, y: float, record: Record) -> bool:
         """Whether a y that is far from what was expected is an outlier."""
         if len(self._refused) < OUTLIERS:
-            self._refused[record.end] = y
+            self._refused.append(record.end)
+            record.doubt(record.end, y)
             self.outliers += 1
             return True
         # So many in a row were none: they are what the fit has to explain.
