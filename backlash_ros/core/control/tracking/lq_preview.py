@@ -1,9 +1,11 @@
 """LQ tracking of a reference that is known for some samples ahead.
 
-Minimises sum (y - r)^2 + w_i q^2 + rho u^2 with the integral q(k+1) = q(k) + r(k) - y(k):
+Minimises sum (y - r)^2 + w_i q^2 + rho (u - u_r)^2 with the integral q(k+1) = q(k) + r(k) - y(k):
 
     u(k) = -K z(k) - sum_{j=0..N} f_j r(k+j),   z = [x; q]
 
+u_r is what holds y at r: r / G(1), as much earlier as G delays slow motion. With it y comes to
+rest at r exactly; a weight of u itself would leave y short of it. Where G integrates, u_r = 0.
 r is taken to stay at its last known value beyond the window.
 
 Reference: M. Tomizuka, Optimal continuous finite preview problem, IEEE Trans. Automatic Control
@@ -20,8 +22,11 @@ from scipy import linalg
 
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
+
+ROUNDING = 1e-9  # of G at z = 1, relative to the coefficients: less is a pole or zero there
 
 
 @dataclass(frozen=True)
@@ -64,16 +69,44 @@ def preview_gains(
     share = b[:, 0] / (1.0 + float(b[:, 0] @ p @ b[:, 0]))  # (R + B'PB)^-1 B'
     gain = share @ p @ a
     closed = a - b @ gain[None, :]
-    # Backward recursion of the affine term s: u = -K z - share' (P e r(k) + s(k+1)).
-    per_sample = closed.T @ (p @ e) - c
-    preview = np.empty(window + 1)
-    preview[0] = share @ p @ e
-    row = per_sample
+    preview = _preview(share, closed, p @ e, c, window) * unit
+    # u = u_r + u': what is weighed is u', and u_r drives G besides.
+    by_u_r = _preview(share, closed, p @ b[:, 0], np.zeros(size), window)
+    by_u_r[0] -= 1.0
+    by_u_r = np.convolve(by_u_r, _holding(model.transfer_function, window))
+    preview += by_u_r[:window + 1]
+    preview[window] += by_u_r[window + 1:].sum()
+    return PreviewGains(
+        gain[:n] * unit, float(gain[n] * unit) if integrates else 0.0, preview
+    )
+
+
+def _preview(share: Array, closed: Array, first: Array, c: Array, window: int) -> Array:
+    """Gains f_0 .. f_N of a signal w in z(k+1) = A z + B u + e w, from P e = first, and y - w.
+
+    The backward recursion of the affine term s: u = -K z - share' (P e w(k) + s(k+1)).
+    """
+    gains = np.empty(window + 1)
+    gains[0] = share @ first
+    row = closed.T @ first - c
     for j in range(1, window + 1):
-        preview[j] = share @ row
+        gains[j] = share @ row
         row = closed.T @ row
     # Held beyond the window: the geometric rest of the sum belongs to the last known value.
-    preview[window] += share @ linalg.solve(np.eye(size) - closed.T, row)
-    return PreviewGains(
-        gain[:n] * unit, float(gain[n] * unit) if integrates else 0.0, preview * unit
-    )
+    gains[window] += share @ linalg.solve(np.eye(len(c)) - closed.T, row)
+    return gains
+
+
+def _holding(model: TransferFunction, window: int) -> Array:
+    """h with u_r(k) = sum_j h_j r(k+j), shape (N + 1,)."""
+    taps = np.zeros(window + 1)
+    b, a = model.numerator, model.denominator
+    b_1, a_1 = float(b.sum()), float(a.sum())
+    if abs(b_1) <= ROUNDING * np.abs(b).sum() or abs(a_1) <= ROUNDING * np.abs(a).sum():
+        return taps  # nothing holds y, or u = 0 does
+    delay = float(np.polyval(np.polyder(a), 1.0) / a_1 - np.polyval(np.polyder(b), 1.0) / b_1)
+    whole, part = divmod(min(max(delay, 0.0), float(window)), 1.0)
+    first = int(whole)
+    taps[first] = 1.0 - part
+    taps[min(first + 1, window)] += part
+    return taps * (a_1 / b_1)
