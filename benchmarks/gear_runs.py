@@ -20,6 +20,7 @@ from gear_physics import PRESETS, Gear, GearPhysics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import (
     Identification,
     Options,
@@ -181,6 +182,8 @@ def identified(
     results = []
     for option, choice in ATTEMPTS.items():
         found = identify(motor if encoder else v, y, gear.sample_period, choice)
+        if encoder:
+            found = with_actuator(found, v)
         try:
             results.append(Identified(found, option, identified_parameters(found, given)))
         except ParameterError as error:

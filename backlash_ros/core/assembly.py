@@ -14,6 +14,7 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.last_command import check_last_commands
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.control.structure import Structure
 from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.control.tracking.tracking import Tracking
@@ -31,6 +32,7 @@ from backlash_ros.core.plant.model_check import check_model, model_warnings
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.scenario import (
+    build_actuator,
     build_model,
     build_plant,
     build_reference,
@@ -80,7 +82,24 @@ def build_controller(p: Parameters, inherited: Estimate | None = None) -> Adapti
     learner = None
     if isinstance(estimator, MovingHorizon) and p.get_bool('plant.adapt'):
         learner = estimator
-    return AdaptiveController(estimator, build_structure(p), inverse, build_limits(p), learner)
+    return AdaptiveController(
+        estimator, build_structure(p), inverse, build_limits(p), learner, _serial(p)
+    )
+
+
+def _serial(p: Parameters) -> SerialPlant | None:
+    actuator = build_actuator(p)
+    if actuator is None:
+        return None
+    return SerialPlant(actuator, build_state_model(p), p.get_float('estimator.output_noise_std'))
+
+
+def _commanded_model(p: Parameters) -> StateModel:
+    """What y does of the command: G, or L G where there is an actuator in front."""
+    model, actuator = build_model(p), build_actuator(p)
+    if actuator is not None:
+        model = actuator.in_front_of(model)
+    return _state_model(tuple(model.numerator), tuple(model.denominator))
 
 
 def build_structure(p: Parameters) -> Structure:
@@ -209,7 +228,8 @@ def _pole_placement(p: Parameters) -> Structure:
 
 def build_four_blocks(p: Parameters) -> FourBlocks:
     """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
-    model, state = build_model(p), build_state_model(p)
+    state = _commanded_model(p)
+    model = state.transfer_function
     weight = p.get_float('tracking.input_weight') * power_gain(model, np.pi / 10.0)
     gains = lq_gains(state, weight)
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
@@ -222,7 +242,7 @@ def _tracking(p: Parameters) -> Structure:
         p.get_int('tracking.preview'),
     )
     return Tracking(
-        design(build_state_model(p), weights), weights, p.get_float('inverse.caution'),
+        design(_commanded_model(p), weights), weights, p.get_float('inverse.caution'),
         p.get_float('estimator.output_noise_std'),
     )
 

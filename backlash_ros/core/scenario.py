@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.simulated_plant import Imperfections, SimulatedPlant
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -21,6 +22,17 @@ def build_model(p: Parameters) -> TransferFunction:
     delay = (0.0,) * p.get_int('control.delay_samples')
     return TransferFunction(
         p.get_floats('plant.numerator'), p.get_floats('plant.denominator') + delay
+    )
+
+
+def build_actuator(p: Parameters) -> Actuator | None:
+    """What lies between control and applied_control; None where nothing does."""
+    numerator = p.get_floats('actuator.numerator')
+    denominator = p.get_floats('actuator.denominator')
+    if not (numerator or denominator):
+        return None
+    return Actuator(
+        TransferFunction(numerator, denominator, 'actuator'), p.get_pair('actuator.wind_up')
     )
 
 
@@ -62,7 +74,8 @@ def build_plant(p: Parameters) -> SimulatedPlant:
     )
     rng = np.random.default_rng(p.get_int('seed'))
     return SimulatedPlant(
-        build_true_model(p), backlash, p.get_float('sample_period'), rng, imperfections
+        build_true_model(p), backlash, p.get_float('sample_period'), rng, imperfections,
+        build_actuator(p),
     )
 
 

@@ -175,7 +175,7 @@ class PlantNode(ProcessNode):
         u = self._plant.step(v)
         truth = self._plant.backlash
         self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        self._applied_message.data = v
+        self._applied_message.data = self._plant.applied
         self._applied.publish(self._applied_message)
 
     def _publish_output(self) -> bool:

@@ -9,8 +9,9 @@ from math import inf, isnan
 from typing import NamedTuple, Protocol
 
 from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.control.structure import Adoption, ControlInput, Structure
-from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval
+from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval, StateSource
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -90,67 +91,81 @@ class AdaptiveController:
 
     compensating: False inverts the slope alone, as if there were no gap.
     learner: who proposes better models of G, for the structure to be redesigned; None where
-    that of the beginning is kept.
+    that of the beginning is kept. serial: the motor and G as the structure sees them; None where
+    v is what it commands.
     """
 
     def __init__(
         self, estimator: Estimator, structure: Structure, inverse: BacklashInverse,
-        limits: Limits, learner: ModelLearner | None = None,
+        limits: Limits, learner: ModelLearner | None = None, serial: SerialPlant | None = None,
     ) -> None:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
         self.compensating = True
         self.lost_samples = 0
         self.adopted: StateModel | None = None  # the learned model of G that is in use
-        self._learner = learner
+        self._learner, self._serial = learner, serial
         self._considered: StateModel | None = None  # the proposal that was designed for last
+        self._designed: StateModel | None = None  # that, with the motor in front
         self._design: Iterator[Adoption | None] = iter(())
         self._adoption: Adoption | None = None  # of the finished design, until it may take over
         self._waited = 0  # samples for which it could not
         self._interval: Interval | None = None
         # The measurement that is still to be learned from: y(k), the interval before it, samples
-        # lost before it and what was applied.
+        # lost before it, what was applied and what was commanded.
         self._pending: (
-            tuple[float, Interval, int, Sequence[float], Sequence[float]] | None
+            tuple[float, Interval, int, Sequence[float], Sequence[float], Sequence[float]] | None
         ) = None
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
-        alternatives: Sequence[float] = (),
+        alternatives: Sequence[float] = (), commands: Sequence[float] = (),
     ) -> ControlStep:
         """Return the command for sample k.
 
         y, y_m: output and reference, finite. lost: samples that never arrived since the last
         call; the plant went on with the last v through all of them. applied: the v that was
-        really applied in each of the lost + 1 intervals since then, if it is known. alternatives:
-        what may have been applied in each of them, nan where none may.
+        really applied in each of the lost + 1 intervals since then, if it is known. commands: those
+        that acted in them, if it is not the last one. alternatives: commands that may have acted
+        instead, nan where none may.
         """
         if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST):
             raise ValueError(f'y={y!r} and y_m={y_m!r} must be finite and no larger than '
                              f'{LARGEST:g}')
         if lost < 0:
             raise ValueError(f'lost={lost!r} must be >= 0')
-        if applied or alternatives:
-            _check_intervals(lost + 1, applied, alternatives)
+        if applied or alternatives or commands:
+            _check_intervals(lost + 1, applied, alternatives, commands)
         if self._pending is not None:
             self._learn()
         if self._interval is not None:
-            self._pending = y, self._interval, lost, applied, alternatives
+            self._pending = y, self._interval, lost, applied, alternatives, commands
             if self.structure.needs_output:
                 self._learn()
         estimator, inverse = self.estimator, self.inverse
         used = estimate = estimator.estimate
         if not self.compensating:
             used = replace(estimate, c_r=0.0, c_l=0.0)
+        elif self._serial is not None:
+            used = self._serial.for_command(estimate)
         v_before = inverse.v
-        u_d, v, f = self.structure.control(ControlInput(y_m, y, used, estimator), inverse)
+        u_d, v, f = self.structure.control(ControlInput(y_m, y, used, self._source), inverse)
         v = self.limits.apply(v, v_before)
         inverse.applied(v)
         self._interval = Interval(v, y_m, u_d, f)
         return ControlStep(y_m, y, u_d, v, estimate)
 
+    @property
+    def _source(self) -> StateSource:
+        """Who knows the state of what the structure commands."""
+        return self.estimator if self._serial is None else self._serial
+
+    def command_of(self, v: float) -> float:
+        """The command at which the motor rests at a v that was reported."""
+        return v if self._serial is None else self._serial.command_of(v)
+
     def start_from(self, v: float) -> None:
-        """Say which v acts now, so that the first command goes on from there."""
+        """Say which command acts now, so that the first one goes on from there."""
         self.inverse.start_from(v)
 
     def go_on_from(self, before: AdaptiveController) -> None:
@@ -163,6 +178,8 @@ class AdaptiveController:
         if self._learner is not None and before.adopted is not None:
             self._learner.adopt(before.adopted)
             self.adopted = before.adopted
+            if self._serial is not None:
+                self._serial.adopt(self._serial.before(before.adopted))
         self.structure.go_on_from(before.structure, state_known=False)
 
     def refine(self, budget_s: float = inf) -> None:
@@ -188,7 +205,11 @@ class AdaptiveController:
             else:
                 proposal = learner.proposal
                 if proposal is not None and proposal is not self._considered:
-                    self._considered, self._design = proposal, self.structure.design(proposal)
+                    self._considered = proposal
+                    self._designed = (
+                        proposal if self._serial is None else self._serial.before(proposal)
+                    )
+                    self._design = self.structure.design(self._designed)
                     self._adoption, self._waited = None, 0
                     continue
                 if self._adoption is None:
@@ -199,28 +220,46 @@ class AdaptiveController:
                     assert self._considered is not None
                     learner.adopt(self._considered)
                     self.adopted = self._considered
-                    self._adoption(self.estimator)
+                    if self._serial is not None:
+                        assert self._designed is not None
+                        self._serial.adopt(self._designed)
+                    self._adoption(self._source)
                     self._adoption = None
                 return
 
     def _learn(self) -> None:
         pending, self._pending = self._pending, None
         assert pending is not None
-        y, interval, lost, applied, alternatives = pending
-        v, y_m, u_d, f, other = interval
+        y, interval, lost, applied, alternatives, commands = pending
+        command, y_m, u_d, f, other = interval
+        serial, estimator = self._serial, self.estimator
         for i in range(lost + 1):
+            measured = y if i == lost else None
+            if commands:
+                command = commands[i]
+            # Where nothing is reported the motor is where the command takes it.
+            v = command if serial is None else serial.position(command)
             if applied:
                 v = applied[i]
-            if alternatives:
+            elif alternatives and serial is None:
                 other = alternatives[i]
-            self.estimator.update(y if i == lost else None, Interval(v, y_m, u_d, f, other))
+            if serial is not None:
+                serial.update(measured, command, v, estimator.estimate)
+            estimator.update(measured, Interval(v, y_m, u_d, f, other))
         self.lost_samples += lost
 
 
-def _check_intervals(count: int, applied: Sequence[float], alternatives: Sequence[float]) -> None:
-    for values in (applied, alternatives):
+def _check_intervals(
+    count: int, applied: Sequence[float], alternatives: Sequence[float], commands: Sequence[float],
+) -> None:
+    for values in (applied, alternatives, commands):
         if values and len(values) != count:
-            raise ValueError(f'applied and alternatives must have lost + 1 = {count!r} values each')
-    for v in applied:
+            raise ValueError(
+                f'applied, alternatives and commands must have lost + 1 = {count!r} values each'
+            )
+    for v in (*applied, *commands):
         if not -LARGEST <= v <= LARGEST:
-            raise ValueError(f'applied={applied!r} must be finite and no larger than {LARGEST:g}')
+            raise ValueError(
+                f'applied={applied!r} and commands={commands!r} must be finite and no larger than '
+                f'{LARGEST:g}'
+            )

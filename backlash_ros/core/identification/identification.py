@@ -41,6 +41,7 @@ from backlash_ros.core.identification.output_error import (
 )
 from backlash_ros.core.identification.separable_search import Profile, profile, search
 from backlash_ros.core.identification.uncertainty import Covariance
+from backlash_ros.core.plant.actuator import Actuator
 
 Array = NDArray[np.float64]
 T = TypeVar('T')
@@ -103,7 +104,8 @@ class Identification:
     residuals beyond chance. ljung_box: probability of a white residual. response_std: relative
     deviation of G at `frequencies` [rad/sample], between which y moves. uncertainty: of G, as the
     parameter plant.uncertainty. outliers: samples of y that were left out. reasons: why it is of no
-    use, remarks: what to know, a sentence each. details: None where nothing was fitted.
+    use, remarks: what to know, a sentence each. details: None where nothing was fitted. actuator:
+    between the command and v; None where nothing is, or it is not known.
     """
 
     sample_period: float
@@ -130,6 +132,7 @@ class Identification:
     reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     details: Details | None = None
+    actuator: Actuator | None = None
 
     @property
     def usable(self) -> bool:

@@ -130,7 +130,7 @@ class ControlLoop:
         # A report is about the interval before it, which a command that was heard in it outdates.
         period_ns = self._p.get_float('sample_period') * 1e9
         if isfinite(reported) and stamp_ns > self._other_ns + period_ns:
-            self._go_on_from(reported)
+            self._go_on_from(self.core.command_of(reported))
         return self.knows_v
 
     def answer(self, output: Output) -> ControlStep | None:
@@ -274,7 +274,6 @@ class ControlLoop:
         # Late commands are counted even where the driver says which ones it applied.
         supposed = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
         reported = commands.reported_over(lost + 1, stamp_ns, unsent)
-        return core.step(y, y_m, lost, reported) if reported else core.step(
-            y, y_m, lost, *supposed
-        )
+        acted, others = supposed
+        return core.step(y, y_m, lost, reported, others, acted)
 

@@ -57,6 +57,14 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('plant.uncertainty', 0.2,
               'relative spread of the time constants, damping and delay of G; 0: G is exact',
               low=0.0, high=1.0),
+    Parameter('actuator.numerator', (),
+              'numerator of L(z), from control to the motor encoder that applied_control reports; '
+              'empty: the command is what acts on the gap', used_by=BOTH, may_be_empty=True),
+    Parameter('actuator.denominator', (), 'denominator of L(z), descending powers of z',
+              used_by=BOTH, may_be_empty=True),
+    Parameter('actuator.wind_up', (0.0, 0.0),
+              'how much further than the motor the command has to go against the friction of the '
+              'load, on its right and on its left side', 'v', length=2, used_by=BOTH),
     Parameter('plant.adapt', True, 'redesign gains and preview for the G that was learned'),
     Parameter(
         'lockstep', False,
@@ -113,8 +121,8 @@ PARAMETERS: tuple[Parameter, ...] = (
               'tracking: samples of y_m looked at ahead; y follows y_m delayed by as many',
               'samples', low=0, high=10000),
     Parameter('tracking.input_weight', 1e-2,
-              'tracking, pole_placement: weight of u^2 in units of |G|^2 at a twentieth of the '
-              'sampling rate',
+              'tracking, pole_placement: weight of the square of u less what holds y at the '
+              'reference, in units of |G|^2 at a twentieth of the sampling rate',
               low=0.0, above=True, live=True),
     Parameter('tracking.integral_weight', 0.0,
               'tracking: weight of the squared integral of y_m - y; 0, for none, suffices where '

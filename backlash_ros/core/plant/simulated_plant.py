@@ -8,6 +8,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import Backlash, check_backlash
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
@@ -38,13 +39,16 @@ class SimulatedPlant:
 
     d is constant, w a random walk, w(k+1) = w(k) + walk_std sqrt(T) N(0, 1), w(0) = 0.
     backlash: its u is the held output at the start. rng: source of the noise and of the walk.
+    actuator: what makes v of the command, None where they are one. applied: the newest v.
     """
 
     def __init__(
         self, model: TransferFunction, backlash: Backlash, sample_period: float,
         rng: np.random.Generator, imperfections: Imperfections | None = None,
+        actuator: Actuator | None = None,
     ) -> None:
-        self.backlash = backlash
+        self.backlash, self.applied = backlash, 0.0
+        self._motor = None if actuator is None else Motor(actuator)
         self.sample = 0
         self._initial = (backlash.m, backlash.c_r, backlash.c_l)
         self._a, self._b, _ = model.state_space()
@@ -63,6 +67,7 @@ class SimulatedPlant:
         self.sample, self._x, self._rng = other.sample, other._x, other._rng
         self._walk, self._walk_rng = other._walk, other._walk_rng
         self.backlash.u, self.backlash.region = other.backlash.u, other.backlash.region
+        self._motor, self.applied = other._motor, other.applied
 
     def measure(self) -> float:
         """y(k) as the sensor shows it; call it once per sample."""
@@ -74,9 +79,12 @@ class SimulatedPlant:
         return y
 
     def step(self, v: float) -> float:
-        """Apply v over one sample period and return u = B[v], without the disturbances."""
+        """Apply a command over one sample period and return u = B[v], without the disturbances."""
         if self._wears:
             self._wear()
+        if self._motor is not None:
+            v = self._motor.step(v, self.backlash.region)
+        self.applied = v
         u = self.backlash.step(v)
         disturbance = self._extra.input_disturbance
         if self._walk_step > 0.0:

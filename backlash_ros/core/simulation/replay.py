@@ -71,13 +71,14 @@ def replay(
             controller.go_on_from(before)
             missing = 0
         applied: list[float] = []
+        commands: list[float] = []
         if k and v_made != v_before:
-            applied = [v_before] * (missing + 1)
+            commands = [v_before] * (missing + 1)
             controller.start_from(v_before)
         complete = bool(reports) and len(reports[k]) == missing + 1
         if k and trust.note(complete) and complete:
             applied = list(reports[k])
-        step = controller.step(y, y_m, missing, applied)
+        step = controller.step(y, y_m, missing, applied, commands=commands)
         controller.refine()
         estimator, e = controller.estimator, step.estimate
         rows[k, :len(COLUMNS)] = (

@@ -72,8 +72,9 @@ def identified_parameters(
         'output_quantum': float(f'{found.quantum:.6g}'),
         'output_noise_std': 0.0 if found.quantum else float(f'{found.noise_std:.3g}'),
     })
+    values.update(_actuator(found))
     for name, value in {
-        **_reference(found, given), **_limits(found), **_weights(found),
+        **_reference(found, given), **_limits(found), **_weights(found), **_reports(found),
     }.items():
         values.setdefault(name, value)
     if estimates is not None:
@@ -104,6 +105,24 @@ def _with_structure(values: dict[str, Any]) -> Parameters:
     return parameters
 
 
+def _actuator(found: Identification) -> dict[str, Value]:
+    """L(z) and the wind-up, none where v is the command: whatever the file had is outdated."""
+    if found.actuator is None:
+        return {'actuator.numerator': (), 'actuator.denominator': (),
+                'actuator.wind_up': (0.0, 0.0)}
+    lag, (right, left) = found.actuator.lag, found.actuator.wind_up
+    return {
+        'actuator.numerator': tuple(_significant(tuple(lag.numerator.tolist()))),
+        'actuator.denominator': tuple(_significant(tuple(lag.denominator.tolist()))),
+        'actuator.wind_up': (float(f'{right:.6g}'), float(f'{left:.6g}')),
+    }
+
+
+def _reports(found: Identification) -> dict[str, Value]:
+    """G begins behind what is reported."""
+    return {} if found.actuator is None else {'estimator.use_applied_control': 'true'}
+
+
 def _reference(found: Identification, given: Mapping[str, Value]) -> dict[str, Value]:
     """A reference that the actuator can follow, unless one is given."""
     if {'waveform', 'amplitude', 'frequency', 'bias', 'file'} & set(given):
@@ -127,6 +146,8 @@ def _weights(found: Identification) -> dict[str, Value]:
     fit = found.details.fit
     w = np.linspace(found.frequencies[0], USUAL_FREQUENCY, 200)
     gain = np.abs(response(fit, w))
+    if found.actuator is not None:
+        gain = gain * np.abs(found.actuator.lag.response(np.exp(1j * w)))
     limit = known_up_to(fit, found.details.covariance)
     beyond = np.flatnonzero((w > limit) | (gain < LITTLE * gain[0]))
     if not len(beyond):
@@ -171,6 +192,11 @@ def numbers(found: Identification) -> dict[str, Any]:
         'held_out': None if found.details is None else {
             'rms': found.details.held_out.rms,
             'rms_of_fit': found.details.held_out.trained,
+        },
+        'actuator': None if found.actuator is None else {
+            'numerator': found.actuator.lag.numerator.tolist(),
+            'denominator': found.actuator.lag.denominator.tolist(),
+            'wind_up': list(found.actuator.wind_up),
         },
         'residual': {'lag_one_correlation': found.correlation, 'ljung_box_p': found.ljung_box},
         'samples': len(found.y), 'lost_samples': int(np.isnan(found.y).sum()),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values
 
 COLUMNS = ('t', 'v', 'y')
+COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
 OFF_GRID = 0.25  # of a period that a row of a CSV may miss its time
 # Of a sample period: a stamp that is later is that of the next sample, and the clock of the driver
 # is slower by this per sample at most.
@@ -38,7 +39,7 @@ LONGEST = 1_000_000  # samples, lost ones included: more is a t that jumps
 class MeasuredRecord:
     """v (N,) from sample k to k+1 and y (N,) at k, nan where lost. source: where they are from.
 
-    notes: what else to know, a sentence each.
+    notes: what else to know, a sentence each. commands: that led to v (N,), None where v is them.
     """
 
     v: Array
@@ -46,6 +47,7 @@ class MeasuredRecord:
     sample_period: float
     source: str
     notes: tuple[str, ...] = ()
+    commands: Array | None = None
 
     @property
     def lost(self) -> int:
@@ -98,7 +100,8 @@ def _from_csv(path: Path, sample_period: float | None) -> MeasuredRecord:
     for name in COLUMNS:
         if header.count(name) > 1:
             raise InputError(f'{path}: line 1: {name} stands there twice: leave one of them')
-    places = [header.index(name) for name in COLUMNS]
+    names = (*COLUMNS, COMMAND) if COMMAND in header else COLUMNS
+    places = [header.index(name) for name in names]
     values: list[list[float]] = []
     for number, row in enumerate(rows[1:], start=2):
         if not row:
@@ -117,12 +120,14 @@ def _from_csv(path: Path, sample_period: float | None) -> MeasuredRecord:
             raise InputError(f'{path}: line {number}: t must rise from row to row')
     if len(values) < 2:
         raise InputError(f'{path}: holds {len(values)} sample, which is no motion')
-    t, v, y = np.array(values).T
+    t, v, y, *commands = np.array(values).T
     period = float(np.median(np.diff(t))) if sample_period is None else sample_period
-    return _on_grid(path, t, v, y, period)
+    return _on_grid(path, t, v, y, period, *commands)
 
 
-def _on_grid(path: Path, t: Array, v: Array, y: Array, period: float) -> MeasuredRecord:
+def _on_grid(
+    path: Path, t: Array, v: Array, y: Array, period: float, commands: Array | None = None,
+) -> MeasuredRecord:
     """Rows by time, those between them being lost."""
     place = (t - t[0]) / period
     index = np.round(place)
@@ -138,13 +143,20 @@ def _on_grid(path: Path, t: Array, v: Array, y: Array, period: float) -> Measure
     count = int(whole[-1]) + 1
     full_v, full_y = np.full(count, nan), np.full(count, nan)
     full_v[whole], full_y[whole] = v, y
-    return _usable(path, full_v, full_y, period)
+    full_commands = None
+    if commands is not None:
+        full_commands = np.full(count, nan)
+        full_commands[whole] = commands
+    return _usable(path, full_v, full_y, period, full_commands)
 
 
 def _usable(
-    path: Path, v: Array, y: Array, period: float, notes: Sequence[str] = (),
+    path: Path, v: Array, y: Array, period: float, commands: Array | None = None,
 ) -> MeasuredRecord:
-    """From the first known v on; a v that is not known is the one before it."""
+    """From the first known v on; a v that is not known is the one before it.
+
+    Commands are left out unless all of them are known from there on.
+    """
     for name, values in (('v', v), ('y', y)):
         if np.isinf(values).any():
             raise InputError(f'{path}: {name} holds what is not finite')
@@ -157,12 +169,20 @@ def _usable(
                 f'{path}: {name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
                 f'{1.0 / LARGEST:g} to {LARGEST:g}: choose another unit, drop what is no reading'
             )
-    known = np.isfinite(v)
-    first = int(np.argmax(known))
-    newest = np.maximum.accumulate(np.where(known, np.arange(len(v)), 0))
+    first = int(np.argmax(np.isfinite(v)))
+    if commands is not None:
+        commands = _held(commands)[first:]
+        if not np.isfinite(commands).all() or np.abs(commands).max() > LARGEST:
+            commands = None
     return MeasuredRecord(
-        v[newest][first:], y[first:], float(f'{period:.9g}'), str(path), tuple(notes)
+        _held(v)[first:], y[first:], float(f'{period:.9g}'), str(path), commands=commands
     )
+
+
+def _held(values: Array) -> Array:
+    """With the one before it for each that is not known."""
+    newest = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
+    return np.asarray(values[newest])
 
 
 def _cut(record: MeasuredRecord, span: Span) -> MeasuredRecord:
@@ -174,7 +194,8 @@ def _cut(record: MeasuredRecord, span: Span) -> MeasuredRecord:
     kept = (t >= span.from_s - slack) & (t < span.to_s - slack)
     if not kept.any():
         raise InputError(f'{record.source}: there is no sample between --from and --to')
-    return replace(record, v=record.v[kept], y=record.y[kept])
+    commands = None if record.commands is None else record.commands[kept]
+    return replace(record, v=record.v[kept], y=record.y[kept], commands=commands)
 
 
 def _from_bag(path: Path, sample_period: float | None, axis: str) -> MeasuredRecord:
@@ -241,7 +262,10 @@ def from_messages(
     y = np.full(count, nan)
     y[index] = output[1]
     v = v_of_intervals(index, output[0], *commands, reported)
-    return _usable(path, v, y, period)
+    sent = heard.get(topics.CONTROL) if reported else None
+    if sent is None or not len(sent[0]):
+        return _usable(path, v, y, period)
+    return _usable(path, v, y, period, v_of_intervals(index, output[0], *sent, False))
 
 
 def _numbered(times: Array) -> NDArray[np.int64]:

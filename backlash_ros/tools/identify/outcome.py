@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimation.storage import save_estimate
+from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import (
     Identification,
     Options,
@@ -29,7 +30,7 @@ from backlash_ros.tools.identify.identified_file import (
     identified_parameters,
     numbers,
 )
-from backlash_ros.tools.identify.measured_record import MeasuredRecord
+from backlash_ros.tools.identify.measured_record import COLUMNS, COMMAND, MeasuredRecord
 from backlash_ros.tools.identify.names import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
 from backlash_ros.tools.identify.page import render
 from backlash_ros.tools.identify.pictures import draw
@@ -53,7 +54,8 @@ def identified(record: MeasuredRecord, options: argparse.Namespace) -> Identific
                 bar.set_description_str(next(work))
             except StopIteration as done:
                 found: Identification = done.value
-                return found
+                commands = record.commands
+                return found if commands is None else with_actuator(found, commands)
             except np.linalg.LinAlgError as error:
                 raise BrokenOffError(f'the record cannot be fitted: {error}') from error
 
@@ -86,12 +88,13 @@ def write_outcome(
 
 
 def write_record(record: MeasuredRecord, path: Path) -> None:
-    """Write t, v, y as a CSV that `identify` reads."""
+    """Write t, v, y, and the commands where they are others, as a CSV that `identify` reads."""
+    columns = [record.v, record.y, *([] if record.commands is None else [record.commands])]
     rows = [
-        (k * record.sample_period, v, y)
-        for k, (v, y) in enumerate(zip(record.v.tolist(), record.y.tolist(), strict=True))
+        (k * record.sample_period, *values)
+        for k, values in enumerate(np.column_stack(columns).tolist())
     ]
-    write_table(path, ('t', 'v', 'y'), rows)
+    write_table(path, (*COLUMNS, COMMAND)[:len(columns) + 1], rows)
 
 
 def _tell(found: Identification, record: MeasuredRecord, out: Path) -> None:
@@ -107,6 +110,11 @@ def _tell(found: Identification, record: MeasuredRecord, out: Path) -> None:
                  if len(found.delays) > 1 else '')
               + f', known to {found.response_std.max():.2g} of itself; noise of y '
               + f'{found.noise_std:.3g}')
+    if found.actuator is not None:
+        actuator = found.actuator
+        print(f'L(z), from control to applied_control: {actuator.lag.order} poles, gain '
+              f'{actuator.gain:.6g}; wind-up {actuator.wind_up[0]:.4g} on the right, '
+              f'{actuator.wind_up[1]:.4g} on the left')
     for text in found.remarks:
         print(f'note: {text}')
     for text in found.reasons:

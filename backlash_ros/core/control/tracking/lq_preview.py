@@ -73,9 +73,9 @@ def preview_gains(
     # u = u_r + u': what is weighed is u', and u_r drives G besides.
     by_u_r = _preview(share, closed, p @ b[:, 0], np.zeros(size), window)
     by_u_r[0] -= 1.0
-    by_u_r = np.convolve(by_u_r, _holding(model.transfer_function, window))
-    preview += by_u_r[:window + 1]
-    preview[window] += by_u_r[window + 1:].sum()
+    of_each = np.convolve(by_u_r, _holding(model.transfer_function, window))
+    preview += of_each[:window + 1]
+    preview[window] += of_each[window + 1:].sum()
     return PreviewGains(
         gain[:n] * unit, float(gain[n] * unit) if integrates else 0.0, preview
     )

@@ -1,0 +1,93 @@
+"""What a position loop in front of the backlash makes of the command.
+
+    v(k+1) = L(z) (command(k) - p),    p = right, -left while the load is pushed on that side
+
+v is where the motor is, as its encoder reports it at the end of an interval. p is the wind-up: dry
+friction of the load holds the motor back as long as it pushes, and not within the gap.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """lag: L(z). wind_up: (right, left), by which the command has to go further [unit of v].
+
+    Raises ParameterError for an L that is not stable or has no gain at rest.
+    """
+
+    lag: TransferFunction
+    wind_up: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        poles = self.lag.poles
+        if np.abs(poles).max() >= 1.0:
+            raise ParameterError(
+                'actuator.denominator', self.lag.denominator.tolist(),
+                f'has the pole {poles[np.abs(poles).argmax()]:.6g}, must have all within the unit '
+                'circle', 'the motor comes to rest where the command says',
+            )
+        if not self.gain > 0.0:
+            raise ParameterError(
+                'actuator.numerator', self.lag.numerator.tolist(),
+                f'has the gain {self.gain:.3g} at rest, must be > 0',
+            )
+
+    @property
+    def gain(self) -> float:
+        """L(1)."""
+        return float(self.lag.numerator.sum() / self.lag.denominator.sum())
+
+    def push(self, side: Region) -> float:
+        """p on a side."""
+        right, left = self.wind_up
+        return right if side > 0 else -left if side < 0 else 0.5 * (right - left)
+
+    def crossings(self, c_r: float, c_l: float) -> tuple[float, float]:
+        """Crossings for the command, of those behind the motor."""
+        right, left = self.wind_up
+        return c_r / self.gain + right, c_l / self.gain - left
+
+    def in_front_of(self, model: TransferFunction) -> TransferFunction:
+        """L(z) G(z) from the command to y.
+
+        G is that of a v that acts from its sample on, where L tells of the v at the end: z L G.
+        """
+        numerator = np.convolve(np.trim_zeros(self.lag.numerator, 'f'), model.numerator)
+        denominator = np.convolve(self.lag.denominator, model.denominator)
+        if denominator[-1] == 0.0:
+            denominator = denominator[:-1]
+        else:
+            numerator = np.append(numerator, 0.0)
+        return TransferFunction(numerator.tolist(), denominator.tolist())
+
+
+class Motor:
+    """Where the motor is, by the command alone. It begins at rest where the first command says."""
+
+    def __init__(self, actuator: Actuator) -> None:
+        self._actuator = actuator
+        self._a, self._b, _ = actuator.lag.state_space()
+        self._x: Array = np.zeros(actuator.lag.order)
+        self._begun = False
+
+    def step(self, command: float, side: Region) -> float:
+        """Go on by one sample with the load on this side; return v at the end of it."""
+        reached = command - self._actuator.push(side)
+        if not self._begun:
+            self._begun = True
+            at_rest = np.linalg.solve(np.eye(len(self._x)) - self._a, self._b)
+            self._x = np.asarray(at_rest * reached)
+        self._x = self._a @ self._x + self._b * reached
+        return float(self._x[0])
