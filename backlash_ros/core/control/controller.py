@@ -238,7 +238,7 @@ class AdaptiveController:
             if commands:
                 command = commands[i]
             # Where nothing is reported the motor is where the command takes it.
-            v = command if serial is None else serial.position(command)
+            v = command if serial is None else serial.position(command, estimator.estimate)
             if applied:
                 v = applied[i]
             elif alternatives and serial is None:

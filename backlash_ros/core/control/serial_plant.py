@@ -1,9 +1,9 @@
 """A motor with its position loop, and the plant behind it, as one plant of the command.
 
 Where v is the position of a motor encoder, G begins behind the position loop. The estimator learns
-from that v; the structure however commands the motor, and y answers as L(z) G(z) does. Backlash
-and L change places in it, as each crossing of the gap takes far longer than L: the structure
-inverts the gap with the wind-up of the motor added.
+from that v; the structure however commands the motor, and y answers as L(z) G(z) does. The gap and
+L change places in it, as L takes less time than a motion does: the structure inverts the gap with
+the wind-up of the motor added.
 """
 
 from __future__ import annotations
@@ -15,16 +15,20 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
 from backlash_ros.core.estimation.constants import GATE, OUTLIERS
-from backlash_ros.core.estimation.observer.observer import INNOVATIONS, Observer
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimation.protocol import Estimate, Interval
 from backlash_ros.core.plant.actuator import Actuator, Motor
-from backlash_ros.core.plant.backlash import Region, clamp
+from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
-REMEMBERED = 200  # samples from which the state of another G is found
+# Share of the motion of u that may not be what the backlash says, before and after it was learned.
+DOUBT, LITTLE_DOUBT = 0.5, 0.1
+REMEMBERED = 60  # samples from which a new observer finds the state
+AVERAGED = 100  # innovations that say how large one may be
+KNOWN = Estimate(1.0, 0.0, 0.0, 0.0)  # for an observer that is told u: no backlash
 
 
 class SerialPlant:
@@ -35,8 +39,9 @@ class SerialPlant:
 
     def __init__(self, actuator: Actuator, model: StateModel, noise_std: float) -> None:
         self._actuator, self._noise_std = actuator, noise_std
-        self._motor, self._side = Motor(actuator), Region.GAP
+        self._motor = Motor(actuator)
         self._play = self._commanded = nan  # what the gap holds, in units of v and of the command
+        self._learned = False
         self._newest: deque[tuple[float, float | None]] = deque(maxlen=REMEMBERED)  # u and y
         self.adopt(self.before(model))
 
@@ -47,20 +52,22 @@ class SerialPlant:
     def adopt(self, model: StateModel) -> None:
         """Give x_hat for this L G from now on."""
         self.model = model
-        self._observer = Observer(model, self._noise_std)
-        self._samples = self._refused = 0
+        doubt = LITTLE_DOUBT if self._learned else DOUBT
+        self._observer = FixedBacklash(KNOWN, model, self._noise_std, doubt)
+        self._u = self._variance = 0.0
+        self._taken = self._refused = 0
         for u, y in self._newest:
             self._follow(y, u)
 
     @property
-    def x_hat(self) -> list[float]:
-        """State of L G in the coordinates of `model`, n values."""
-        return self._observer.state
+    def x_hat(self) -> Array:
+        """State of L G in the coordinates of `model`, shape (n,)."""
+        return self._observer.x_hat
 
     @property
     def x_cov(self) -> Array:
         """Covariance of x_hat, shape (n, n)."""
-        return self._observer.cov
+        return self._observer.x_cov
 
     def for_command(self, estimate: Estimate) -> Estimate:
         """The estimate with its crossings as the command meets them."""
@@ -71,44 +78,45 @@ class SerialPlant:
         """The command at which the motor rests at v."""
         return v / self._actuator.gain
 
-    def position(self, command: float) -> float:
+    def position(self, command: float, estimate: Estimate) -> float:
         """Where the motor is at the end of an interval by the command of it; once per interval."""
-        return self._motor.step(command, self._side)
+        c_r, c_l = estimate.c_r, estimate.c_l
+        play = self._play if self._play == self._play else command * self._actuator.gain + c_r
+        return self._motor.step(command, play - c_r, c_r, c_l)
 
     def update(self, y: float | None, command: float, v: float, estimate: Estimate) -> None:
         """Take in y(k), None if it was lost, and command and v of the interval before it."""
-        self._play = play = _played(self._play, v, estimate)
-        gap = estimate.c_r - estimate.c_l
-        self._side = (
-            Region.RIGHT if play == v else Region.LEFT if play == v + gap else Region.GAP
-        )
+        self._play = _played(self._play, v, estimate)
         # Nothing is known of the gap before it was learned.
         gapless = replace(estimate, c_r=0.0, c_l=0.0)
         seen = self.for_command(estimate if estimate.learned else gapless)
         self._commanded = _played(self._commanded, command, seen)
+        if estimate.learned is not self._learned:
+            self._learned = estimate.learned
+            self.adopt(self.model)
         u = seen.m * (self._commanded - seen.c_r)
         self._newest.append((u, y))
         self._follow(y, u)
 
     def _follow(self, y: float | None, u: float) -> None:
-        observer = self._observer
-        if not self._samples:
-            if y is not None:
-                observer.start(self.model.equilibrium * y, None)
-                self._samples = 1
-            return
-        expected = observer.predict(u)
-        self._samples += 1
-        if y is None:
-            return
-        innovation = y - expected
-        if innovation**2 > GATE**2 * observer.variance and self._refused < OUTLIERS:
-            self._refused += 1
-            return
-        self._refused = 0
-        observer.correct(innovation)
-        if self._samples % INNOVATIONS == 0:
-            observer.settle(self._noise_std)
+        observer, model = self._observer, self.model
+        disturbance = observer.u_hat - self._u
+        self._u = u
+        if y is not None and self._taken >= AVERAGED:
+            x = model.a @ observer.x_hat + model.b * (u + disturbance)
+            square = (y - model.c * float(x[0])) ** 2
+            least = self._noise_std**2
+            # So many outliers in a row are none.
+            if square > GATE**2 * max(self._variance, least) and self._refused < OUTLIERS:
+                self._refused += 1
+                y = None
+        observer.update(y, Interval(u, nan, nan, nan))
+        if y is not None:
+            self._refused = 0
+            self._taken += 1
+            self._variance += (
+                observer.innovation**2 - self._variance
+            ) / min(self._taken, AVERAGED)
 
 
 def _played(held: float, v: float, estimate: Estimate) -> float:

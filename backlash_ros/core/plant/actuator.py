@@ -1,9 +1,9 @@
 """What a position loop in front of the backlash makes of the command.
 
-    v(k+1) = L(z) (command(k) - p),    p = right, -left while the load is pushed on that side
+    q(k+1) = L(z) (command(k) - offset),   v = q - L(1) w while it pushes the load to the right
 
-v is where the motor is, as its encoder reports it at the end of an interval. p is the wind-up: dry
-friction of the load holds the motor back as long as it pushes, and not within the gap.
+v is where the motor is, as its encoder reports it at the end of an interval. Dry friction of the
+load winds the loop up by w before the load moves: until then v stays where it touched the load.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -49,11 +49,6 @@ class Actuator:
         """L(1)."""
         return float(self.lag.numerator.sum() / self.lag.denominator.sum())
 
-    def push(self, side: Region) -> float:
-        """p on a side."""
-        right, left = self.wind_up
-        return right if side > 0 else -left if side < 0 else 0.5 * (right - left)
-
     def crossings(self, c_r: float, c_l: float) -> tuple[float, float]:
         """Crossings for the command, of those behind the motor."""
         right, left = self.wind_up
@@ -77,17 +72,21 @@ class Motor:
     """Where the motor is, by the command alone. It begins at rest where the first command says."""
 
     def __init__(self, actuator: Actuator) -> None:
-        self._actuator = actuator
+        right, left = actuator.wind_up
+        self._offset = 0.5 * (right - left)
+        self._wind_up = 0.5 * (right + left) * actuator.gain  # [v]
         self._a, self._b, _ = actuator.lag.state_space()
         self._x: Array = np.zeros(actuator.lag.order)
         self._begun = False
 
-    def step(self, command: float, side: Region) -> float:
-        """Go on by one sample with the load on this side; return v at the end of it."""
-        reached = command - self._actuator.push(side)
+    def step(self, command: float, load: float, c_r: float, c_l: float) -> float:
+        """Go on by one sample; return v at the end of it. load: u / m, what the gap holds [v]."""
+        reached = command - self._offset
         if not self._begun:
             self._begun = True
             at_rest = np.linalg.solve(np.eye(len(self._x)) - self._a, self._b)
             self._x = np.asarray(at_rest * reached)
         self._x = self._a @ self._x + self._b * reached
-        return float(self._x[0])
+        q, w = float(self._x[0]), self._wind_up
+        load = clamp(load, q - w - c_r, q + w - c_l)
+        return clamp(q, load + c_l, load + c_r)

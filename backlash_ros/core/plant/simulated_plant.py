@@ -83,7 +83,8 @@ class SimulatedPlant:
         if self._wears:
             self._wear()
         if self._motor is not None:
-            v = self._motor.step(v, self.backlash.region)
+            held = self.backlash
+            v = self._motor.step(v, held.u / held.m, held.c_r, held.c_l)
         self.applied = v
         u = self.backlash.step(v)
         disturbance = self._extra.input_disturbance
