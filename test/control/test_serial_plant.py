@@ -70,7 +70,9 @@ def test_the_loop_goes_on_without_reports_from_where_the_command_takes_the_motor
 
 
 def test_lost_outputs_are_stepped_over() -> None:
-    loop = build_closed_loop(TRUE.replaced({'output_loss': 0.2}))
+    loop = build_closed_loop(TRUE.replaced({
+        'output_loss': 0.2, 'tracking.input_weight': 0.1,
+    }))
     record = loop.run(SAMPLES)
     assert record.lost_samples > 100
     y, t = record.column('y'), record.column('t')

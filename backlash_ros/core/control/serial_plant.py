@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
-from backlash_ros.core.estimation.constants import GATE, OUTLIERS
+from backlash_ros.core.estimation.constants import OUTLIERS
 from backlash_ros.core.estimation.protocol import Estimate, Interval
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import clamp
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 DOUBT, LITTLE_DOUBT = 0.5, 0.1
 REMEMBERED = 60  # samples from which a new observer finds the state
 AVERAGED = 100  # innovations that say how large one may be
+# Of their rms, beyond which y is an outlier. They come in bursts, when v crosses the gap.
+GATE = 100.0
 KNOWN = Estimate(1.0, 0.0, 0.0, 0.0)  # for an observer that is told u: no backlash
 
 
