@@ -16,7 +16,11 @@ from backlash_ros.core.identification.identification import Identification, Opti
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.identify.identified_file import commented_yaml, identified_parameters
-from backlash_ros.tools.identify.measured_record import MeasuredRecord, read_measured
+from backlash_ros.tools.identify.measured_record import (
+    MeasuredRecord,
+    from_messages,
+    read_measured,
+)
 from backlash_ros.tools.identify.outcome import write_record
 
 PERIOD = 0.005
@@ -95,3 +99,16 @@ def test_a_csv_keeps_the_commands_beside_v(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.v, motor)
     write_record(MeasuredRecord(motor, y, PERIOD, ''), path)
     assert read_measured(path).commands is None
+
+
+def test_messages_tell_commands_and_reports_of_each_interval() -> None:
+    stamps = 10**18 + np.arange(50) * 5_000_000
+    reports = stamps - 100_000, np.arange(50.0)
+    # The first command comes after five reports: until then the motor rests where it is.
+    control = stamps[5:] + 300_000, 100.0 + np.arange(5.0, 50.0)
+    read = from_messages(Path('a test'), {
+        'plant_output': (stamps, np.zeros(50)), 'applied_control': reports, 'control': control,
+    }, PERIOD)
+    assert read.commands is not None
+    assert read.v[:8].tolist() == [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0]
+    assert read.commands[:8].tolist() == [1.0, 1.0, 1.0, 1.0, 1.0, 105.0, 106.0, 107.0]

@@ -155,7 +155,7 @@ def _usable(
 ) -> MeasuredRecord:
     """From the first known v on; a v that is not known is the one before it.
 
-    Commands are left out unless all of them are known from there on.
+    Before the first command the motor rests where it is.
     """
     for name, values in (('v', v), ('y', y)):
         if np.isinf(values).any():
@@ -172,7 +172,8 @@ def _usable(
     first = int(np.argmax(np.isfinite(v)))
     if commands is not None:
         commands = _held(commands)[first:]
-        if not np.isfinite(commands).all() or np.abs(commands).max() > LARGEST:
+        commands = np.where(np.isnan(commands), v[first], commands)
+        if not np.abs(commands).max() <= LARGEST:
             commands = None
     return MeasuredRecord(
         _held(v)[first:], y[first:], float(f'{period:.9g}'), str(path), commands=commands
