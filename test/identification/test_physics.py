@@ -22,6 +22,12 @@ from backlash_ros.core.estimation.protocol import Status  # noqa: E402
 SERVO = PRESETS['servo']
 
 
+@pytest.fixture(scope='module')
+def identified() -> gear_runs.Identified:
+    """The servo, identified from its limits alone."""
+    return gear_runs.identified(SERVO, encoder=False)
+
+
 def test_motion_lost_behind_the_motor_is_gap_and_wind_up_of_the_gear() -> None:
     v, motor, load = gear_runs.quasi_static(SERVO)
     windup = 2.0 * SERVO.friction / SERVO.contact_stiffness
@@ -54,8 +60,9 @@ def test_arm_pulls_the_load_down() -> None:
     assert 0.5 - physics.load == pytest.approx(below, rel=0.05)
 
 
-def test_identified_from_limits_alone_the_loop_removes_what_backlash_does() -> None:
-    identified = gear_runs.identified(SERVO, encoder=False)
+def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(
+    identified: gear_runs.Identified,
+) -> None:
     assert identified.said == 'of use'
     assert identified.parameters is not None
     lost = SERVO.lost_motion
@@ -90,6 +97,19 @@ def test_from_the_motor_encoder_lag_and_wind_up_of_the_motor_are_made_up_for_as_
     # As well as with the best constants from the command, 2 % of the motion that is lost; without
     # compensation it is 30 %.
     assert run.error < 0.035 * SERVO.lost_motion
+
+
+def test_one_speed_with_rests_takes_nothing_from_what_was_identified(
+    identified: gear_runs.Identified,
+) -> None:
+    # At each rest, and at 1,500 samples, the record is let go; the rest of it takes a lag of the
+    # position loop for a part of the gap.
+    assert identified.parameters is not None
+    gear = replace(SERVO, frequency=1.1 * SERVO.frequency)
+    controller = gear_runs.learning(identified.found, identified.parameters)
+    run = gear_runs.close_loop(gear, controller, 'moves and rests')
+    assert np.any(run.status[run.first:] == Status.TRACKING)
+    assert run.said_tracking_off_by(SERVO.lost_motion) < 0.1
 
 
 @pytest.mark.parametrize('setting', ['gab=0.1', 'gap', 'about=1', 'gap=wide'])

@@ -10,7 +10,7 @@ from __future__ import annotations
 BY_CHANCE = 3.0  # standard deviations up to which a difference is chance
 ENGAGED = 15.0  # log-likelihood by which a gap must beat a constant u
 UNDECIDED_BY = 6.0  # log-likelihood by which another gap may fall behind: some 300 are compared
-REVERSALS = 2  # changes of the engaged side before the first estimate where G is uncertain
+REVERSALS = 2  # changes of the engaged side before the first estimate, or another one: G uncertain
 PRECISE_SLOPE = 0.2  # relative deviation of m below which an estimate is published
 PRECISE_GAP = 0.3  # relative deviation of the gap below which it is
 NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
@@ -27,6 +27,7 @@ NO_DATA = 20  # lost samples in a row that are worth a state
 SLOW = 100  # samples that u takes at least to walk: what is faster is motion
 LEAK = 5e-3  # prior of that of an integrator, per sample and per unit of the uncertainty
 FREE_TAPS = 0.2  # prior of single taps, as a share of the largest one and of the uncertainty
+LAGS = (1, 2, 4, 8, 16)  # samples after which a residual is compared with itself
 LINEAR = 0.05  # scale of the error of G up to which the response is linear in it
 
 # --- effort

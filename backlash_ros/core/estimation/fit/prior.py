@@ -23,12 +23,16 @@ class Prior(NamedTuple):
     cov: Array
 
 
-def prior_of(estimate: Estimate) -> Prior:
-    """What an estimate with its deviations says."""
+def prior_of(estimate: Estimate, cov: Array | None = None) -> Prior:
+    """What an estimate with its deviations says.
+
+    cov: covariance (3, 3) of m, c_r, c_l, where more is known of them than their deviations.
+    """
     m, c_r, c_l = estimate.m, estimate.c_r, estimate.c_l
     std = np.array([estimate.std_m, estimate.std_c_r, estimate.std_c_l])
     std = np.maximum(std, SHARPEST * np.array([m, c_r - c_l, c_r - c_l]))
-    return Prior(np.array([m, m * c_r, m * c_l]), _cov_of_theta(m, c_r, c_l, std**2))
+    theta = np.array([m, m * c_r, m * c_l])
+    return Prior(theta, _cov_of_theta(m, c_r, c_l, np.diag(std**2) if cov is None else cov))
 
 
 def drifted(theta: Array, cov: Array, drift: Array, samples: int) -> Prior:
@@ -37,13 +41,14 @@ def drifted(theta: Array, cov: Array, drift: Array, samples: int) -> Prior:
     drift: random walk of m, c_r, c_l per square root of a sample, shape (3,).
     """
     m, product_r, product_l = theta.tolist()
-    return Prior(theta, cov + _cov_of_theta(m, product_r / m, product_l / m, drift**2 * samples))
+    added = np.diag(drift**2 * samples)
+    return Prior(theta, cov + _cov_of_theta(m, product_r / m, product_l / m, added))
 
 
-def _cov_of_theta(m: float, c_r: float, c_l: float, variances: Array) -> Array:
-    """Covariance (3, 3) of theta for independent m, c_r, c_l of these variances (3,)."""
+def _cov_of_theta(m: float, c_r: float, c_l: float, cov: Array) -> Array:
+    """Covariance (3, 3) of theta for one (3, 3) of m, c_r, c_l."""
     jacobian = np.array([[1.0, 0.0, 0.0], [c_r, m, 0.0], [c_l, 0.0, m]])
-    return np.asarray(jacobian @ np.diag(variances) @ jacobian.T)
+    return np.asarray(jacobian @ cov @ jacobian.T)
 
 
 def contradicts(one: Prior, other: Prior) -> bool:

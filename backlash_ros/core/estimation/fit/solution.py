@@ -49,8 +49,9 @@ class Solution:
 
     posterior: of all unknowns. crossings: with honest deviations; None unless m > 0. gap: of the
     solution, start: p of the solution at the start. count: samples that count, repeated readings
-    once. correlation: of successive residuals beyond chance. inflation: 1 - rho + N rho, by which
-    the covariance is widened. rms: of the residual.
+    once. correlation: of the residual with itself, beyond chance. inflation: 1 - rho + N rho, by
+    which the covariance is widened; beside a prior, that of the samples alone. rms: of the
+    residual. contested: whether the samples alone contradict what is known from elsewhere.
     """
 
     posterior: Posterior
@@ -63,6 +64,7 @@ class Solution:
     correlation: float
     inflation: float
     rms: float
+    contested: bool
 
     @property
     def m(self) -> float:

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, SLOW
 from backlash_ros.core.estimation.fit.crossings import crossings_of
+from backlash_ros.core.estimation.fit.prior import contradicts
 from backlash_ros.core.estimation.fit.solution import Around, Solution
+from backlash_ros.core.estimation.fit.whiteness import largest_correlation
 from backlash_ros.core.estimation.regression.play import NO_PAST, Labels, Start
 from backlash_ros.core.estimation.regression.posterior import (
     VAGUE,
@@ -178,10 +180,13 @@ class WindowFit:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
         triangle, offset, prior = self._triangle, 0.0, self.around.prior
+        own: Solution | None = None
         if prior is not None and not alone:
-            triangle = triangle.informed(
-                layout.theta, prior.theta, prior.cov, self.around.told_std
-            )
+            if self.around.error.count and triangle.count > layout.unknowns:
+                own = self.solve(walk, leaking, alone=True)
+            # What the model cannot explain of these samples makes the prior no worse.
+            cov = prior.cov if own is None else prior.cov / own.inflation
+            triangle = triangle.informed(layout.theta, prior.theta, cov, self.around.told_std)
         if layout.ramps:
             step = (walk or self.around.walk) / sqrt(layout.ramps)
             triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
@@ -192,9 +197,8 @@ class WindowFit:
         count = self._triangle.count
         correlation = 0.0
         if squares > count * (NO_RESIDUAL * self.extent[0]) ** 2 and count > 1.0:
-            lag = float(residual[1:] @ residual[:-1]) / squares
-            correlation = max(0.0, lag - BY_CHANCE / sqrt(count))
-        inflation = 1.0 - correlation + count * correlation
+            correlation = max(0.0, largest_correlation(residual) - BY_CHANCE / sqrt(count))
+        inflation = own.inflation if own else 1.0 - correlation + count * correlation
         posterior = self._with_other_labels(posterior, inflation)
         now = self._theta_now()
         theta = now @ posterior.mean
@@ -208,6 +212,7 @@ class WindowFit:
             posterior, theta, cov, crossings_of(theta, cov),
             float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
             inflation, sqrt(squares / max(count, 1.0)),
+            own is not None and prior is not None and contradicts(own.of_theta, prior),
         )
 
     def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:

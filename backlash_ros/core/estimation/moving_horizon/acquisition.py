@@ -11,7 +11,6 @@ from backlash_ros.core.estimation.constants import (
     AS_GOOD,
     BLOCK,
     REPLACING,
-    REVERSALS,
     SEARCH_GROWTH,
     UNDECIDED,
 )
@@ -56,8 +55,7 @@ def acquire(learning: Learning) -> Task:
     search.candidate = found.solution.of_theta
     search.next_at = end + BLOCK[0]
     again = before is not None and not contradicts(search.candidate, before)
-    wanted = REVERSALS if around.error.count else 1
-    if again and found.decided and found.fit.reversals >= wanted:
+    if again and found.decided and found.fit.reversals > 0 and learning.reversed_often(found.fit):
         return learning.go_on_from(found, first)
     return False
 
@@ -69,7 +67,8 @@ def confirmed(
 
     free: a fit without it, if there is one.
     """
-    prior, current, pace = prior_of(inherited), learning.current, learning.pace
+    current, pace = learning.current, learning.pace
+    prior = prior_of(inherited, learning.held)
     # G is no worse known than it was: it does not explain whatever has happened.
     most = TOLD if current is None else current.solution.posterior.scale
     alone = learning.free._replace(most=most)

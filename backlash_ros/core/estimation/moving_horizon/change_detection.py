@@ -73,7 +73,7 @@ def halve(learning: Learning) -> Task:
     if half < RECOVERED:
         return False
     v, y = record.since(record.first)
-    around = learning.free
+    around = learning.unchanged
     start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
     newer = yield from fitted(v[half:], y[half:], around, start, solution.m, pace)
     if learning.usable(newer, REPLACING) is None:
@@ -82,6 +82,13 @@ def halve(learning: Learning) -> Task:
     if not (contradicts(newer.solution.of_theta, whole)
             or learning.drifts_more(newer.solution, half)):
         return False
+    if around.error.count:
+        known = learning.around.prior
+        # A lag may pass for a gap, and what was known before the record may hold on.
+        if not learning.reversed_often(newer.fit) or not (
+            known is None or contradicts(newer.solution.of_theta, known)
+        ):
+            return False
     if learning.expects_changes and not around.error.count:
         # What the older half says holds as far as theta has not drifted since.
         older = yield from fitted(
@@ -103,7 +110,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     current, since, record = learning.fit, learning.contradicted_from, learning.record
     assert since is not None
     bound = AS_GOOD * current.solution.posterior.noise_std
-    around, end = learning.free, record.end
+    around, end = learning.unchanged, record.end
     learning.next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
     # What is known from elsewhere still holds, unless the plant has changed.
     whole = yield from _best_of_all(learning, learning.around._replace(walk=0.0))
@@ -122,10 +129,12 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         found = yield from searched(v, y, around, learning.widest, learning.pace)
         if found is not None:
             changes.append(found)
-            if learning.usable(found, REPLACING) is not None and found.solution.rms <= bound \
+            if learning.reversed_often(found.fit) \
+                    and learning.usable(found, REPLACING) is not None \
+                    and found.solution.rms <= bound \
                     and _has_changed(current, found, whole, first == record.first):
                 theta = learning.changed = found.solution.of_theta
-                # As a first estimate, one that nobody expects has to be found twice.
+                # As a first estimate, one that nobody expects is to be found twice.
                 again = before is not None and not contradicts(theta, before)
                 if again or learning.expects_changes:
                     return learning.go_on_from(found, first, changed=True)

@@ -16,20 +16,24 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import (
     BLOCK,
+    BY_CHANCE,
     FIRST_SEARCH,
     GROWTH,
     LONGEST,
     MEMORIES_SEARCHED,
     RECOVERED,
     REPLACING,
+    REVERSALS,
     SEARCHED,
 )
+from backlash_ros.core.estimation.fit.arrival import arrival
 from backlash_ros.core.estimation.fit.crossings import Crossings, difference
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance, contradicts, drifted
 from backlash_ros.core.estimation.fit.record import Record
 from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.fit.solution import Around, Solution
+from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.moving_horizon.acceptance import differs, is_precise, usable
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
@@ -74,7 +78,7 @@ class Learning:
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
     again. changed: what theta seems to have become. refitted: whether it was refitted since the
     record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
-    do not deny it.
+    do not deny it. held: covariance (3, 3) of the m, c_r, c_l that are published, None before.
     """
 
     bounds: Bounds
@@ -95,6 +99,7 @@ class Learning:
     refitted: bool = False
     changed: Prior | None = None
     unconfirmed: Prior | None = None
+    held: Array | None = None
 
     @property
     def expects_changes(self) -> bool:
@@ -111,6 +116,11 @@ class Learning:
     def free(self) -> Around:
         """Around the G of now, with nothing else taken for known."""
         return self.around._replace(prior=None, most=inf, walk=0.0)
+
+    @property
+    def unchanged(self) -> Around:
+        """Free, but for G: another backlash leaves it as well known as it was."""
+        return self.free._replace(most=self.fit.solution.posterior.scale)
 
     @property
     def searched(self) -> int:
@@ -138,9 +148,23 @@ class Learning:
             return [around]
         return [around, around._replace(model=told.model, error=told.error, scale=0.0)]
 
+    def reversed_often(self, fit: WindowFit) -> bool:
+        """Whether the engaged side has changed so often that no lag passes for a gap."""
+        return self.around.error.count == 0 or fit.reversals >= REVERSALS
+
     def usable(self, result: Fitted, share: float = 1.0) -> Crossings | None:
         """The crossings of a fit that is precise enough, see acceptance.py."""
         return usable(result, self.bounds, share)
+
+    @property
+    def share(self) -> float:
+        """Of the usual deviations, up to which the fit is of use.
+
+        What no backlash and no G explains is an error that lasts: all of what chance makes of the
+        deviations has to be small, not one of them.
+        """
+        lasting = self.around.error.count > 0 and self.fit.solution.moved_otherwise
+        return 1.0 / BY_CHANCE if lasting else 1.0
 
     def judged(self, found: Crossings | None, estimate: Estimate, held: Array | None) -> Belief:
         """What becomes of a fit beside the estimate that held so far.
@@ -150,7 +174,7 @@ class Learning:
         otherwise: after a contradiction a fit has to foretell some, before it says something else
         or says it less precisely.
         """
-        if found is None:
+        if found is None or self.fit.solution.contested:
             return Belief.REFUSED
         if held is None:
             return Belief.REPLACES
@@ -176,6 +200,8 @@ class Learning:
         """
         prior, (fit, solution, _) = self.unconfirmed, self.fit
         if prior is None or solution.moved_otherwise or self.around.walk > 0.0:
+            return False
+        if not self.reversed_often(fit):
             return False
         alone = fit.solve(alone=True)
         found = alone.crossings
@@ -229,7 +255,7 @@ class Learning:
         if current is None:
             self.begin_acquisition(self.acquisition.inherited)
             return
-        self.around = self.around._replace(prior=current.solution.of_theta)
+        self.around = self.around._replace(prior=arrival(current, current.solution.contested))
         fit = current.fit.restarted(self.around, start)
         self.current = Fitted(fit, fit.solve())
         self.refit_at = FIRST_SEARCH

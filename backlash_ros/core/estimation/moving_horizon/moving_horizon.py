@@ -285,10 +285,13 @@ class MovingHorizon:
         current = learning.fit
         if learning.confirm():
             # The estimate was that of another plant.
-            learning.begin_acquisition(None)
-            learning.reason, self.covariance = Status.INCONSISTENT, None
+            exact = learning.around.error.count == 0
+            learning.begin_acquisition(None if exact else self.estimate)
+            learning.reason = Status.INCONSISTENT
+            if exact:
+                self.covariance = learning.held = None
             return
-        found = learning.usable(current)
+        found = learning.usable(current, learning.share)
         belief = learning.judged(found, self.estimate, self.covariance)
         if belief is Belief.REPLACES and found is not None:
             self._take_over(found)
@@ -302,7 +305,7 @@ class MovingHorizon:
 
     def _take_over(self, found: Crossings) -> None:
         m, c_r, c_l = self._learning.bounds.project(found.m, found.c_r, found.c_l)
-        self.covariance = found.cov
+        self.covariance = self._learning.held = found.cov
         self.estimate = Estimate(
             m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
             self.estimate.status,

@@ -16,6 +16,8 @@ from backlash_ros.core.estimation.constants import (
     OUTLIER_SHARE,
     SEARCHED,
 )
+from backlash_ros.core.estimation.fit.arrival import arrival
+from backlash_ros.core.estimation.fit.prior import Prior, drifted
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
@@ -111,13 +113,13 @@ def _shortened(
         return around, fit.start, record.first
     gone = LONGEST // 3
     v, y = record.since(record.first)
-    prior = None
-    if around.error.count == 0 and solution.correlation == 0.0:
-        part = yield from fitted(
-            v[:gone], y[:gone], around, fit.start, solution.m, learning.pace
-        )
-        prior = learning.drifted(part.solution, len(v) - gone)
-    around = around._replace(prior=prior, most=around.most if prior else inf)
+    prior: Prior | None = None
+    if around.error.count or solution.correlation == 0.0:
+        part = yield from fitted(v[:gone], y[:gone], around, fit.start, solution.m, learning.pace)
+        known = arrival(part, solution.contested)
+        if known is not None:
+            prior = drifted(*known, learning.drift, len(v) - gone)
+    around = around._replace(prior=prior, most=inf)
     return around, fit.start_after(v[:gone]), record.first + gone
 
 
