@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import asin, inf, pi, sin
@@ -81,11 +81,12 @@ MOTIONS: dict[str, tuple[Motion, float]] = {
 
 @dataclass(frozen=True)
 class Run:
-    """A closed loop. y: true load (N,), y_m: as it is to be followed (N,), v, estimates, status."""
+    """A closed loop. y: true load (N,), y_m: as it is to be followed (N,), v, motor, estimates."""
 
     y: Array
     y_m: Array
     v: Array
+    motor: Array
     gap: Array
     std_gap: Array
     status: NDArray[np.int64]
@@ -167,6 +168,7 @@ class Identified:
 
 def identified(
     gear: Gear, encoder: bool, rate: float = 1.0, seconds: float = STROKES_S,
+    attempts: Mapping[str, Options] = ATTEMPTS,
 ) -> Identified:
     """Identify from v, or from the motor encoder; if it is not of use, again as told to.
 
@@ -180,7 +182,7 @@ def identified(
         'estimator.use_applied_control': 'true' if encoder else 'false',
     }
     results = []
-    for option, choice in ATTEMPTS.items():
+    for option, choice in attempts.items():
         found = identify(motor if encoder else v, y, gear.sample_period, choice)
         if encoder:
             found = with_actuator(found, v)
@@ -223,21 +225,23 @@ def close_loop(
         [shape(2.0 * pi * frequency * period * k) for k in range(samples)]
     )
     physics = GearPhysics(gear)
-    rows = np.zeros((samples, 5))
+    rows = np.zeros((samples, 6))
     applied: tuple[float, ...] = ()
     for k in range(samples):
-        y = physics.load
+        y, motor = physics.load, physics.motor
         step = controller.step(physics.load_encoder(), float(reference[k]), applied=applied)
         controller.refine()
         e = step.estimate
-        rows[k] = y, step.v, e.c_r - e.c_l, np.hypot(e.std_c_r, e.std_c_l), e.status
+        rows[k] = y, step.v, motor, e.c_r - e.c_l, np.hypot(e.std_c_r, e.std_c_l), e.status
         physics.move_to(step.v)
         physics.advance(period)
         applied = (physics.motor_encoder(),) if encoder else ()
-    y, v, gap, std, status = rows.T
+    y, v, motor, gap, std, status = rows.T
     delay = controller.structure.delay
     due = np.concatenate([np.full(delay, reference[0]), reference])[:samples]
-    return Run(y, due, v, gap, std, status.astype(int), round(first / frequency / period))
+    return Run(
+        y, due, v, motor, gap, std, status.astype(int), round(first / frequency / period)
+    )
 
 
 def uncompensated(gear: Gear, parameters: Parameters, motion: str) -> Run:

@@ -16,9 +16,11 @@ from math import isinf, nan
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
-import matplotlib as mpl
 import numpy as np
-from gear_map import map_table
+from gear_figures import draw_hysteresis, draw_map
+from gear_map import FILE as MAP_FILE
+from gear_map import HEADER as WRONG_HEADER
+from gear_map import map_cells, summary, wrong_rows
 from gear_runs import (
     MOTIONS,
     PERIODS,
@@ -42,11 +44,8 @@ from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.tools.config.configuration import parse_setting
 
-mpl.use('Agg')
-import matplotlib.pyplot as plt
-
 DOCUMENT = ROOT / 'docs' / 'physics.md'
-FIGURE = ROOT / 'docs' / 'images' / 'physics.png'
+IMAGES = ROOT / 'docs' / 'images'
 MARKS = r'(<!-- {}: made by benchmarks -->\n).*?(<!-- end -->)'
 REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
 LITTLE = 0.05  # share of the error without compensation that constants avoid: the rest is not play
@@ -194,31 +193,22 @@ def wrong(cases: list[Case]) -> list[list[str]]:
     return rows
 
 
-def draw() -> None:
-    """Hysteresis loops of all presets, behind the command and behind the motor."""
-    figure, axes = plt.subplots(2, len(PRESETS), figsize=(15, 6), constrained_layout=True)
-    for (above, below), (name, gear) in zip(axes.T, PRESETS.items(), strict=True):
-        v, motor, load = quasi_static(gear)
-        for x, label in ((v, 'command'), (motor, 'motor')):
-            above.plot(x, load, label=label)
-            below.plot(x, x - load)
-        half = 0.5 * gear.scale * gear.gap
-        for y in (-half, half):
-            below.axhline(y, color='0.6', linestyle=':', zorder=0)
-        above.set_title(name)
-        below.set_xlabel('v [mm]' if gear.linear else 'v [rad]')
-    axes[0, 0].set_ylabel('load')
-    axes[1, 0].set_ylabel('v − load; gap dotted')
-    axes[0, 0].legend()
-    figure.savefig(FIGURE, dpi=80)
-    plt.close(figure)
-
-
 def write(name: str, text: str) -> None:
     """Put a table into the document."""
     marks = re.compile(MARKS.format(name), re.DOTALL)
     page = DOCUMENT.read_text()
     DOCUMENT.write_text(marks.sub(lambda mark: mark[1] + text + mark[2], page))
+
+
+def make_map(side: int, processes: int, into_document: bool) -> None:
+    """Draw the map, and say what is wrong on it."""
+    cells = map_cells(side, processes)
+    rows, counts = wrong_rows(cells), summary(cells)
+    print(f'{text_table(WRONG_HEADER, rows)}\n{counts}')
+    draw_map(cells, (IMAGES if into_document else MAP_FILE.parent) / 'physics_map.png')
+    if into_document:
+        table = markdown_table(WRONG_HEADER, rows) + '\n' if rows else ''
+        write('physics_map', f'{counts}\n\n{table}'.rstrip() + '\n')
 
 
 def main() -> None:
@@ -234,24 +224,24 @@ def main() -> None:
     parser.add_argument('--parameter', action='append', default=[], metavar='KEY=VALUE',
                         help='change the identified file for the loops that learn')
     parser.add_argument('--map', type=int, metavar='CELLS', default=0,
-                        help='only the map of inertia and bandwidth, with so many cells a side')
+                        help='only the map of inertia and bandwidth, with so many cells a side; '
+                             f'what {MAP_FILE.relative_to(ROOT)} holds is not made again')
+    parser.add_argument('--processes', type=int, default=processors(), metavar='N',
+                        help='that compute beside each other')
     parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
     options = parser.parse_args()
     if options.map:
-        header, rows = map_table(options.map)
-        print(text_table(header, rows))
-        if options.write:
-            write('physics_map', f'{markdown_table(header, rows)}\n')
+        make_map(options.map, options.processes, options.write)
         return
     presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
     sources = parallel(
         find, [(p, e, options.rate, options.duration) for p in presets for e in (False, True)],
-        'identification', processors(),
+        'identification', options.processes,
     )
     changes = {one.name: one.value for one in map(parse_setting, options.parameter)}
     cases = parallel(
         judge, [(motion, *sources[2 * i:2 * i + 2], changes, options.periods)
-                for i in range(len(presets)) for motion in motions], 'loops', processors(),
+                for i in range(len(presets)) for motion in motions], 'loops', options.processes,
     )
     found, rows, bad = found_rows(sources), rows_of(cases), wrong(cases)
     header = ('run', 'v from', 'what')
@@ -259,7 +249,7 @@ def main() -> None:
     print(text_table(HEADER, rows))
     print(text_table(header, bad))
     if options.write:
-        draw()
+        draw_hysteresis(IMAGES / 'physics.png')
         text = '\n\n'.join([
             markdown_table(FOUND_HEADER, found), markdown_table(HEADER, rows),
             f'Where less than {REMOVED:.0%} is removed, or *tracking* is said with the gap off by '
