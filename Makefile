@@ -52,8 +52,9 @@ lint: dev-environment
 	@$(RUN) -m ruff check --quiet .
 	@$(CHECK_TYPES)
 
-docs: run-environment
+docs: dev-environment
 	@$(RUN) docs/made_by/figures.py
+	@$(RUN) docs/made_by/film.py
 
 clean:
 	@rm -rf .venv build install log *.egg-info .hypothesis .mypy_cache .pytest_cache .ruff_cache

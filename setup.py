@@ -27,7 +27,7 @@ setup(
         (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
         (f'share/{PACKAGE}/examples', sorted(glob('examples/*.py'))),
         (f'share/{PACKAGE}/docs', sorted(glob('docs/*.md'))),
-        (f'share/{PACKAGE}/docs/images', sorted(glob('docs/images/*.png'))),
+        (f'share/{PACKAGE}/docs/images', sorted(glob('docs/images/*'))),
     ],
     zip_safe=False,
     python_requires='>=3.10',

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
@@ -87,6 +88,16 @@ def test_links_lead_to_files_and_headings() -> None:
 def test_every_picture_is_shown() -> None:
     shown = {(page.parent / link).resolve() for page, link in of_every_page(LINK)}
     assert set((DOCS / 'images').iterdir()) <= shown
+
+
+def test_readme_begins_with_a_film_that_loads_fast() -> None:
+    first = re.search(r'!\[[^\]]*\]\((\S+)\)', README)
+    assert first is not None
+    path = ROOT / first[1]
+    assert path.stat().st_size < 3e6
+    with Image.open(path) as film:
+        assert film.n_frames > 50
+        assert film.info['loop'] == 0  # for ever
 
 
 def test_made_tables_are_filled_and_known_to_the_script() -> None:
