@@ -21,6 +21,8 @@ from gear_figures import draw_hysteresis, draw_map
 from gear_map import FILE as MAP_FILE
 from gear_map import HEADER as WRONG_HEADER
 from gear_map import map_cells, summary, wrong_rows
+from gear_processes import HEADER as PROCESS_HEADER
+from gear_processes import process_row
 from gear_runs import (
     MOTIONS,
     PERIODS,
@@ -39,6 +41,7 @@ from gear_runs import (
     uncompensated,
 )
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
+from tqdm import tqdm
 
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters.table import Value
@@ -211,6 +214,15 @@ def make_map(side: int, processes: int, into_document: bool) -> None:
         write('physics_map', f'{counts}\n\n{table}'.rstrip() + '\n')
 
 
+def run_processes(presets: list[str], into_document: bool) -> None:
+    """Measure what a user gets in real time, one preset after the other."""
+    rows = [process_row(preset) for preset in tqdm(presets, 'real time', disable=None)]
+    print(text_table(PROCESS_HEADER, rows))
+    if into_document:
+        table = markdown_table(PROCESS_HEADER, rows)
+        write('physics_processes', f'{table}\n\nMeasured on {machine()}.\n')
+
+
 def main() -> None:
     """Measure and print, or write."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -226,6 +238,8 @@ def main() -> None:
     parser.add_argument('--map', type=int, metavar='CELLS', default=0,
                         help='only the map of inertia and bandwidth, with so many cells a side; '
                              f'what {MAP_FILE.relative_to(ROOT)} holds is not made again')
+    parser.add_argument('--real', action='store_true',
+                        help='only one sine a preset, as real processes in real time')
     parser.add_argument('--processes', type=int, default=processors(), metavar='N',
                         help='that compute beside each other')
     parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
@@ -234,6 +248,9 @@ def main() -> None:
         make_map(options.map, options.processes, options.write)
         return
     presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
+    if options.real:
+        run_processes(presets, options.write)
+        return
     sources = parallel(
         find, [(p, e, options.rate, options.duration) for p in presets for e in (False, True)],
         'identification', options.processes,

@@ -9,18 +9,21 @@ in one terminal, then in another, as with any driver:
     bringup --config identified/identified.yaml --driver none --duration 20
 
 It is motor_driver.py with another motor, in real time: each reading of the load moves the gear on
-by one sample. docs/physics.md tells what to expect of the presets.
+by one sample, or by as many as have passed. docs/physics.md tells what to expect of the presets.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from math import nan
+import time
+from math import inf
 
 import motor_driver
 import mujoco.viewer
 from gear_physics import PRESETS, Gear, GearPhysics
+
+ON_TIME = 0.25  # of a period: a reading that is later than a period less this has missed one
 
 
 class GearMotor(GearPhysics):
@@ -28,14 +31,22 @@ class GearMotor(GearPhysics):
 
     def __init__(self, gear: Gear, view: bool) -> None:
         super().__init__(gear)
+        self._due = inf  # when the next reading is [s]
         self._viewer = mujoco.viewer.launch_passive(self.model, self.data) if view else None
 
     def load_encoder(self) -> float:
-        """Go on by one sample; return the position of the load then."""
-        self.advance(self.gear.sample_period)
+        """Go on by one sample, and by those that the machine was too busy for; read the load."""
+        now, period = time.monotonic(), self.gear.sample_period
+        missed = int(max((now - self._due) / period + ON_TIME, 0.0))
+        self.advance((1 + missed) * period)
+        self._due = min(self._due + missed * period, now) + period
         if self._viewer is not None and self._viewer.is_running():
             self._viewer.sync()
         return super().load_encoder()
+
+    def command(self) -> float:
+        """Return the v that acts: late commands and those of the watchdog are no riddle then."""
+        return self.gear.scale * float(self.data.ctrl[0])
 
 
 def limits(gear: Gear) -> str:
@@ -67,7 +78,7 @@ def main() -> int:
                         help='change a constant of the preset, in SI units (see gear_physics.py)')
     parser.add_argument('--view', action='store_true', help='show it; needs a display')
     parser.add_argument('--report', action='store_true',
-                        help='tell the motor encoder on applied_control')
+                        help='tell the motor encoder on applied_control, not the command that acts')
     parser.add_argument('--limits', action='store_true',
                         help='print sample period and limits as a parameter file, and end')
     options = parser.parse_args()
@@ -78,12 +89,12 @@ def main() -> int:
     if options.limits:
         print(limits(gear))
         return 0
-    motor_driver.motor = GearMotor(gear, options.view)
+    motor_driver.motor = motor = GearMotor(gear, options.view)
     motor_driver.SAMPLE_PERIOD_S = gear.sample_period
     motor_driver.V_MAX = gear.scale * gear.reach
     motor_driver.V_MIN = -motor_driver.V_MAX
     if not options.report:
-        motor_driver.read_motor_position = lambda: nan
+        motor_driver.read_motor_position = motor.command
     motor_driver.main()
     return 0
 
