@@ -44,6 +44,7 @@ RELABELLINGS = 8  # of relabelling, at most
 STANDS = 0.02  # standard deviations by which the gap may still move
 FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
 NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
+SAME = 1.5  # ratio of deviations of the gap up to which they say the same
 MODELS = 6  # times that G may move in one fit
 
 
@@ -71,8 +72,11 @@ class Fitted(NamedTuple):
         return prior is None or not beyond_chance(self.solution.theta - prior.theta, prior.cov)
 
     def with_gap_spread(self, spread: float) -> Fitted:
-        """The same with a gap that is no better known than by this deviation."""
-        self.fit.gap_spread = spread
+        """The same with a gap that is no better known than by this deviation.
+
+        One that the labels leave anyhow says nothing of other gaps.
+        """
+        self.fit.gap_spread = spread if spread > SAME * self.solution.std_gap else 0.0
         return self._replace(solution=self.fit.solve())
 
     def beginning(self, v: Array) -> Start:
@@ -133,7 +137,8 @@ def searched(
         best = best._replace(decided=not any(_rivals(best, other) for other in fits))
     assert found.comparison is not None
     spread = yield from gap_spread(
-        found.comparison, found.candidates, best.solution.gap, best.solution.std_gap, None, pace
+        found.comparison, found.candidates, best.solution.gap, best.solution.std_gap,
+        _gap_of(around.prior), pace,
     )
     result = yield from with_better_model(v, y, best, pace)
     return result.with_gap_spread(spread)._replace(decided=best.decided)
@@ -143,16 +148,21 @@ def with_other_gaps(
     v: Array, y: Array, result: Fitted, prior: Prior, pace: Pace,
 ) -> Generator[None, None, Fitted]:
     """A fit with a prior whose gap is no better known than over all that explain the samples."""
-    known = crossings_of(prior.theta, prior.cov)
+    known, around = _gap_of(prior), result.around
     gap, std = result.solution.gap, result.solution.std_gap
-    if known is None or not known.std_gap > std:
+    if known is None or not known[1] > std:
         return result
-    around = result.around
     comparison = Comparison(
         v, y, weights_of(y), around.model, around.error, around.told_std
     )
-    spread = yield from gap_spread(comparison, (), gap, std, (known.gap, known.std_gap), pace)
+    spread = yield from gap_spread(comparison, (), gap, std, known, pace)
     return result.with_gap_spread(spread)
+
+
+def _gap_of(prior: Prior | None) -> tuple[float, float] | None:
+    """Gap and its deviation as known from elsewhere."""
+    known = None if prior is None else crossings_of(prior.theta, prior.cov)
+    return None if known is None else (known.gap, known.std_gap)
 
 
 def _rivals(best: Fitted, other: Fitted) -> bool:

@@ -252,9 +252,8 @@ class WindowFit:
         wanted = self.gap_spread**2 / noise_var
         if not 0.0 < var < wanted:
             return posterior
-        return replace(
-            posterior, cov=posterior.cov + (wanted - var) / var**2 * np.outer(by, by)
-        )
+        along = by / var  # by which all unknowns move with the gap
+        return replace(posterior, cov=posterior.cov + (wanted - var) * np.outer(along, along))
 
     def _theta_now(self) -> Array:
         """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""

@@ -24,6 +24,7 @@ from backlash_ros.core.estimation.constants import (
     RECOVERED,
     REPLACING,
     REVERSALS,
+    SEARCH_GROWTH,
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
@@ -196,19 +197,18 @@ class Learning:
 
         They deny what is off by more than an estimate may be uncertain at all. What contradicts
         them by less is neither denied nor confirmed: in a plant that is no backlash and no linear G
-        they may be as wrong. So may they where something else moves y.
+        they may be as wrong. So may they where something else moves y, which denies nothing.
         """
         prior, (fit, solution, _) = self.unconfirmed, self.fit
-        if prior is None or solution.moved_otherwise or self.around.walk > 0.0:
-            return False
-        if not self.reversed_often(fit):
+        if prior is None or not self.reversed_often(fit):
             return False
         alone = fit.solve(alone=True)
         found = alone.crossings
         if found is None or not is_precise(found, fit.swing):
             return False
         contradicted = contradicts(alone.of_theta, prior)
-        denied = contradicted and differs(found, prior)
+        otherwise = solution.moved_otherwise or self.around.walk > 0.0
+        denied = contradicted and differs(found, prior) and not otherwise
         if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
             self.unconfirmed = None
         return denied
@@ -241,7 +241,9 @@ class Learning:
         if result.around.prior is not self.unconfirmed:
             self.unconfirmed = None
         self.record.forget_before(first)
-        self.refit_at = min(GROWTH * result.fit.length, LONGEST)
+        # As long as the gap may be another one the search for it goes on.
+        growth = SEARCH_GROWTH if result.fit.gap_spread > 0.0 else GROWTH
+        self.refit_at = min(growth * result.fit.length, LONGEST)
         self.moved_at = result.fit.length + BLOCK[1]
         self.contradicted_from = self.changed = self.acquisition.rejected = None
         if changed:
