@@ -64,6 +64,7 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
         'control.min': -0.1, 'control.rate_max': 5.5, 'lockstep': True,
         'file': "it's a: file.csv", 'seed': 7, 'backlash.jump': [0.0, 1e22, -0.5],
         'truth.numerator': [0.5], 'truth.denominator': [1.0, -0.5],
+        'actuator.numerator': [0.5], 'actuator.denominator': [1.0, -0.5],
     })
     write_config(parameters, config)
     assert Parameters(load_config(config)) == parameters
