@@ -17,13 +17,13 @@ from math import isinf, nan
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from gear_figures import draw_hysteresis, draw_map
-from gear_map import FILE as MAP_FILE
-from gear_map import HEADER as WRONG_HEADER
-from gear_map import map_cells, summary, wrong_rows
-from gear_processes import HEADER as PROCESS_HEADER
-from gear_processes import process_row
-from gear_runs import (
+from gears.gear_figures import draw_hysteresis, draw_map
+from gears.gear_map import FILE as MAP_FILE
+from gears.gear_map import HEADER as WRONG_HEADER
+from gears.gear_map import map_cells, summary, wrong_rows
+from gears.gear_processes import HEADER as PROCESS_HEADER
+from gears.gear_processes import process_row
+from gears.gear_runs import (
     MOTIONS,
     PERIODS,
     PRESETS,

@@ -27,7 +27,7 @@ if os.environ['MUJOCO_GL'] == 'osmesa' and find_library('OSMesa') is None:
              'apt-get install libosmesa6, or set MUJOCO_GL to egl or glfw')
 
 from film_scene import Scene  # noqa: E402
-from gear_runs import PRESETS, Run, close_loop, constant, identified  # noqa: E402
+from gears.gear_runs import PRESETS, Run, close_loop, constant, identified  # noqa: E402
 
 from backlash_ros.core.assembly import build_controller  # noqa: E402
 from backlash_ros.core.estimation.protocol import Status  # noqa: E402

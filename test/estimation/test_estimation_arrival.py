@@ -11,9 +11,9 @@ from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.solution import Around
-from backlash_ros.core.estimation.fit.whiteness import largest_correlation
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.estimation.regression.whiteness import largest_correlation
 from backlash_ros.core.plant.state_model import StateModel
 
 NOISE = 1e-3

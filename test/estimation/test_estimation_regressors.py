@@ -14,9 +14,9 @@ from records import resonance
 from scipy.signal import lfilter
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, signals
 
-from backlash_ros.core.estimation.fit.window_fit import weights_of
 from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel, monic
 from backlash_ros.core.estimation.regression.play import Labels, labels_of
+from backlash_ros.core.estimation.regression.readings import weights_of
 from backlash_ros.core.estimation.regression.regressors import Regressors
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.model_check import ON_CIRCLE

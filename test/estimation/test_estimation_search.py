@@ -18,9 +18,9 @@ from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, searched, with_other_gaps
 from backlash_ros.core.estimation.fit.search import Found, search
 from backlash_ros.core.estimation.fit.solution import Around
-from backlash_ros.core.estimation.fit.window_fit import weights_of
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.estimation.regression.readings import weights_of
 from backlash_ros.core.plant.state_model import StateModel
 
 NOISE = 1e-3

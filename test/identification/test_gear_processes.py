@@ -12,8 +12,8 @@ pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / 'benchmarks'), str(ROOT / 'examples')]
 
-import gear_runs  # noqa: E402
-from gear_processes import MOST_LOST, MOTION, GearProcesses, TooBusyError  # noqa: E402
+from gears import gear_runs  # noqa: E402
+from gears.gear_processes import MOST_LOST, MOTION, GearProcesses, TooBusyError  # noqa: E402
 
 DRIVE_S, PERIODS = 6.0, 3
 SLOWER = 'sample_period=0.01'  # than the preset: beside other tests a machine has less time

@@ -14,8 +14,8 @@ pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / 'benchmarks'), str(ROOT / 'examples')]
 
-import gear_runs  # noqa: E402
 from gear_physics import PRESETS, Gear, GearPhysics  # noqa: E402
+from gears import gear_runs  # noqa: E402
 
 from backlash_ros.core.estimation.protocol import Status  # noqa: E402
 

@@ -31,8 +31,9 @@ from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance
 from backlash_ros.core.estimation.fit.search import Candidate, Comparison, gap_spread, search
 from backlash_ros.core.estimation.fit.solution import Around, Solution
-from backlash_ros.core.estimation.fit.window_fit import WindowFit, weights_of
+from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.estimation.regression.readings import weights_of
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.model_check import check_model
 from backlash_ros.core.plant.state_model import StateModel

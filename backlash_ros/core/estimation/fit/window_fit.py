@@ -18,7 +18,6 @@ from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, SLOW
 from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.prior import contradicts
 from backlash_ros.core.estimation.fit.solution import Around, Solution
-from backlash_ros.core.estimation.fit.whiteness import largest_correlation
 from backlash_ros.core.estimation.regression.play import NO_PAST, Labels, Start
 from backlash_ros.core.estimation.regression.posterior import (
     VAGUE,
@@ -28,6 +27,7 @@ from backlash_ros.core.estimation.regression.posterior import (
     with_zero,
 )
 from backlash_ros.core.estimation.regression.regressors import RAMPS, Regressors
+from backlash_ros.core.estimation.regression.whiteness import largest_correlation
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -295,16 +295,6 @@ class WindowFit:
         return np.asarray(
             labels.held * held + labels.v_a * m - labels.right * right - labels.left * left + walked
         )
-
-
-def weights_of(y: Array) -> Array:
-    """Weight of each reading: 1 over the length of the run of equal readings it stands in.
-
-    A sensor with a resolution repeats its error with its reading; what repeats tells nothing new.
-    """
-    changes = np.flatnonzero(np.diff(y) != 0.0) + 1  # nan differs from itself
-    lengths = np.diff(np.concatenate([[0], changes, [len(y)]]))
-    return np.repeat(1.0 / lengths, lengths)
 
 
 @lru_cache(maxsize=64)

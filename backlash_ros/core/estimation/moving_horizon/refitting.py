@@ -28,12 +28,13 @@ from backlash_ros.core.estimation.fit.relabelling import (
     with_walk,
 )
 from backlash_ros.core.estimation.fit.solution import Around
-from backlash_ros.core.estimation.fit.window_fit import PAST, weights_of
+from backlash_ros.core.estimation.fit.window_fit import PAST
 from backlash_ros.core.estimation.moving_horizon.change_detection import change, note_block
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.observer.attribution import attributed
 from backlash_ros.core.estimation.observer.observer import Observer
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.estimation.regression.readings import weights_of
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gear_runs import FIRST, MOTIONS, PERIODS, PRESETS, oracle
 from reporting import ROOT
 
 from backlash_ros.core.assembly import build_controller
@@ -30,6 +29,7 @@ from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.config.configuration import effective_parameters
 from backlash_ros.tools.report.command import open_source
+from gears.gear_runs import FIRST, MOTIONS, PERIODS, PRESETS, oracle
 
 DRIVER = ROOT / 'examples' / 'mujoco_gear.py'
 MOTION = 'sine'

@@ -16,12 +16,12 @@ from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
-from gear_runs import PRESETS, Gear, close_loop, identified, learning
 from reporting import ROOT
 from tqdm import tqdm
 
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.identification.identification import Options
+from gears.gear_runs import PRESETS, Gear, close_loop, identified, learning
 
 INERTIA, BANDWIDTH = (0.01, 30.0), (2.0, 100.0)
 HEAVY_MOTOR, DAMPED = 1000.0, 0.8  # times the load, so that friction hardly turns it back; ratio
@@ -33,7 +33,7 @@ COASTS = 'the load coasts'  # in what is said
 FILE = ROOT / 'results' / 'physics_map.jsonl'
 # A result is taken from the file only where all that it depends on is as it was.
 SOURCES = ('backlash_ros/core/**/*.py', 'backlash_ros/tools/identify/identified_file.py',
-           'benchmarks/gear_map.py', 'benchmarks/gear_runs.py', 'examples/gear_physics.py')
+           'benchmarks/gears/*.py', 'examples/gear_physics.py')
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from gear_map import BANDWIDTH, INERTIA, OFF, Cell
-from gear_runs import PRESETS, quasi_static
+
+from gears.gear_map import BANDWIDTH, INERTIA, OFF, Cell
+from gears.gear_runs import PRESETS, quasi_static
 
 mpl.use('Agg')
 import matplotlib.pyplot as plt

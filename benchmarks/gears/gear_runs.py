@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
+sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 
 from gear_physics import PRESETS, Gear, GearPhysics
 
