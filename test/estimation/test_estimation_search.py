@@ -245,3 +245,12 @@ def test_gap_that_a_prior_leaves_open_is_no_better_known_for_its_labels() -> Non
     fit = fit_from(v, y, truth, 0.0, known)
     open_gap = drained(with_other_gaps(v, y, fit, Prior(theta, cov), Pace())).solution.std_gap
     assert open_gap == pytest.approx(sqrt(0.02), rel=0.3)
+
+
+def test_few_samples_say_nothing_of_other_gaps() -> None:
+    prior = Prior(Truth().theta, np.diag([1e-4, 0.01, 0.01]))
+    known = around(0.0)._replace(prior=prior)
+    for count in (1, 2, 3, 4, 6):
+        v = swing(count)
+        fit = fit_from(v, output(MODEL, v, Truth()), Truth(), 0.0, known)
+        assert drained(with_other_gaps(v, output(MODEL, v, Truth()), fit, prior, Pace()))

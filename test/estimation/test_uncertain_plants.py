@@ -29,14 +29,29 @@ from accuracy.uncertain_runs import NAMES, _longest, _swaps, run_job
 
 from backlash_ros.core.assembly import build_controller, build_model, build_true_model
 from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.tools.config.configuration import load_config
 
 PERIOD = 0.005
+SHIPPED = Path(__file__).resolve().parents[2] / 'config'
 
 
 def motor_job(case: dict[str, object], seconds: float, **changes: object) -> Job:
     [job] = motor_jobs({'case': case}, [3], seconds, **changes)
     return job
+
+
+def test_a_triangle_read_by_an_encoder_is_learned_from() -> None:
+    # One speed tells a lag from a gap at the turns alone, and rounding repeats with the motion.
+    p = load_config(SHIPPED / 'geared_motor.yaml')
+    record = build_closed_loop(Parameters({**p, 'waveform': 'triangle'})).run(1600)
+    later = slice(1000, None)
+    assert np.mean(record.column('status')[later] == Status.TRACKING) > 0.8
+    for name in NAMES:
+        true = record.column(f'true_{name}')[later]
+        assert np.abs(record.column(name)[later] / true - 1.0).max() < 0.01
 
 
 def test_cases_are_single_differences_and_pairs_of_different_kinds() -> None:

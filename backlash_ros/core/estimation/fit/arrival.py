@@ -24,7 +24,7 @@ def arrival(part: Fitted, contested: bool) -> Prior | None:
     around, solution = part.around, part.solution
     if not solution.m > 0.0:
         return around.prior
-    if around.prior is None or around.error.count == 0:
+    if around.prior is None or not around.inherited:
         return solution.of_theta
     if solution.count <= part.fit.layout.unknowns:
         return around.prior

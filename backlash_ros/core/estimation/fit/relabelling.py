@@ -29,7 +29,13 @@ from backlash_ros.core.estimation.fit.learned_error import wants_another_model
 from backlash_ros.core.estimation.fit.low_order import OutputError, low_order
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance
-from backlash_ros.core.estimation.fit.search import Candidate, Comparison, gap_spread, search
+from backlash_ros.core.estimation.fit.search import (
+    Candidate,
+    Comparison,
+    gap_spread,
+    search,
+    too_few,
+)
 from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.play import Start
@@ -151,11 +157,10 @@ def with_other_gaps(
     """A fit with a prior whose gap is no better known than over all that explain the samples."""
     known, around = _gap_of(prior), result.around
     gap, std = result.solution.gap, result.solution.std_gap
-    if known is None or not known[1] > std:
+    weights = weights_of(y)
+    if known is None or not known[1] > std or too_few(y, weights, around.model):
         return result
-    comparison = Comparison(
-        v, y, weights_of(y), around.model, around.error, around.told_std
-    )
+    comparison = Comparison(v, y, weights, around.model, around.error, around.told_std)
     spread = yield from gap_spread(comparison, (), gap, std, known, pace)
     return result.with_gap_spread(spread)
 

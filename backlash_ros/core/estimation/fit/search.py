@@ -59,7 +59,7 @@ def search(
     swing = float(np.ptp(v))
     top = min(swing, widest)
     if not (top > 0.0 and NO_GAP * swing > 0.0) \
-            or float(weights[np.isfinite(y)].sum()) <= model.order + 3:
+            or too_few(y, weights, model):
         return Found([], 0.0)
     comparison = Comparison(v, y, weights, model, error, told_std)
     null = comparison.null
@@ -96,6 +96,11 @@ def gap_spread(
         evidence = evidence - 0.5 * ((gaps - prior[0]) / prior[1]) ** 2
     share = np.gradient(gaps) * np.exp(evidence - evidence.max())
     return sqrt(float(share @ (gaps - gap) ** 2 / share.sum()))
+
+
+def too_few(y: Array, weights: Array, model: StateModel) -> bool:
+    """Whether so few samples tell nothing of a gap."""
+    return float(weights[np.isfinite(y)].sum()) <= model.order + 3
 
 
 class Comparison:

@@ -27,7 +27,9 @@ class Around(NamedTuple):
     model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that
     of the error of the G that was told, once this one was moved to where the data want it: it is no
     better known for that. most: largest scale that is believed. walk: deviation by which a
-    disturbance of u walks over the record [unit of u], 0 for none.
+    disturbance of u walks over the record [unit of u], 0 for none. inherited: whether the backlash
+    was known before the first sample: then what contradicts it needs more to be believed than where
+    samples of this run alone have told it.
     """
 
     model: StateModel
@@ -37,6 +39,7 @@ class Around(NamedTuple):
     scale: float = 0.0
     most: float = inf
     walk: float = 0.0
+    inherited: bool = False
 
     def moved_to(self, model: StateModel) -> Around:
         """The same around another G with as many moving poles."""

@@ -14,7 +14,7 @@ from math import inf, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, SLOW
+from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, LAGS, SLOW
 from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.prior import contradicts
 from backlash_ros.core.estimation.fit.solution import Around, Solution
@@ -32,6 +32,7 @@ from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
+NEXT = (1,)  # lag of successive residuals
 PAST = 3  # memories of G for which what its error does may last
 STEP_SAMPLES = 64  # samples over which the size of a column is told
 # --- guards
@@ -182,7 +183,7 @@ class WindowFit:
         triangle, offset, prior = self._triangle, 0.0, self.around.prior
         own: Solution | None = None
         if prior is not None and not alone:
-            if self.around.error.count and triangle.count > layout.unknowns:
+            if self.around.inherited and triangle.count > layout.unknowns:
                 own = self.solve(walk, leaking, alone=True)
             # What the model cannot explain of these samples makes the prior no worse.
             cov = prior.cov if own is None else prior.cov / own.inflation
@@ -197,7 +198,9 @@ class WindowFit:
         count = self._triangle.count
         correlation = 0.0
         if squares > count * (NO_RESIDUAL * self.extent[0]) ** 2 and count > 1.0:
-            correlation = max(0.0, largest_correlation(residual) - BY_CHANCE / sqrt(count))
+            # A sensor with a resolution repeats its error over some lags as well.
+            lags = LAGS if self.around.inherited else NEXT
+            correlation = max(0.0, largest_correlation(residual, lags) - BY_CHANCE / sqrt(count))
         inflation = own.inflation if own else 1.0 - correlation + count * correlation
         posterior = self._with_other_labels(posterior, inflation)
         now = self._theta_now()

@@ -68,7 +68,7 @@ def confirmed(
     free: a fit without it, if there is one.
     """
     current, pace = learning.current, learning.pace
-    prior = prior_of(inherited, learning.held)
+    prior = prior_of(inherited, learning.held if learning.around.inherited else None)
     # G is no worse known than it was: it does not explain whatever has happened.
     most = TOLD if current is None else current.solution.posterior.scale
     alone = learning.free._replace(most=most)

@@ -82,7 +82,7 @@ def halve(learning: Learning) -> Task:
     if not (contradicts(newer.solution.of_theta, whole)
             or learning.drifts_more(newer.solution, half)):
         return False
-    if around.error.count:
+    if around.inherited:
         known = learning.around.prior
         # A lag may pass for a gap, and what was known before the record may hold on.
         if not learning.reversed_often(newer.fit) or not (
@@ -129,7 +129,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         found = yield from searched(v, y, around, learning.widest, learning.pace)
         if found is not None:
             changes.append(found)
-            if learning.reversed_often(found.fit) \
+            if (learning.reversed_often(found.fit) or not around.inherited) \
                     and learning.usable(found, REPLACING) is not None \
                     and found.solution.rms <= bound \
                     and _has_changed(current, found, whole, first == record.first):

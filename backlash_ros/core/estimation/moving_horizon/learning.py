@@ -121,6 +121,8 @@ class Learning:
     @property
     def unchanged(self) -> Around:
         """Free, but for G: another backlash leaves it as well known as it was."""
+        if not self.around.inherited:
+            return self.free
         return self.free._replace(most=self.fit.solution.posterior.scale)
 
     @property
@@ -164,7 +166,7 @@ class Learning:
         What no backlash and no G explains is an error that lasts: all of what chance makes of the
         deviations has to be small, not one of them.
         """
-        lasting = self.around.error.count > 0 and self.fit.solution.moved_otherwise
+        lasting = self.around.inherited and self.fit.solution.moved_otherwise
         return 1.0 / BY_CHANCE if lasting else 1.0
 
     def judged(self, found: Crossings | None, estimate: Estimate, held: Array | None) -> Belief:

@@ -56,7 +56,11 @@ class MovingHorizon:
         self.covariance: Array | None = None
         """Covariance of (m, c_r, c_l) behind the published deviations, shape (3, 3)."""
         self.failed_fits = 0
-        told = Around(model, build_error_model(model, uncertainty), max(noise_std, SMALLEST_NOISE))
+        error = build_error_model(model, uncertainty)
+        told = Around(
+            model, error, max(noise_std, SMALLEST_NOISE),
+            inherited=initial.learned and error.count > 0,
+        )
         self._learning = Learning(
             bounds, told, walk_std, np.array(drift_std) * sample_period**0.5, told
         )
@@ -285,10 +289,10 @@ class MovingHorizon:
         current = learning.fit
         if learning.confirm():
             # The estimate was that of another plant.
-            exact = learning.around.error.count == 0
-            learning.begin_acquisition(None if exact else self.estimate)
+            kept = learning.around.inherited
+            learning.begin_acquisition(self.estimate if kept else None)
             learning.reason = Status.INCONSISTENT
-            if exact:
+            if not kept:
                 self.covariance = learning.held = None
             return
         found = learning.usable(current, learning.share)

@@ -115,12 +115,13 @@ def _shortened(
     gone = LONGEST // 3
     v, y = record.since(record.first)
     prior: Prior | None = None
-    if around.error.count or solution.correlation == 0.0:
+    if around.inherited or (around.error.count == 0 and solution.correlation == 0.0):
         part = yield from fitted(v[:gone], y[:gone], around, fit.start, solution.m, learning.pace)
         known = arrival(part, solution.contested)
         if known is not None:
             prior = drifted(*known, learning.drift, len(v) - gone)
-    around = around._replace(prior=prior, most=inf)
+    most = around.most if prior is not None and not around.inherited else inf
+    around = around._replace(prior=prior, most=most)
     return around, fit.start_after(v[:gone]), record.first + gone
 
 

@@ -6,13 +6,13 @@ over two or eight.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import LAGS
 
-
-def largest_correlation(residual: NDArray[np.float64]) -> float:
-    """Largest correlation of a residual (N,), not all 0, with itself some samples before."""
+def largest_correlation(residual: NDArray[np.float64], lags: Sequence[int]) -> float:
+    """Largest correlation of a residual (N,), not all 0, with itself so many samples before."""
     squares = float(residual @ residual)
-    return max(float(residual[lag:] @ residual[:-lag]) / squares for lag in LAGS)
+    return max(float(residual[lag:] @ residual[:-lag]) / squares for lag in lags)
