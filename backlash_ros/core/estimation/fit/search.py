@@ -90,7 +90,10 @@ def gap_spread(
     places = gap + std * NEAR
     if prior is not None:
         places = np.append(places, prior[0] + prior[1] * FAR)
-    close = yield from comparison.best_per_gap(places[places > 0.0], 2 * STARTS - 1, pace)
+    places = places[places > 0.0]
+    if len(places) < 2:
+        return 0.0
+    close = yield from comparison.best_per_gap(places, 2 * STARTS - 1, pace)
     gaps, evidence = np.unique([(one.gap, one.evidence) for one in (*known, *close)], axis=0).T
     if prior is not None:
         evidence = evidence - 0.5 * ((gaps - prior[0]) / prior[1]) ** 2
