@@ -25,9 +25,7 @@ settings.register_profile(
 settings.register_profile('search', deadline=None, max_examples=1000)
 settings.load_profile('repeatable')
 
-STARTS_PROCESSES = {
-    'bringup_processes', 'gears.gear_processes', 'paced_driver', 'ros_processes',
-}
+STARTS_PROCESSES = {'bringup_processes', 'paced_driver', 'ros_processes'}
 # Their tests look at the same runs, so one worker of pytest-xdist makes these for all of them.
 SHARE_RUNS = {
     'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify', 'test_live',
