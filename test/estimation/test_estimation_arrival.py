@@ -61,8 +61,8 @@ def test_unexplained_motion_makes_what_was_known_no_worse() -> None:
 def test_what_contradicts_what_was_known_widens_it() -> None:
     wrong = Prior(1.2 * THETA, np.diag([1e-3, 1e-3, 1e-3])**2)
     part = fit_of(wrong)
-    assert part.solution.contested
-    assert not fit_of(Prior(THETA, wrong.cov)).solution.contested
+    assert part.contested
+    assert not fit_of(Prior(THETA, wrong.cov)).contested
     doubted, kept = arrival(part, contested=True), arrival(part, contested=False)
     assert np.trace(doubted.cov) > 10.0 * np.trace(kept.cov)
 

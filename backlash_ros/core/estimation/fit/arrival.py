@@ -26,9 +26,9 @@ def arrival(part: Fitted, contested: bool) -> Prior | None:
         return around.prior
     if around.prior is None or not around.inherited:
         return solution.of_theta
-    if solution.count <= part.fit.layout.unknowns:
-        return around.prior
-    alone = part.fit.solve(alone=True).of_theta
+    if solution.alone is None:
+        return around.prior  # so few samples say nothing alone
+    alone = solution.alone.of_theta
     return intersected(*(_doubted(around.prior, alone) if contested else (around.prior, alone)))
 
 

@@ -28,7 +28,7 @@ from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.learned_error import wants_another_model
 from backlash_ros.core.estimation.fit.low_order import OutputError, low_order
 from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance
+from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance, contradicts
 from backlash_ros.core.estimation.fit.search import (
     Candidate,
     Comparison,
@@ -78,12 +78,21 @@ class Fitted(NamedTuple):
         prior = self.around.prior
         return prior is None or not beyond_chance(self.solution.theta - prior.theta, prior.cov)
 
+    @property
+    def contested(self) -> bool:
+        """Whether the samples alone contradict what is known from elsewhere."""
+        prior, alone = self.around.prior, self.solution.alone
+        return prior is not None and alone is not None and contradicts(alone.of_theta, prior)
+
     def with_gap_spread(self, spread: float) -> Fitted:
         """The same with a gap that is no better known than by this deviation.
 
         One that the labels leave anyhow says nothing of other gaps.
         """
-        self.fit.gap_spread = spread if spread > SAME * self.solution.std_gap else 0.0
+        spread = spread if spread > SAME * self.solution.std_gap else 0.0
+        if spread == self.fit.gap_spread:
+            return self
+        self.fit.gap_spread = spread
         return self._replace(solution=self.fit.solve())
 
     def beginning(self, v: Array) -> Start:

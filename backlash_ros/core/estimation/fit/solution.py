@@ -54,7 +54,7 @@ class Solution:
     solution, start: p of the solution at the start. count: samples that count, repeated readings
     once. correlation: of the residual with itself, beyond chance. inflation: 1 - rho + N rho, by
     which the covariance is widened; beside a prior, that of the samples alone. rms: of the
-    residual. contested: whether the samples alone contradict what is known from elsewhere.
+    residual. alone: of the samples without their prior, None where that was not asked for.
     """
 
     posterior: Posterior
@@ -67,7 +67,7 @@ class Solution:
     correlation: float
     inflation: float
     rms: float
-    contested: bool
+    alone: Solution | None
 
     @property
     def m(self) -> float:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, LAGS, SLOW
 from backlash_ros.core.estimation.fit.crossings import crossings_of
-from backlash_ros.core.estimation.fit.prior import contradicts
 from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.regression.play import NO_PAST, Labels, Start
 from backlash_ros.core.estimation.regression.posterior import (
@@ -215,7 +214,7 @@ class WindowFit:
             posterior, theta, cov, crossings_of(theta, cov),
             float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
             inflation, sqrt(squares / max(count, 1.0)),
-            own is not None and prior is not None and contradicts(own.of_theta, prior),
+            own,
         )
 
     def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:

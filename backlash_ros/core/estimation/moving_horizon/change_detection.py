@@ -94,7 +94,7 @@ def halve(learning: Learning) -> Task:
         older = yield from fitted(
             v[:half], y[:half], learning.around._replace(walk=0.0), fit.start, solution.m, pace
         )
-        prior = learning.drifted(older.solution, half)
+        prior = learning.drifted(older.solution.of_theta, half)
         if older.solution.m > 0.0 and not contradicts(newer.solution.of_theta, prior):
             newer = yield from fitted(
                 v[half:], y[half:], around._replace(prior=prior), newer.fit.start, solution.m, pace

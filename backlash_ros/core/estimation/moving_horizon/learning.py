@@ -169,15 +169,16 @@ class Learning:
         lasting = self.around.inherited and self.fit.solution.moved_otherwise
         return 1.0 / BY_CHANCE if lasting else 1.0
 
-    def judged(self, found: Crossings | None, estimate: Estimate, held: Array | None) -> Belief:
+    def judged(self, found: Crossings | None, estimate: Estimate) -> Belief:
         """What becomes of a fit beside the estimate that held so far.
 
-        found: what the fit says, None if it is of no use. held: covariance (3, 3) of that estimate.
+        found: what the fit says, None if it is of no use.
         Few samples can be fitted by a backlash that never was, and so can many where y moves
         otherwise: after a contradiction a fit has to foretell some, before it says something else
         or says it less precisely.
         """
-        if found is None or self.fit.solution.contested:
+        held = self.held
+        if found is None or self.fit.contested:
             return Belief.REFUSED
         if held is None:
             return Belief.REPLACES
@@ -204,7 +205,7 @@ class Learning:
         prior, (fit, solution, _) = self.unconfirmed, self.fit
         if prior is None or not self.reversed_often(fit):
             return False
-        alone = fit.solve(alone=True)
+        alone = solution.alone or fit.solve(alone=True)
         found = alone.crossings
         if found is None or not is_precise(found, fit.swing):
             return False
@@ -222,9 +223,9 @@ class Learning:
             return False
         return bool(np.any(self.drift**2 * (samples / 3.0) > np.diag(found.cov)))
 
-    def drifted(self, solution: Solution, samples: int) -> Prior:
-        """What a solution says of theta after so many samples of drift."""
-        return drifted(solution.theta, solution.theta_cov, self.drift, samples)
+    def drifted(self, known: Prior, samples: int) -> Prior:
+        """What was known of theta after so many samples of drift."""
+        return drifted(*known, self.drift, samples)
 
     def begin_acquisition(self, inherited: Estimate | None) -> None:
         """Look for the backlash afresh; inherited: what is believed unless the samples deny it."""
@@ -259,7 +260,7 @@ class Learning:
         if current is None:
             self.begin_acquisition(self.acquisition.inherited)
             return
-        self.around = self.around._replace(prior=arrival(current, current.solution.contested))
+        self.around = self.around._replace(prior=arrival(current, current.contested))
         fit = current.fit.restarted(self.around, start)
         self.current = Fitted(fit, fit.solve())
         self.refit_at = FIRST_SEARCH

@@ -53,8 +53,6 @@ class MovingHorizon:
         uncertainty: float, observer: FixedBacklash | None = None,
     ) -> None:
         self.estimate = replace(initial, status=Status.ACQUIRING)
-        self.covariance: Array | None = None
-        """Covariance of (m, c_r, c_l) behind the published deviations, shape (3, 3)."""
         self.failed_fits = 0
         error = build_error_model(model, uncertainty)
         told = Around(
@@ -77,6 +75,11 @@ class MovingHorizon:
     def model(self) -> StateModel:
         """The G that x_hat is the state of."""
         return self._following.model
+
+    @property
+    def covariance(self) -> Array | None:
+        """Covariance of (m, c_r, c_l) behind the published deviations, shape (3, 3)."""
+        return self._learning.held
 
     @property
     def u_hat(self) -> float:
@@ -293,10 +296,10 @@ class MovingHorizon:
             learning.begin_acquisition(self.estimate if kept else None)
             learning.reason = Status.INCONSISTENT
             if not kept:
-                self.covariance = learning.held = None
+                learning.held = None
             return
         found = learning.usable(current, learning.share)
-        belief = learning.judged(found, self.estimate, self.covariance)
+        belief = learning.judged(found, self.estimate)
         if belief is Belief.REPLACES and found is not None:
             self._take_over(found)
         if belief is Belief.REFUSED:
@@ -309,7 +312,7 @@ class MovingHorizon:
 
     def _take_over(self, found: Crossings) -> None:
         m, c_r, c_l = self._learning.bounds.project(found.m, found.c_r, found.c_l)
-        self.covariance = self._learning.held = found.cov
+        self._learning.held = found.cov
         self.estimate = Estimate(
             m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
             self.estimate.status,

@@ -17,7 +17,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.prior import Prior, drifted
+from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
@@ -85,14 +85,16 @@ def refit(learning: Learning) -> Task:
             v, y, beginning, start, current.solution.m, learning.pace
         )))
     result = yield from with_walk(v, y, most_likely(results), learning.pace)
-    if len(v) <= SEARCHED and around.prior is None:
+    if len(v) > SEARCHED:
+        return learning.go_on_from(result, first)
+    if around.prior is None:
         # The gap of a short record may be one of several.
         other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
         if other is not None:
             result = result.with_gap_spread(other.fit.gap_spread)
             if learning.usable(other) is not None:
                 result = most_likely([result, other])
-    elif len(v) <= SEARCHED and around.prior is not None:
+    else:
         result = yield from with_other_gaps(v, y, result, around.prior, learning.pace)
     return learning.go_on_from(result, first)
 
@@ -117,9 +119,9 @@ def _shortened(
     prior: Prior | None = None
     if around.inherited or (around.error.count == 0 and solution.correlation == 0.0):
         part = yield from fitted(v[:gone], y[:gone], around, fit.start, solution.m, learning.pace)
-        known = arrival(part, solution.contested)
+        known = arrival(part, current.contested)
         if known is not None:
-            prior = drifted(*known, learning.drift, len(v) - gone)
+            prior = learning.drifted(known, len(v) - gone)
     most = around.most if prior is not None and not around.inherited else inf
     around = around._replace(prior=prior, most=most)
     return around, fit.start_after(v[:gone]), record.first + gone
