@@ -19,7 +19,8 @@ from scipy.signal import lfilter
 from backlash_ros.core.estimation.constants import GAPS, NO_GAP, STARTS, ZOOM
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.regression.error_model import ErrorModel
-from backlash_ros.core.estimation.regression.posterior import NOISE_WEIGHT, SCALES
+from backlash_ros.core.estimation.regression.play import plays
+from backlash_ros.core.estimation.regression.posterior import NOISE_WEIGHT, RATIOS
 from backlash_ros.core.estimation.regression.regressors import held
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -156,12 +157,7 @@ class Comparison:
 
     def _compare(self, gaps: Array, starts: Array) -> tuple[Array, Array]:
         """Evidence and slope of each pair, shape (H,)."""
-        p = np.empty((len(self._v), len(gaps)))
-        held = starts.copy()
-        for k, value in enumerate(self._v.tolist()):
-            np.maximum(held, value, out=held)
-            np.minimum(held, value + gaps, out=held)
-            p[k] = held
+        p = plays(self._v, gaps, starts)
         moved = self._projected(self._filtered(p.T))
         energy = np.einsum('hn,hn->h', moved, moved)
         still = energy <= 0.0  # v never engaged: all is in common
@@ -185,11 +181,11 @@ class Comparison:
         z2 = np.minimum(z2, squares[:, None])
         s = s * (slopes**2)[:, None]
         squares = np.maximum(squares - z2.sum(axis=1), 0.0) + self._told
-        ratios = np.append(0.0, SCALES**2)[None, :, None] * (self._freedom / squares)[:, None, None]
+        ratios = RATIOS[None, :, None] * (self._freedom / squares)[:, None, None]
         shrink = 1.0 / (1.0 + ratios * s[:, None, :])
         left = squares[:, None] + (shrink * z2[:, None, :]).sum(axis=2)
         evidence = 0.5 * np.log(shrink).sum(axis=2) + self._log_likelihood(left)
-        evidence -= 0.5 * np.append(0.0, SCALES**2)  # as posterior.py has it
+        evidence -= 0.5 * RATIOS  # as posterior.py has it
         return evidence.max(axis=1), slopes
 
     def _log_likelihood(self, squares: Array | float) -> Array:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.backlash import clamp
+from backlash_ros.core.plant.backlash import play_outputs
 
 Array = NDArray[np.float64]
 
@@ -76,13 +76,28 @@ def labels_from(
 
 def play(v: Array, gap: float, p0: float) -> tuple[Array, NDArray[np.int8]]:
     """Play output p (N,) and side engaged at each sample: 1 right, -1 left, 0 in the gap."""
-    p: list[float] = []
-    held = p0
-    for value in v.tolist():
-        held = clamp(held, value, value + gap)
-        p.append(held)
-    out = np.array(p)
-    return out, np.where(out == v, 1, np.where(out == v + gap, -1, 0)).astype(np.int8)
+    p = np.array(play_outputs(v.tolist(), gap, p0))
+    return p, np.where(p == v, 1, np.where(p == v + gap, -1, 0)).astype(np.int8)
+
+
+def plays(v: Array, gaps: Array, p0: Array) -> Array:
+    """Play output for many gaps (H,) and starts (H,), shape (N, H).
+
+    Only where v turns it has to be stepped: while v rises, p = max(p, v) with the p of the turn
+    before; while it falls, p = min(p, v + gap).
+    """
+    rising = np.diff(v, prepend=v[0]) > 0.0
+    last: Array = np.append(np.flatnonzero(rising[1:] != rising[:-1]), len(v) - 1)
+    held = np.minimum(np.maximum(p0, v[0]), v[0] + gaps)
+    before = np.empty((len(last), len(gaps)))
+    for k, (value, up) in enumerate(zip(v[last].tolist(), rising[last].tolist(), strict=True)):
+        before[k] = held
+        held = np.maximum(held, value) if up else np.minimum(held, value + gaps)
+    p = np.repeat(before, np.diff(last, prepend=-1), axis=0)
+    left = v[:, None] + gaps
+    np.maximum(p, v[:, None], out=p, where=rising[:, None])
+    np.minimum(p, left, out=p, where=~rising[:, None])
+    return p
 
 
 class Start(NamedTuple):

@@ -13,6 +13,7 @@ Bayesian interpolation, Neural Computation 4 (1992) 415-447.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from math import exp, log, log1p, sqrt
 
 import numpy as np
@@ -24,6 +25,7 @@ Array = NDArray[np.float64]
 NOISE_WEIGHT = 1.0  # samples that the told noise level counts for
 # Scales s of the error of G that are compared, besides none, in units of the spread of the prior.
 SCALES = np.geomspace(1e-4, 10.0, 21)
+RATIOS = np.append(0.0, SCALES**2)
 SAME = 0.7  # ratio of scales that the grid does not tell apart
 # --- guards
 LARGEST_EXPONENT = 700.0  # of a number that still is one
@@ -61,7 +63,7 @@ class Triangle:
         stacked = np.empty((size + len(y), size), order='F')
         stacked[:size], stacked[size:, :-1], stacked[size:, -1] = self.r, rows, y
         factored = lapack.dgeqrf(stacked, overwrite_a=1)[0]
-        self.r = np.triu(factored[:size])
+        self.r = np.where(_upper(size), factored[:size], 0.0)
         self.count += count
 
     def informed(self, where: slice, mean: Array, cov: Array, told_std: float) -> Triangle:
@@ -76,7 +78,9 @@ class Triangle:
         size = len(self.r) - 1
         other = Triangle(np.zeros(size - 1))
         other.count = self.count
-        other.r = np.triu(lapack.dgeqrf(np.delete(self.r, column, axis=1))[0][:size])
+        kept = np.empty((size + 1, size), order='F')
+        kept[:, :column], kept[:, column:] = self.r[:, :column], self.r[:, column + 1:]
+        other.r = np.where(_upper(size), lapack.dgeqrf(kept, overwrite_a=1)[0][:size], 0.0)
         return other
 
     def log_precision(self, first: int, last: int) -> float:
@@ -130,7 +134,7 @@ class Triangle:
         u, s, vt = np.linalg.svd(r[base:size, base:size] * weights)
         z = u.T @ r[base:size, size]
         # Grid of (s / sigma)^2, the form in which sigma can be integrated out.
-        ratios = np.append(0.0, SCALES**2 * (freedom / squares))[:, None]
+        ratios = (RATIOS * (freedom / squares))[:, None]
         shrink = 1.0 / (1.0 + ratios * (s * s))
         left = squares + shrink @ (z * z)
         evidence = 0.5 * np.log(shrink).sum(axis=1) - 0.5 * weight * np.log(left / weight)
@@ -167,12 +171,23 @@ class Triangle:
         )
 
 
+@lru_cache(maxsize=64)
+def _upper(size: int) -> NDArray[np.bool_]:
+    """Where the triangle of a square matrix is."""
+    return np.triu(np.ones((size, size), dtype=np.bool_))
+
+
 def with_zero(posterior: Posterior, where: int) -> Posterior:
     """The same with one more unknown, which is known to be 0."""
-    return replace(
-        posterior, mean=np.insert(posterior.mean, where, 0.0),
-        cov=np.insert(np.insert(posterior.cov, where, 0.0, axis=0), where, 0.0, axis=1),
-    )
+    size = len(posterior.mean) + 1
+    mean, cov = np.zeros(size), np.zeros((size, size))
+    before, after = slice(where), slice(where + 1, None)
+    mean[before], mean[after] = posterior.mean[before], posterior.mean[where:]
+    cov[before, before] = posterior.cov[before, before]
+    cov[before, after] = posterior.cov[before, where:]
+    cov[after, before] = posterior.cov[where:, before]
+    cov[after, after] = posterior.cov[where:, where:]
+    return replace(posterior, mean=mean, cov=cov)
 
 
 def mixture(one: Posterior, other: Posterior, bonus: float) -> Posterior:
