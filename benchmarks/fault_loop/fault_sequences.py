@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from itertools import product
 from math import inf, isfinite
 
@@ -40,8 +41,18 @@ NEGLIGIBLE = 1e-3  # of m and of the gap: an error that is none, however small t
 WITHOUT = 0.2  # of m and of the gap: an error of laws without deviations that is wrong
 JUMP = 2.5  # usual moves of v in the first one after an interruption
 LEARNED_MOVES = 50  # commands from which it is known which moves are usual
-NOTHING, AFTER = 'nothing yet', '; after: '
+NOTHING = 'nothing yet'
 TWICE = 2.0  # an interruption may ask for what the reference alone does not
+
+
+class Without(Enum):
+    """What a sequence may be played without, to tell what its findings are due to."""
+
+    NOTHING = auto()
+    ERROR_OF_G = auto()
+    TOLD_NOISE = auto()
+    WRONG_READINGS = auto()
+    EVENTS = auto()
 
 
 @dataclass
@@ -115,16 +126,24 @@ def parameters_of(rng: np.random.Generator) -> tuple[Parameters, float]:
 class Sequence:
     """One loop, and what happens to it. told: called with what happens, for a reader."""
 
-    def __init__(self, seed: int, told: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(
+        self, seed: int, told: Callable[[str], None] = lambda text: None,
+        without: Without = Without.NOTHING,
+    ) -> None:
         self.rng = rng = np.random.default_rng([seed, 13])
         self.findings = Findings()
-        self._told = told
+        self._told, self._without = told, without
         while True:
             try:
                 self.p, swing = parameters_of(rng)
                 break
             except ParameterError:
                 continue  # a plant that is refused
+        if without is Without.ERROR_OF_G:
+            self.p = self.p.replaced({'truth.scale_frequency': 1.0})
+        if without is Without.TOLD_NOISE:
+            noise = self.p.get_float('output_noise_std')
+            self.p = self.p.replaced({'estimator.output_noise_std': noise})
         p = self.p
         self.actuator = Actuator()
         self.driver = Driver(
@@ -181,6 +200,8 @@ class Sequence:
         """Let something happen."""
         rng = self.rng
         what = str(rng.choice(EVENTS))
+        if self._without is Without.EVENTS:
+            return
         self._told(f'{tick}: {what}')
         self._lately = what
         EVENTS_BY_NAME[what](self, tick)
@@ -189,10 +210,11 @@ class Sequence:
 
     def _fail_sensor(self, tick: int) -> None:
         sensor = self.driver.sensor
-        sensor.fault = str(self.rng.choice(SENSOR_FAULTS))
+        fault = str(self.rng.choice(SENSOR_FAULTS))
+        sensor.fault = '' if self._without is Without.WRONG_READINGS else fault
         sensor.value = sensor.swing * float(self.rng.uniform(-1.0, 1.0))
-        self._told(f'    {sensor.fault}')
-        self._lately += f': {sensor.fault}'
+        self._told(f'    {fault}')
+        self._lately += f': {fault}'
         self._end_later(tick, lambda: setattr(sensor, 'fault', ''))
 
     def _lose(self, tick: int) -> None:
@@ -379,7 +401,7 @@ class Sequence:
             f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
             f'm {e.m:.5g} ({m:.5g}) ± {e.std_m:.2g}, '
             f'c_r {e.c_r:.5g} ({c_r:.5g}) ± {e.std_c_r:.2g}, '
-            f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}{AFTER}{self._lately}'
+            f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}; after: {self._lately}'
         )
 
     def _conclude(self) -> None:
