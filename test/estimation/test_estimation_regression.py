@@ -64,7 +64,8 @@ class Problem:
     def dense(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Mean, covariance and variance of the noise over all ratios, each with its evidence."""
         evidence = np.array([self.evidence(ratio) for ratio in self.ratios()])
-        share = np.exp(evidence - evidence.max())
+        # Of a grid of log s each s stands for as much of s as it is large.
+        share = np.append(SCALES[0], SCALES) * np.exp(evidence - evidence.max())
         share /= share.sum()
         means, covs, noise = zip(*(self.given(ratio) for ratio in self.ratios()), strict=True)
         mean = share @ np.array(means)

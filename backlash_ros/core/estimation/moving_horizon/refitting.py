@@ -77,10 +77,12 @@ def refit(learning: Learning) -> Task:
     start = start.with_gap(current.solution.gap, v)
     results: list[Fitted] = []
     # The G that was told is as good a beginning as one that was moved; the scale that is found for
-    # its error holds for both.
+    # its error holds for both, whether or not this fit has moved it.
     for beginning in reversed(learning.beginnings(around)):
         if results:
-            beginning = beginning._replace(scale=results[0].around.scale)
+            told = results[0]
+            scale = max(told.around.scale, told.solution.posterior.scale)
+            beginning = beginning._replace(scale=scale)
         results.insert(0, (yield from fitted_with_model(
             v, y, beginning, start, current.solution.m, learning.pace
         )))

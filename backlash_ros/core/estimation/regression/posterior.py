@@ -26,6 +26,7 @@ NOISE_WEIGHT = 1.0  # samples that the told noise level counts for
 # Scales s of the error of G that are compared, besides none, in units of the spread of the prior.
 SCALES = np.geomspace(1e-4, 10.0, 21)
 RATIOS = np.append(0.0, SCALES**2)
+STEPS = np.append(SCALES[0], SCALES)
 SAME = 0.7  # ratio of scales that the grid does not tell apart
 # --- guards
 LARGEST_EXPONENT = 700.0  # of a number that still is one
@@ -147,7 +148,8 @@ class Triangle:
         best = int(np.argmax(evidence))
         if not np.isfinite(evidence[best]):
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
-        share = np.exp(evidence - evidence[best])
+        # The grid is one of the logarithm of s: each scale stands for as much of s as it is large.
+        share = STEPS * np.exp(evidence - evidence[best])
         share /= share.sum()
         noise_var = float(share @ left) / freedom
         # The mixture over all scales: its mean, its mean covariance, and that of its means.
