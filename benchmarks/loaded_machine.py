@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from real_time.loop_latency import NODES, processes
+from real_time.node_processes import NODES, processes
 from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
 from std_msgs.msg import Float64MultiArray
 

@@ -21,13 +21,8 @@ os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from real_time.loop_latency import (
-    LATENCY_HEADER,
-    measure_latency,
-    node_command,
-    processes,
-    wait_for_event,
-)
+from real_time.loop_latency import LATENCY_HEADER, measure_latency
+from real_time.node_processes import node_command, processes, wait_for_event
 from reporting import CHECK_HEADER, ROOT, Check, text_table
 from scipy import linalg, signal
 

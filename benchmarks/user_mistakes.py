@@ -34,7 +34,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from real_time.loop_latency import NODES
+from real_time.node_processes import NODES
 from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
 
 from backlash_ros import topics

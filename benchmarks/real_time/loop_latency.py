@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -29,18 +27,20 @@ from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
-from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
+from real_time.node_processes import (
+    DEADLINE_S,
+    check_running,
+    node_command,
+    processes,
+    wait_for_event,
+)
 
 RATES_HZ = (100.0, 1000.0)
 BLOCK, SETTLE = 50, 10  # samples of a block, and how many of them at its start do not count
 WARM_UP_S = 3.0  # acquisition is not counted either
-DEADLINE_S = 30.0  # for processes to start
 PATIENCE_S = 0.2  # for an answer
 LATENCY_LIMIT = 1.3
 LOCKSTEP_SAMPLES = 3000
-NODES = 'backlash_ros.nodes'
 
 
 @dataclass
@@ -133,13 +133,28 @@ class Driver:
         return self._answered_at - start
 
     def measure(self, duration_s: float) -> Latencies:
-        """Alternate blocks of both; the plant goes on with the newest v through all of them."""
+        """Alternate blocks of both, once the controller is warmed up."""
         result = Latencies(1.0 / self._period)
+        begun = time.monotonic()
+        ends = begun + WARM_UP_S + duration_s
+
+        def counting() -> Latencies | None:
+            return result if time.monotonic() >= begun + WARM_UP_S else None
+
+        self.drive(counting, lambda: time.monotonic() < ends)
+        return result
+
+    def drive(
+        self, counting: Callable[[], Latencies | None], goes_on: Callable[[], bool],
+    ) -> None:
+        """Be the plant, which goes on with the newest v, as long as goes_on().
+
+        counting: what the times are for at the moment, in alternating blocks of both; None while
+        none counts: the controller alone is asked then.
+        """
         start, tick = time.perf_counter(), 0
-        while True:
+        while goes_on():
             now = time.perf_counter() - start
-            if now > duration_s + WARM_UP_S:
-                return result
             due = int(now / self._period) + 1
             time.sleep(max(due * self._period - now, 0.0))
             # Who has overslept goes on with the sample of now.
@@ -149,11 +164,11 @@ class Driver:
                 # A sample that was skipped while an answer was late still ended without it.
                 in_time = tick == due or self._v_came_at < start + tick * self._period
                 self._plant.step(self._v if in_time else self._v_before)
+            result = counting()
+            asks_controller = result is None or due // BLOCK % 2 == 0
             t = due * self._period
-            warming_up = t < WARM_UP_S
-            asks_controller = warming_up or due // BLOCK % 2 == 0
             passed = self._ask_controller(t) if asks_controller else self._ask(self._question, t)
-            if warming_up or due % BLOCK < SETTLE:
+            if result is None or due % BLOCK < SETTLE:
                 continue
             if passed is None:
                 result.unanswered += 1
@@ -174,38 +189,10 @@ class Driver:
 
 
 @contextmanager
-def processes(
-    commands: Mapping[str, Sequence[str]],
-) -> Iterator[tuple[ProcessSupervisor, int]]:
-    """The processes of one measurement in a domain of their own; all are gone afterwards."""
-    with tempfile.TemporaryDirectory() as name, free_domain() as domain:
-        folder = Path(name)
-        environment = child_environment(folder, domain)
-        stages = [
-            [ProcessPlan(who, tuple(command), folder / f'{who}.log', environment)]
-            for who, command in commands.items()
-        ]
-        with ProcessSupervisor(stages, lambda: False) as supervisor:
-            yield supervisor, domain
-
-
-def node_command(name: str, values: Mapping[str, object]) -> list[str]:
-    """How to start a node with parameters."""
-    arguments: list[str] = ['--ros-args'] if values else []
-    for key, value in values.items():
-        text = value if isinstance(value, str) else json.dumps(value)
-        arguments += ['-p', f'{key}:={text}']
-    return [sys.executable, '-m', f'{NODES}.{name}', *arguments]
-
-
-def measure_latency(
-    rate: float, law: str, duration_s: float, changes: Mapping[str, object] | None = None,
-    beside: Mapping[str, Sequence[str]] | None = None, awaited: str = '',
-) -> Latencies:
-    """Latency of the controller process with this law at this rate.
-
-    beside: commands that run in the same domain. awaited: the one of these that is to be ready.
-    """
+def driven_loop(
+    rate: float, law: str, changes: Mapping[str, object] | None = None,
+) -> Iterator[tuple[Driver, int]]:
+    """Driver of a controller process with this law at this rate, and of an echo; their domain."""
     # The same waves per sample at every rate: G is given in samples, not in seconds. While the
     # echo is asked the controller hears nothing, which is no silence of the driver.
     parameters = Parameters({
@@ -216,21 +203,26 @@ def measure_latency(
     commands = {
         'controller': node_command('controller', _values_of(CONTROLLER, parameters)),
         'echo': [sys.executable, str(Path(__file__).with_name('echo_node.py'))],
-        **(beside or {}),
     }
     with processes(commands) as (supervisor, domain):
         driver = Driver(domain, parameters)
         try:
             driver.connect()
-            if awaited:
-                wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', awaited))
-            result = driver.measure(duration_s)
+            yield driver, domain
         finally:
             driver.close()
-        _check_running(supervisor)
-        if not (result.controller and result.echo):
-            raise RuntimeError(f'{law}, {rate:g} Hz: nobody answered')
-        return result
+        check_running(supervisor)
+
+
+def measure_latency(
+    rate: float, law: str, duration_s: float, changes: Mapping[str, object] | None = None,
+) -> Latencies:
+    """Latency of the controller process with this law at this rate."""
+    with driven_loop(rate, law, changes) as (driver, _):
+        result = driver.measure(duration_s)
+    if not (result.controller and result.echo):
+        raise RuntimeError(f'{law}, {rate:g} Hz: nobody answered')
+    return result
 
 
 def _values_of(executable: str, parameters: Parameters) -> dict[str, object]:
@@ -260,22 +252,3 @@ def lockstep_speed(law: str, samples: int = LOCKSTEP_SAMPLES) -> float:
         started = wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
         done = wait_for_event(supervisor, lambda kind, _: kind == 'done')
     return samples / (done - started)
-
-
-def wait_for_event(
-    supervisor: ProcessSupervisor, wanted: Callable[[str, str], bool],
-    patience_s: float = 10.0 * DEADLINE_S,
-) -> float:
-    """Time at which an event of this kind and process came [s]."""
-    deadline = time.monotonic() + patience_s
-    while time.monotonic() < deadline:
-        for event in supervisor.events(0.1):
-            if wanted(event.kind, event.plan.name):
-                return time.perf_counter()
-        _check_running(supervisor)
-    raise RuntimeError('the nodes did not come to an end in time')
-
-
-def _check_running(supervisor: ProcessSupervisor) -> None:
-    for child in supervisor.ended():
-        raise RuntimeError(f'{child.plan.name} ended: {child.end_of_log()}')

@@ -18,7 +18,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.middleware.loopback import prefer_loopback
-from real_time.loop_latency import DEADLINE_S, node_command, processes
+from real_time.node_processes import DEADLINE_S, node_command, processes
 
 PERIOD_S = 0.005
 DRIVERS: dict[str, dict[str, object]] = {
