@@ -35,6 +35,10 @@ from backlash_ros.tools.bringup.environment import with_source
 
 DRIVER = ROOT / 'examples' / 'motor_driver.py'
 CONFIG = 'geared_motor.yaml'
+DOCUMENT = ROOT / 'docs' / 'deployment.md'
+MARK = re.compile(
+    r'(<!-- hosts: made by benchmarks/two_hosts\.py -->\n).*?(<!-- end -->)', re.DOTALL
+)
 TRUTH = {'m': simulated_motor.SLOPE, 'c_r': simulated_motor.C_R, 'c_l': simulated_motor.C_L}
 WITHIN = 0.01  # of the truth, as in summary.json
 # Fast DDS may miss for good who starts at the same moment.
@@ -44,12 +48,15 @@ PULLED_AT_S, PULLED_S = 4.0, 3.0
 
 
 class Case(NamedTuple):
-    """What lies between driver and controller; cable: None for a bare veth pair."""
+    """What lies between driver and controller; cable: None for a bare veth pair.
+
+    pulled_s: for how long the cable is pulled; the run takes as much longer.
+    """
 
     name: str
     two: bool = True
     cable: Cable | None = None
-    pulled: bool = False
+    pulled_s: float = 0.0
 
 
 CASES = (
@@ -63,7 +70,7 @@ CASES = (
     Case('0.1 % lost', cable=Cable(loss_percent=0.1)),
     Case('1 % lost', cable=Cable(loss_percent=1.0)),
     Case('5 % lost', cable=Cable(loss_percent=5.0)),
-    Case(f'link down for {PULLED_S:g} s', pulled=True),
+    Case(f'link down for {PULLED_S:g} s', pulled_s=PULLED_S),
 )
 
 
@@ -139,6 +146,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 def run(case: Case, duration_s: float, folder: Path) -> Row:
     """One run with a fresh pair of hosts; raises RuntimeError where no result comes."""
+    duration_s += case.pulled_s
     with ExitStack() as stack:
         domain = stack.enter_context(free_domain())
         hosts = stack.enter_context(linked_hosts(case.cable)) if case.two else (None, None)
@@ -157,9 +165,9 @@ def run(case: Case, duration_s: float, folder: Path) -> Row:
                 env=environment(domain, here.peer if here else ''),
             )
             try:
-                if case.pulled:
+                if case.pulled_s:
                     assert hosts[0] is not None
-                    _pull(hosts[0], folder / 'bringup.log')
+                    _pull(hosts[0], case.pulled_s, folder / 'bringup.log')
                 process.wait(duration_s + START_S)
             except subprocess.TimeoutExpired:
                 pass
@@ -170,7 +178,7 @@ def run(case: Case, duration_s: float, folder: Path) -> Row:
         return _row(out)
 
 
-def _pull(host: Host, log: Path) -> None:
+def _pull(host: Host, pulled_s: float, log: Path) -> None:
     """Pull the cable for a while, some time after the first progress."""
     deadline = time.monotonic() + START_S
     while not re.search(r' s +\d+/\d+', log.read_text()):
@@ -179,7 +187,7 @@ def _pull(host: Host, log: Path) -> None:
         time.sleep(0.1)
     time.sleep(PULLED_AT_S)
     host.set_link('down')
-    time.sleep(PULLED_S)
+    time.sleep(pulled_s)
     host.set_link('up')
 
 
@@ -218,13 +226,26 @@ def _said_most(log: str) -> str:
     return max(kinds, key=kinds.count, default='')
 
 
+def write_document(rows: Sequence[Sequence[str]], duration_s: float) -> None:
+    """Write the table between its marks."""
+    made = (
+        f'{machine()}; runs of {duration_s:g} s, the one whose link is down {PULLED_S:g} s longer.'
+        f'\n\n{markdown_table(HEADER, rows)}\n\n'
+    )
+    text = DOCUMENT.read_text(encoding='utf-8')
+    DOCUMENT.write_text(
+        MARK.sub(lambda mark: f'{mark[1]}{made}{mark[2]}', text), encoding='utf-8'
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--duration', type=float, default=20.0, help='of a run [s]')
+    parser.add_argument('--duration', type=float, default=10.0, help='of a run [s]')
     parser.add_argument('--repeat', type=int, default=1, help='runs of each case, in turns')
     parser.add_argument('--case', action='append', default=[], help='only those; default: all')
-    parser.add_argument('--markdown', action='store_true', help='the table for a document')
+    parser.add_argument('--write', action='store_true',
+                        help=f'write the table into {DOCUMENT.relative_to(ROOT)}')
     options = parser.parse_args(arguments)
     if reason := why_not():
         print(f'two_hosts: skipped: {reason}', file=sys.stderr)
@@ -237,7 +258,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 rows.append([case.name, *run(case, options.duration, Path(folder)).cells])
             print(' | '.join(rows[-1]), file=sys.stderr, flush=True)
     print(machine())
-    print((markdown_table if options.markdown else text_table)(HEADER, rows))
+    print(text_table(HEADER, rows))
+    if options.write:
+        write_document(rows, options.duration)
     return 0
 
 
