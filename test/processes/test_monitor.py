@@ -133,6 +133,13 @@ def test_ctrl_c_ends_it_while_it_waits_and_leaves_the_terminal_as_it_was(tmp_pat
         awaited = f'waiting for a controller in ROS_DOMAIN_ID={world.domain}'
         probe = world.probe()
         probe.wait_until(lambda: awaited in screen.frame(), awaited)
+        # The threads of the middleware wake up for each message.
+        tasks = Path(f'/proc/{screen.process.pid}/task')
+        of_dds = [int(each.name) for each in tasks.iterdir()
+                  if (each / 'comm').read_text().startswith('dds.')]
+        classes = {os.sched_getscheduler(each) for each in (screen.process.pid, *of_dds)}
+        assert of_dds
+        assert classes == {os.SCHED_BATCH}
         screen.press(CTRL_C)
         assert screen.wait() == 0
         assert screen.restored

@@ -6,14 +6,13 @@ The page is served to this machine alone, at an address that is printed.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.nodes.live.node import EXECUTABLE, LiveNode
 from backlash_ros.nodes.live.page_server import bound_socket
-from backlash_ros.nodes.monitor.followed import NICENESS
+from backlash_ros.nodes.monitor.followed import give_way
 from backlash_ros.nodes.runtime.arguments import ros_arguments
 from backlash_ros.nodes.runtime.spin import run
 from backlash_ros.options import LARGEST_PORT, OptionParser
@@ -38,7 +37,7 @@ def main(args: list[str] | None = None) -> int:
         bound = bound_socket(options.port)
     except OSError as error:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
-    os.nice(NICENESS)
+    give_way()
     with bound:
         return run(
             EXECUTABLE, lambda: LiveNode(options.name, bound), ros_arguments(arguments)

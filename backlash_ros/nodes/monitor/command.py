@@ -6,12 +6,11 @@ Without a terminal a line per controller is printed once a second.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.nodes.monitor.followed import NICENESS
+from backlash_ros.nodes.monitor.followed import give_way
 from backlash_ros.nodes.monitor.node import EXECUTABLE, MonitorNode
 from backlash_ros.nodes.runtime.arguments import ros_arguments
 from backlash_ros.nodes.runtime.spin import run
@@ -30,7 +29,7 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument('name', nargs='*', metavar='NAME',
                         help='a controller or a namespace, as /pan (default: all there are)')
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
-    os.nice(NICENESS)
+    give_way()
     return run(EXECUTABLE, lambda: MonitorNode(options.name), ros_arguments(arguments))
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Float64
@@ -18,6 +20,16 @@ LOOK_S = 1.0  # between two looks for further controllers
 NICENESS = 10  # of a process that only shows: the loop comes first
 STATUSES = 100  # of all nodes of the domain that may wait: some robots have many
 MARK = topics.of_node(topics.watched(BACKLASH[0])).removeprefix('~')  # of a controller
+
+
+def give_way() -> None:
+    """Let the loop come first; before a thread is started, which inherits it."""
+    os.nice(NICENESS)
+    # Niceness counts only among the processes of one session, see autogroup in sched(7). In this
+    # class whoever wakes up does not interrupt one that runs, whatever session that is of.
+    if hasattr(os, 'SCHED_BATCH'):
+        with suppress(OSError):  # some containers do not allow it
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 
 class Followed:
