@@ -47,6 +47,17 @@ def test_what_a_part_does_not_tell_stays_as_well_known_as_it_was() -> None:
     assert both.cov == pytest.approx(known.cov, rel=0.01)
 
 
+@pytest.mark.parametrize('seed', range(20))
+def test_a_direction_that_is_unknown_leaves_what_is_known_of_the_others(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    axes = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    cov = (axes * np.array([1e20, 1e-6, 1e-6])) @ axes.T
+    known = Prior(THETA, np.diag([1e-7, 1e-5, 1e-5]))
+    both = intersected(known, Prior(THETA + 1.0, 0.5 * (cov + cov.T)))
+    assert np.linalg.eigvalsh(both.cov).min() > 0.0
+    assert both.theta == pytest.approx(known.theta, abs=1e-2)
+
+
 def test_unexplained_motion_makes_what_was_known_no_worse() -> None:
     sharp = Prior(THETA, np.diag([1e-3, 1e-3, 1e-3])**2)
     v = swing(400, 3.0)

@@ -10,10 +10,16 @@ estimation algorithm in the presence of unknown correlations, American Control C
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import Fitted
+
+Array = NDArray[np.float64]
+
+# --- guards
+ROUNDING = 1e-14  # share of the largest eigenvalue of a covariance that is rounding
 
 
 def arrival(part: Fitted, contested: bool) -> Prior | None:
@@ -47,14 +53,23 @@ def _doubted(one: Prior, other: Prior) -> tuple[Prior, Prior]:
 def intersected(one: Prior, other: Prior) -> Prior:
     """What two estimates of theta say together, however correlated they are.
 
-    The mixture of their informations with the least volume of the deviations.
+    The mixture of their informations with the least volume of the deviations. The other one may
+    leave directions unknown; LinAlgError where the first one does.
     """
-    first, second = np.linalg.inv(one.cov), np.linalg.inv(other.cov)
+    root = np.linalg.cholesky(one.cov)
+    whitened = np.linalg.inv(root)
+    var, axes = np.linalg.eigh(whitened @ other.cov @ whitened.T)
+    # Beside a direction that is not known at all, what is known of others is lost in rounding.
+    var = np.maximum(var, ROUNDING * var[-1])
+
+    def information(share: float) -> Array:
+        return np.asarray(share + (1.0 - share) / var)
 
     def volume(share: float) -> float:
-        return -float(np.linalg.slogdet(share * first + (1.0 - share) * second)[1])
+        return -float(np.log(information(share)).sum())
 
     share = float(minimize_scalar(volume, bounds=(0.0, 1.0), method='bounded').x)
-    cov = np.linalg.inv(share * first + (1.0 - share) * second)
-    theta = cov @ (share * first @ one.theta + (1.0 - share) * second @ other.theta)
-    return Prior(theta, 0.5 * (cov + cov.T))
+    back, there = root @ axes, axes.T @ whitened
+    both = information(share)
+    mean = (share * (there @ one.theta) + (1.0 - share) / var * (there @ other.theta)) / both
+    return Prior(back @ mean, (back / both) @ back.T)

@@ -231,7 +231,17 @@ class MovingHorizon:
 
     def _restart_record(self) -> None:
         self._task = None
-        self._learning.restart(self._following.start_of(self.estimate))
+        try:
+            self._learning.restart(self._following.start_of(self.estimate))
+        except np.linalg.LinAlgError:
+            self._search_afresh()
+
+    def _search_afresh(self) -> None:
+        """Go on after samples that leave nothing but rounding: others may be better."""
+        self.failed_fits += 1
+        learning = self._learning
+        learning.record.forget_before(learning.record.end)
+        learning.begin_acquisition(self.estimate if self.estimate.learned else None)
 
     def _status(self) -> Status:
         if self._lost_in_a_row >= NO_DATA:
@@ -261,11 +271,8 @@ class MovingHorizon:
                 with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
                     self._go_on(self._task)  # what is not finite is refused by the posterior
             except np.linalg.LinAlgError:
-                # Samples that leave nothing but rounding: others may be better.
-                self.failed_fits += 1
-                self._task, learning = None, self._learning
-                learning.record.forget_before(learning.record.end)
-                learning.begin_acquisition(self.estimate if self.estimate.learned else None)
+                self._task = None
+                self._search_afresh()
                 return
             if timed:
                 now = perf_counter()
