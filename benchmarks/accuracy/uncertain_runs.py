@@ -41,7 +41,7 @@ class Figures:
     following: RMS of y, before the sensor, against the delayed reference [unit of y].
     moving: share of the samples after RESTS_S in which v moves. swaps: of G; worst_swap: largest
     move of v at one of them over the largest in the second before, nan without any, and when that
-    was [s].
+    was [s]. moves: of v, the first one from 0, shape (N,).
     """
 
     name: str
@@ -56,6 +56,7 @@ class Figures:
     swaps: int = 0
     worst_swap: float = nan
     worst_swap_s: float = nan
+    moves: Array = field(default_factory=lambda: np.zeros(0))
     problem: str = ''
 
 
@@ -128,15 +129,16 @@ def _figures(
         normalised = np.abs(error) / deviations
     wrong = is_tracking & ~(normalised <= WRONG).all(axis=1)
     v = np.array(plant.v)
-    swaps, worst, worst_s = _swaps(models, v, run.sample_period)
+    moves = np.abs(np.diff(v, prepend=0.0))
+    swaps, worst, worst_s = swaps_of(models, moves, run.sample_period)
     begin = round(RESTS_S / run.sample_period)
     return Figures(
         job.name, job.seed, errors, float(is_tracking[t >= ACQUIRED_S].mean()),
         normalised[learned & np.isfinite(deviations).all(axis=1)],
-        _longest(wrong) * run.sample_period, Status(int(status[-1])),
+        longest(wrong) * run.sample_period, Status(int(status[-1])),
         following(job.parameters, loop, np.array(plant.u)),
         float(np.mean(np.diff(v[begin:]) != 0.0)) if len(v) > begin + 1 else nan,
-        swaps, worst, worst_s,
+        swaps, worst, worst_s, moves,
     )
 
 
@@ -151,18 +153,21 @@ def following(p: Parameters, loop: ClosedLoop, u: Array) -> float:
     return float(np.sqrt(np.mean((y[begin:] - reference) ** 2)))
 
 
-def _longest(flags: NDArray[np.bool_]) -> int:
+def larger_moves(moves: Array, k: int, period_s: float) -> float:
+    """Largest move of v from sample k on over the largest in the second before."""
+    second = round(COUNTED / period_s)
+    return float(moves[k:k + SWAP].max() / max(moves[max(k - second, 0):k].max(), 1e-12))
+
+
+def longest(flags: NDArray[np.bool_]) -> int:
     """Length of the longest row of true ones."""
     ends = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     return int(np.max(ends[1::2] - ends[::2], initial=0))
 
 
-def _swaps(models: list[object], v: Array, period_s: float) -> tuple[int, float, float]:
-    moves = np.abs(np.diff(v, prepend=0.0))
-    second = round(COUNTED / period_s)
+def swaps_of(models: list[object], moves: Array, period_s: float) -> tuple[int, float, float]:
+    """How many swaps of G there were, and the worst `larger_moves` at one of them, when [s]."""
     at = [k for k in range(1, len(models)) if models[k] is not models[k - 1]]
-    ratios = [
-        float(moves[k:k + SWAP].max() / max(moves[max(k - second, 0):k].max(), 1e-12)) for k in at
-    ]
+    ratios = [larger_moves(moves, k, period_s) for k in at]
     worst = int(np.argmax(ratios)) if at else 0
     return (len(at), ratios[worst], at[worst] * period_s) if at else (0, nan, nan)

@@ -25,7 +25,7 @@ from accuracy.uncertain_cases import (
     near_cases,
     random_backlash,
 )
-from accuracy.uncertain_runs import NAMES, _longest, _swaps, run_job
+from accuracy.uncertain_runs import NAMES, longest, run_job, swaps_of
 
 from backlash_ros.core.assembly import build_controller, build_model, build_true_model
 from backlash_ros.core.estimation.protocol import Status
@@ -126,17 +126,17 @@ def test_frozen_reference_stays_where_it_was() -> None:
 
 
 def test_longest_row_of_true_ones_is_found() -> None:
-    assert _longest(np.array([], dtype=bool)) == 0
-    assert _longest(np.array([True, True, False, True, True, True])) == 3
+    assert longest(np.array([], dtype=bool)) == 0
+    assert longest(np.array([True, True, False, True, True, True])) == 3
 
 
 def test_move_at_a_swap_is_compared_with_those_of_the_second_before() -> None:
-    v = np.cumsum([5.0] + [1.0] * 9 + [3.0] + [1.0] * 10)
+    moves = np.array([5.0] + [1.0] * 9 + [3.0] + [1.0] * 10)
     old, new = object(), object()
-    assert _swaps([old] * 9 + [new] * 12, v, 0.2) == (1, 3.0, pytest.approx(1.8))
-    assert _swaps([old] * 15 + [new] * 6, v, 0.2) == (1, pytest.approx(1.0 / 3.0), 3.0)
-    assert _swaps([old] * 9 + [new] * 6 + [old] * 6, v, 0.2) == (2, 3.0, pytest.approx(1.8))
-    count, worst, when = _swaps([old] * 21, v, 0.2)
+    assert swaps_of([old] * 9 + [new] * 12, moves, 0.2) == (1, 3.0, pytest.approx(1.8))
+    assert swaps_of([old] * 15 + [new] * 6, moves, 0.2) == (1, pytest.approx(1.0 / 3.0), 3.0)
+    assert swaps_of([old] * 9 + [new] * 6 + [old] * 6, moves, 0.2) == (2, 3.0, pytest.approx(1.8))
+    count, worst, when = swaps_of([old] * 21, moves, 0.2)
     assert count == 0
     assert np.isnan([worst, when]).all()
 

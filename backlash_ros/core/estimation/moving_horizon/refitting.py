@@ -86,7 +86,11 @@ def refit(learning: Learning) -> Task:
         results.insert(0, (yield from fitted_with_model(
             v, y, beginning, start, current.solution.m, learning.pace
         )))
-    result = yield from with_walk(v, y, most_likely(results), learning.pace)
+    # Another G that is likelier by no more than chance would only make the structure follow it.
+    result, afresh = results[0], results[-1]
+    if afresh.evidence > result.evidence + around.error.count:
+        result = afresh
+    result = yield from with_walk(v, y, result, learning.pace)
     if len(v) > SEARCHED:
         return learning.go_on_from(result, first)
     if around.prior is None:
