@@ -44,6 +44,11 @@ class CommandHistory:
         median = self._transit_ns + (step if passed_ns > self._transit_ns else -step)
         self._transit_ns = min(max(median, 0.0), longest)
 
+    @property
+    def newest_ns(self) -> int:
+        """When the newest command left, 0 before the first one."""
+        return self._published[-1][0] if self._published else 0
+
     def publish(self, v: float, stamp_ns: int) -> None:
         """Note a command and when it left."""
         self._published.append((stamp_ns, v))

@@ -127,9 +127,11 @@ class ControlLoop:
         Returns whether it is known now which one acts.
         """
         reported = self.commands.newest_report(stamp_ns)
-        # A report is about the interval before it, which a command that was heard in it outdates.
+        # A report is about the interval before it, which a command in it outdates: one that was
+        # heard, or, while waiting outputs are answered, an own one.
         period_ns = self._p.get_float('sample_period') * 1e9
-        if isfinite(reported) and stamp_ns > self._other_ns + period_ns:
+        commanded_ns = max(self._other_ns, self.commands.newest_ns)
+        if isfinite(reported) and stamp_ns > commanded_ns + period_ns:
             self._go_on_from(self.core.command_of(reported))
         return self.knows_v
 
