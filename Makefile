@@ -18,9 +18,9 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 RUN := .venv/bin/python
-# Tests that start processes wait for more than half of their time, each in a ROS domain of its
-# own. Their order is that of conftest.py.
-WORKERS := -n 2 --no-loadscope-reorder
+# Two workers compute at a low priority while two wait for processes, each of which has a ROS
+# domain of its own: see test/scheduling.py.
+WORKERS := -n 4 --no-loadscope-reorder
 # A Python that was not asked for by name leaves an existing .venv of another Python as it is.
 KEEP := $(if $(filter file,$(origin PYTHON)),--keep-python)
 # A sourced ROS 2 brings its own numpy, and each numpy has other types than the pinned one.

@@ -13,9 +13,9 @@ import pytest
 from bringup_processes import Session, bringup_sessions
 from hypothesis import HealthCheck, settings
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from scheduling import FromBothEnds, give_way, starts_processes
 from undrawn import leave_out
 from xdist.remote import Producer
-from xdist.scheduler import LoadScopeScheduling
 
 settings.register_profile(
     'repeatable', derandomize=True, database=None, deadline=None, max_examples=60,
@@ -25,13 +25,6 @@ settings.register_profile(
 settings.register_profile('search', deadline=None, max_examples=1000)
 settings.load_profile('repeatable')
 
-STARTS_PROCESSES = {'bringup_processes', 'paced_driver', 'ros_processes'}
-# Their tests look at the same runs, so one worker of pytest-xdist makes these for all of them.
-SHARE_RUNS = {
-    'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify', 'test_live',
-    'test_packaging', 'test_replay', 'test_report', 'test_report_sections', 'test_two_hosts',
-}
-
 
 def pytest_configure() -> None:
     """Hear Ctrl-C even where the tests run in the background of a script.
@@ -40,38 +33,25 @@ def pytest_configure() -> None:
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-class SharedRuns(LoadScopeScheduling):
-    """Gives the next test to the worker that is free, and the files of SHARE_RUNS as a whole."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        file = nodeid.split('::')[0]
-        return file if Path(file).stem in SHARE_RUNS else nodeid
+    give_way()
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> SharedRuns:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> FromBothEnds:
     """The scheduler of pytest-xdist."""
-    return SharedRuns(config, log)
+    return FromBothEnds(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put tests with processes at the end: beside each other, not beside those that compute.
+    """Put tests with processes at the end, where half of the workers begin.
 
     They run against the clock of a machine that they do not have to themselves, so each may be
     run once again, as `colcon test --retest-until-pass 1` does; the summary names those that were.
     """
-    items.sort(key=_starts_processes)
+    items.sort(key=lambda item: starts_processes(item.path))
     for item in items:
-        if _starts_processes(item):
+        if starts_processes(item.path):
             item.add_marker(pytest.mark.flaky(reruns=1))
-
-
-def _starts_processes(item: pytest.Item) -> bool:
-    assert isinstance(item, pytest.Function)
-    helpers = {getattr(each, '__module__', '') for each in vars(item.module).values()}
-    return 'start' in item.fixturenames or bool(helpers & STARTS_PROCESSES)
 
 
 @pytest.fixture

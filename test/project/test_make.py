@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import SHARE_RUNS
+from scheduling import SHARE_RUNS
 
 ROOT = Path(__file__).resolve().parents[2]
 # The interpreter beneath the environment that runs the tests: without packages, so without rclpy.
