@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from itertools import islice
 from math import inf, sin
 from typing import Any
@@ -53,6 +54,7 @@ SENSORS: dict[str, Callable[[float, int], float]] = {
 LAWS = ('kalman', 'lms', 'printed', 'fixed', 'gradient')
 
 
+@cache
 def asked_by_the_reference(structure: str, start: float = 0.0) -> float:
     """Largest |u_d| of a loop without a gap in which nothing is wrong, from y = start on."""
     loop = build_closed_loop(Parameters({
@@ -66,15 +68,15 @@ def asked_by_the_reference(structure: str, start: float = 0.0) -> float:
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
-@pytest.mark.parametrize('law', LAWS)
-@pytest.mark.parametrize('structure', ['tracking', 'pole_placement'])
+@pytest.mark.parametrize(('law', 'structure'), [
+    (law, structure) for structure in ('tracking', 'pole_placement') for law in LAWS
+    if law_fits(law, structure)
+])
 def test_u_d_stays_within_a_stated_multiple_of_what_is_asked(
-    structure: str, law: str, sensor: str,
+    law: str, structure: str, sensor: str,
 ) -> None:
     settings = {'structure': structure, 'estimator.law': law, 'amplitude': 0.2}
     p = Parameters({**settings, 'output_noise_std': 1e-3})
-    if not law_fits(law, structure):
-        return  # refused when it is configured
     controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
     asked = asked_by_the_reference(structure, SENSORS[sensor](0.0, 0))
     allowed = LARGEST_IN_ACQUISITION

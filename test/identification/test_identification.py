@@ -38,7 +38,7 @@ from accuracy.identification_cases import random_case
 
 Array = NDArray[np.float64]
 PERIOD_S = 0.005
-SEEDS = (7, 13, 21, 34, 42, 55)  # of the benchmark; among them integrators and quantised y
+SEEDS = (7, 21, 42, 55)  # of the benchmark; among them integrators and quantised y
 QUICK = Options(orders=(1, 2), delays=(0, 1))
 
 
@@ -242,7 +242,7 @@ def test_arrays_that_are_none_are_refused(v: Array, y: Array) -> None:
         identify(v, y, PERIOD_S)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.integers(0, 2**31), st.sampled_from((0.0, 1e-6, 1.0, 1e6)), st.floats(0.0, 0.9))
 def test_any_numbers_lead_to_a_result(seed: int, size: float, lost: float) -> None:
     rng = np.random.default_rng(seed)

@@ -105,6 +105,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_the_command_says_that_nothing_parts(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
