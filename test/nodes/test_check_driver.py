@@ -160,8 +160,9 @@ def test_a_topic_of_another_name_is_pointed_out(tmp_path: Path) -> None:
         process = beside.start('--wait', str(DEADLINE_S))
         try:
             wait_until(
-                lambda: ' '.join(REMAP) in process.stdout, 'a hint', lambda: time.sleep(0.02)
+                lambda: '/motor/plant_output' in process.stdout, 'a hint', lambda: time.sleep(0.02)
             )
+            assert ' '.join(REMAP) in process.stdout
         finally:
             process.kill()
 

@@ -81,6 +81,11 @@ def test_topics_follow_the_name_of_their_node(tmp_path: Path) -> None:
         probe.wait_until(
             lambda: expected <= dict(probe.node.get_topic_names_and_types()).keys(), 'the topics'
         )
+        private = {
+            topic for topic, _ in probe.node.get_topic_names_and_types()
+            if topic.endswith(('/estimates', '/signals', '/truth'))
+        }
+        assert private == expected
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)

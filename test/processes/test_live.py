@@ -80,6 +80,7 @@ def test_who_comes_later_gets_the_curves_so_far(run: Session) -> None:
         return 0
 
     wait_until(lambda: asyncio.run(first_frame()) > 10, 'a history')
+    assert asyncio.run(first_frame()) > 10, 'it is there for every further page'
 
 
 def test_nothing_listens_beyond_this_machine_nor_answers_to_another_name(run: Session) -> None:

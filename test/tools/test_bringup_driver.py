@@ -164,8 +164,9 @@ def test_no_grandchild_of_a_driver_survives_a_killed_bringup(start: Callable[...
         '--unlimited', '--driver', f'sh -c "{PLANT}; true"', '--duration', '100', '--no-record',
     )
     session.wait_for_samples()
+    assert len(session.survivors()) > 4, 'bringup, its nodes, the shell and its driver'
     session.process.kill()
-    session.wait()
+    assert session.wait() == -signal.SIGKILL
     wait_until(lambda: not session.survivors(), 'the guardian has stopped all')
 
 

@@ -313,7 +313,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     try:
         wait_until(lambda: len(children(process.pid)) > 1, 'the start of a worker')
         process.kill()
-        process.wait()
+        assert process.wait() == -signal.SIGKILL
         wait_until(lambda: is_gone(process.pid), 'the end of every worker')
     finally:
         if not is_gone(process.pid):
