@@ -14,7 +14,7 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.last_command import check_last_commands
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.serial_plant import SerialPlant
+from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
 from backlash_ros.core.control.structure import Structure
 from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.control.tracking.tracking import Tracking
@@ -45,8 +45,6 @@ __all__ = [
     'build_true_model', 'law_fits', 'warnings_of',
 ]
 
-# Until the backlash is known, half of the motion of u may not be what the first guess says.
-DOUBT_OF_FIRST_GUESS = 0.5
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
 # Laws that belong to one structure, and why.
@@ -178,7 +176,7 @@ def _moving_horizon(p: Parameters, initial: Estimate) -> Estimator:
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
         observer = FixedBacklash(
             given, build_state_model(p), p.get_float('estimator.output_noise_std'),
-            DOUBT_OF_FIRST_GUESS,
+            DOUBT,
         )
     return MovingHorizon(
         initial, _bounds(p), build_state_model(p), p.get_float('estimator.output_noise_std'),

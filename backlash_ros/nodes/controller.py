@@ -52,7 +52,6 @@ from backlash_ros.nodes.runtime.spin import run
 POST_COMMAND_SLEEP = 0.05
 REFINE_SHARE = 0.3  # of a sample period for fits, after the command
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
-LOOK_S = 0.05  # between two looks for a silent plant_output or reference
 
 
 class ControllerNode(ManagedNode):
@@ -117,7 +116,7 @@ class ControllerNode(ManagedNode):
         )
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         if not self._lockstep:
-            self.create_timer(LOOK_S, self._look_for_silence, clock=self.steady_clock)
+            self.create_timer(0.05, self._look_for_silence, clock=self.steady_clock)
         self._announce()
         if p.get_bool('autostart'):
             self.start()

@@ -39,7 +39,6 @@ from backlash_ros.nodes.runtime.spin import ProcessNode, run
 from backlash_ros.options import BAD_INPUT, FAILED
 
 DEPTH = 10_000  # messages that may wait while the disk is slow
-PROGRESS_PERIOD_S = 0.2  # between two reports to bringup
 FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that a flush takes
 # Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
 DRAIN_S = 0.3
@@ -90,7 +89,7 @@ class RecorderNode(ProcessNode):
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, DEPTH)
         if ENABLED:
-            self.create_timer(PROGRESS_PERIOD_S, self._tell, clock=self.steady_clock)
+            self.create_timer(0.2, self._tell, clock=self.steady_clock)
         self.call_when(
             lambda: all(heard() for heard in needed), self._start, ', '.join(wanted)
         )

@@ -20,7 +20,8 @@ from ros_processes import NodeProcess, RosWorld, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.nodes.diagnostics.rivals import ENDPOINT, SILENT_S, SINCE, Rival, Rivals
+from backlash_ros.nodes.diagnostics.rivals import ENDPOINT, SINCE, Rival, Rivals
+from backlash_ros.nodes.runtime.messages import SILENT_S
 
 PROMPTLY_S = 1.0  # within which both have to name the other
 RATE_MAX, PERIOD_S = 400.0, 0.01

@@ -26,7 +26,6 @@ Array = NDArray[np.float64]
 
 # Share of the motion of u that may not be what the backlash says, before and after it was learned.
 DOUBT, LITTLE_DOUBT = 0.5, 0.1
-REMEMBERED = 60  # samples from which a new observer finds the state
 AVERAGED = 100  # innovations that say how large one may be
 # Of their rms, beyond which y is an outlier. They come in bursts, when v crosses the gap.
 GATE = 100.0
@@ -44,7 +43,8 @@ class SerialPlant:
         self._motor = Motor(actuator)
         self._play = self._commanded = nan  # what the gap holds, in units of v and of the command
         self._learned = False
-        self._newest: deque[tuple[float, float | None]] = deque(maxlen=REMEMBERED)  # u and y
+        # u and y, from which a new observer finds the state.
+        self._newest: deque[tuple[float, float | None]] = deque(maxlen=60)
         self.adopt(self.before(model))
 
     def before(self, model: StateModel) -> StateModel:

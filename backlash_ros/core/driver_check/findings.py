@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.controller import plausible
+from backlash_ros.core.loop.causes import SKEW
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
 
 FLOAT64 = 'std_msgs/msg/Float64'
@@ -28,7 +29,6 @@ DOUBLE = 0.25  # of a period: the same value again within it is the same sample
 MOSTLY = 0.6  # a larger share of equal values is a plant at rest, not repetition
 HELD = 0.2  # share of samples that repeat the one before while y moves
 FINE_STEPS = 5.0  # steps of y larger than this many resolutions need not repeat
-SKEW = 0.5  # of a period: age of a message on arrival that only a wrong clock explains
 
 
 class Message(NamedTuple):

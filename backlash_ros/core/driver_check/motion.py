@@ -23,6 +23,7 @@ from backlash_ros.core.driver_check.findings import (
 )
 from backlash_ros.core.estimation.whole_record.record_description import RecordFit
 from backlash_ros.core.estimation.whole_record.record_fit import fit_record
+from backlash_ros.core.identification.judgement import SHOWS
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
 from backlash_ros.core.loop.report_use import ReportUse, report_use
 from backlash_ros.core.parameters import Parameters
@@ -36,7 +37,6 @@ DELAY, SIGN, MODEL, NOISE, BACKLASH = (
 MOTION_SUBJECTS = (DELAY, SIGN, MODEL, NOISE, BACKLASH)
 
 DECISIVE = 10.0  # log-likelihood by which one delay beats another
-SHOWS = 15.0  # log-likelihood by which y shows v at all
 PREDICTED = 0.9  # share of the motion of y that G has to predict
 BOUND_SLACK = 0.01  # of a value that lies outside its bounds without harm
 NOISIER = 3.0  # times the given deviation of the noise

@@ -24,8 +24,6 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-ORDERS, DELAYS = (1, 2), (0, 1, 2, 3)  # of L; a coefficient more than poles is part of a delay
-STARTS = (0.3, 0.7, 0.9)  # where all poles begin
 STABLE = 0.9999  # largest reflection coefficient of the denominator
 SLOWEST = 0.99  # pole: a motor that takes longer follows no command
 PUSHED_FOR = 10  # samples after which the load is pushed on a side as hard as it ever is
@@ -82,8 +80,9 @@ def _best(
 ) -> _Fitted | None:
     """The fit with the least rows log(squares) + unknowns log(rows); None without any."""
     found: list[tuple[float, _Fitted]] = []
-    for order in ORDERS:
-        for delay in DELAYS:
+    for order in (1, 2):
+        for delay in range(4):
+            # A coefficient more than poles is part of a delay.
             unknowns = 2 * order + 3
             if len(rows) < FEWEST * unknowns or len(np.unique(side[rows])) < 2:
                 continue
@@ -116,7 +115,7 @@ def _fitted(
         least_squares(
             lambda x: solved(x)[2] / size, _reflections(np.full(order, pole)),
             bounds=(-STABLE, STABLE), x_scale=0.1,
-        ) for pole in STARTS
+        ) for pole in (0.3, 0.7, 0.9)
     ]
     best = min(fits, key=lambda one: float(one.cost))
     denominator, solution, residual = solved(best.x)

@@ -48,14 +48,11 @@ T = TypeVar('T')
 
 GENERAL = Structure(3, 0, False)  # G with which the gap is searched first, and a tap per delay
 FEWEST = 8  # samples per unknown below which nothing is fitted
-CANDIDATES = 2  # gaps with which the structures are compared
 SAME = 0.005  # relative distance of two gaps that are one
-PROFILE_GAPS = 40  # gaps of the profile over the swing of v
 NEAR = np.linspace(0.8, 1.2, 17)  # gaps around the best one, relative
 FEW_VALUES = 0.8  # distinct values of y per sample, more of which are not quantised
 LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
 TINY = float(np.finfo(float).tiny)
-FREQUENCIES = 60  # at which the response is told
 
 
 @dataclass(frozen=True)
@@ -167,7 +164,7 @@ def identifying(
     if wild.any():
         searched = searched.without(wild)
         found = yield from _named('searching the gap again', search(searched, general))
-    candidates = _distinct(found)[:CANDIDATES]
+    candidates = _distinct(found)[:2]
     compared = yield from _named('comparing orders and delays', compare(
         searched, [one.point for one in candidates], options.orders, options.delays,
         options.integrators, options.held_out,
@@ -259,7 +256,7 @@ def _refined(
     """The best fit of the chosen structure, other minima (gap, how far behind), the profile."""
     structure, swing = chosen.structure, samples.play.swing
     best = chosen.fit
-    whole: Array = np.append(0.0, np.geomspace(1e-3, 0.99, PROFILE_GAPS) * swing)
+    whole: Array = np.append(0.0, np.geomspace(1e-3, 0.99, 40) * swing)
     curve = yield from profile(samples, structure, whole, best)
     around = np.array([gap for gap in best.point.gap * NEAR if 0.0 < gap < swing])
     near = yield from profile(samples, structure, around, best)
@@ -313,7 +310,7 @@ def _described(
     c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
     band = frequencies_of(best.simulated)
     low = max(band[0], np.pi / samples.count)
-    frequencies = np.geomspace(low, max(band[1], 1.01 * low), FREQUENCIES, dtype=np.float64)
+    frequencies = np.geomspace(low, max(band[1], 1.01 * low), 60, dtype=np.float64)
     spread = uncertainty.response_std(best, covariance, frequencies)
     gain_std = float(uncertainty.response_std(best, covariance, np.zeros(1))[0])
     residual = samples.y - best.simulated

@@ -13,10 +13,8 @@ from backlash_ros.core.identification.output_error import Fit, Samples
 Array = NDArray[np.float64]
 
 REVERSALS = 3  # changes of the engaged side: fewer leave gap, crossings and start entangled
-PRECISE_GAP = 0.1  # relative deviation of the gap beyond which it is not known
+PRECISE = 0.1  # relative deviation of gap, gain and G(z) beyond which they are not known
 NO_GAP = 0.005  # of the swing of v: a gap known this well may be 0
-PRECISE_GAIN = 0.1  # relative deviation of the gain
-PRECISE_RESPONSE = 0.1  # relative deviation of G between the frequencies at which y moves
 SHOWS = 15.0  # log-likelihood by which the fit must beat a u that stands still
 SURE = 3.0  # standard deviations
 WHOLE_SWING = 0.95  # of the swing of v: a gap as wide as this was not seen from both sides
@@ -82,15 +80,15 @@ def reasons(e: Evidence) -> list[str]:
             f'two gaps fit alike, {gap:.4g} and {alike[0]:.4g}: move v at several speeds and '
             'amplitudes'
         )
-    imprecise = e.gap_std > max(PRECISE_GAP * gap, NO_GAP * swing)
+    imprecise = e.gap_std > max(PRECISE * gap, NO_GAP * swing)
     if imprecise:
         found.append(_why_imprecise(e))
-    if e.gain_std > PRECISE_GAIN:
+    if e.gain_std > PRECISE:
         found.append(
             f'the gain of G is known to {e.gain_std:.0%} only: move v further and at lower '
             'frequencies, or record for longer'
         )
-    elif e.response_std > PRECISE_RESPONSE:
+    elif e.response_std > PRECISE:
         found.append(
             f'G is known to {e.response_std:.0%} only: move v at more speeds, or record for longer'
         )

@@ -27,9 +27,6 @@ Array = NDArray[np.float64]
 POINTS = 40  # frequencies up to half the sampling rate
 GRID: Array = np.pi * (np.arange(POINTS) + 0.5) / POINTS  # [rad/sample]
 UNKNOWN = 0.1  # relative deviation, or difference, of G beyond which the record is silent
-ALLOWED = 4.0  # by which the squares may grow, in variances of the noise: two standard deviations
-HALVINGS = 12  # of the factor of the penalty
-FIRST_FACTOR = 1e4  # of it, relative to the squares of the fit
 
 
 def least_response(
@@ -87,9 +84,9 @@ def _smoothed(samples: Samples, found: Fit, silent: Array, noise_variance: float
     rows, gain = _rows(found, silent), _gain(found, silent)
     if gain == 0.0:
         return found
-    most = found.squares + ALLOWED * noise_variance
-    factor = np.sqrt(FIRST_FACTOR * found.squares / gain)
-    for _ in range(HALVINGS):
+    most = found.squares + 4.0 * noise_variance  # two standard deviations
+    factor = np.sqrt(1e4 * found.squares / gain)
+    for _ in range(12):
         smooth = fit(samples, found.structure, found.point, penalty=factor * rows)
         if smooth.squares <= most:
             return smooth

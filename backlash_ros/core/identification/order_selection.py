@@ -38,7 +38,6 @@ Array = NDArray[np.float64]
 
 WITHIN = 1.05  # times the least held-out error: equally good
 STARTS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # places in the gap at which p may begin
-EXTRA_POLES = (0.3, 0.85)  # where one more pole than in the order below may begin
 CANCELS = 0.02  # distance of a pole and a zero that cancel, relative to that of the pole from 1
 SLOWEST = 0.01  # ... which counts as this much at least: a zero at 1 cancels an integrator
 EPS = float(np.finfo(float).eps)
@@ -170,7 +169,7 @@ def _fit_from(
             key=lambda one: squares_of(samples, structure, one),
         )))
     if below is not None and below.structure.free_poles == structure.free_poles - 1:
-        for pole in EXTRA_POLES:
+        for pole in (0.3, 0.85):
             a = np.convolve(np.append(1.0, below.point.a), (1.0, -pole))[1:]
             fits.append(fit(samples, structure, below.point._replace(a=a)))
     return min(fits, key=lambda found: found.squares)

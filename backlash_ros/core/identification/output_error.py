@@ -23,7 +23,6 @@ from backlash_ros.core.identification.play_record import PlayOutput, PlayRecord
 
 Array = NDArray[np.float64]
 
-ITERATIONS = 40  # of one fit at most
 TOLERANCE = 1e-7  # relative fall of the squares below which a fit is done
 # Of Levenberg and Marquardt: at first, times after a step down and one up, where a fit gives up.
 FIRST_DAMPING, LESS, MORE, MOST_DAMPING = 1e-3, 0.2, 5.0, 1e8
@@ -234,7 +233,7 @@ def slopes(
 
 def fit(
     samples: Samples, structure: Structure, start: Point, gap_free: bool = True,
-    iterations: int = ITERATIONS, penalty: Array | None = None,
+    iterations: int = 40, penalty: Array | None = None,
 ) -> Fit:
     """The least squares nearest to a start. gap_free: whether the gap moves as well.
 

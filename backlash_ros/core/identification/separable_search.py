@@ -24,13 +24,8 @@ from backlash_ros.core.identification.starting_models import steiglitz_mcbride
 
 Array = NDArray[np.float64]
 
-GAPS = 48  # that the whole swing of v is searched with
-SMALLEST = 2e-3  # of them, in swings of v
-NEAR, NEAR_GAPS = 0.2, 13  # reach around a minimum, relative, and gaps that it is searched with
+NEAR = np.linspace(0.8, 1.2, 13)  # gaps around a minimum, relative
 STARTS = (0.0, 0.5, 1.0)  # places in the gap at which p may begin
-AFRESH = 4  # every so many gaps a model is searched for from scratch
-STEPS = 3  # of the model per gap; it goes on from that of the gap before
-MINIMA = 3  # that are set free
 
 
 class Profile(NamedTuple):
@@ -56,12 +51,11 @@ class Profile(NamedTuple):
 def search(samples: Samples, structure: Structure) -> Generator[None, None, list[Fit]]:
     """Fits with everything free from the best minima, the best first; yields between pieces."""
     swing = samples.play.swing
-    gaps: Array = np.append(0.0, np.geomspace(SMALLEST, 0.98, GAPS) * swing)
+    gaps: Array = np.append(0.0, np.geomspace(2e-3, 0.98, 48) * swing)
     first = yield from profile(samples, structure, gaps)
     found: list[Fit] = []
-    for minimum in first.minima()[:MINIMA]:
-        shares = np.linspace(1.0 - NEAR, 1.0 + NEAR, NEAR_GAPS)
-        around = np.array([gap for gap in minimum.point.gap * shares if gap < swing])
+    for minimum in first.minima()[:3]:
+        around = np.array([gap for gap in minimum.point.gap * NEAR if gap < swing])
         if not len(around):
             found.append(minimum)
             continue
@@ -80,12 +74,13 @@ def profile(
     models = [] if known is None else [known.point.a]
     for number, gap in enumerate(gaps.tolist()):
         starts = [v0 + share * gap for share in (STARTS if gap > 0.0 else STARTS[:1])]
-        if number % AFRESH == 0:
+        if number % 4 == 0:  # a model from scratch
             p = samples.play.output(gap, starts[len(starts) // 2]).p
             models = [*models, *steiglitz_mcbride(samples, structure, p)[:1]]
         points = [Point(a, gap, start) for a in models for start in starts]
         best = min(points, key=lambda point: squares_of(samples, structure, point))
-        fits.append(fit(samples, structure, best, gap_free=False, iterations=STEPS))
+        # The next gap goes on from this model.
+        fits.append(fit(samples, structure, best, gap_free=False, iterations=3))
         models = [fits[-1].point.a]
         yield
     return Profile(gaps, np.array([found.squares for found in fits]), fits)

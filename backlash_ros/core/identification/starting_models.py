@@ -23,9 +23,6 @@ from backlash_ros.core.identification.output_error import (
 
 Array = NDArray[np.float64]
 
-FIRST_FILTERS = (0.5, 0.9, 0.98)  # pole of the first filter, as often as G has poles
-STEPS = 4  # of filtering with the model of the step before
-FIRST_JUDGED = 2  # steps before a model is compared with others
 INSIDE = 0.999  # a pole outside is put back to here
 
 
@@ -33,10 +30,12 @@ def steiglitz_mcbride(samples: Samples, structure: Structure, p: Array) -> list[
     """Free coefficients of A, the best first; at least one."""
     tried: list[tuple[float, int, Array]] = []
     y = _without_losses(samples)
-    for first in FIRST_FILTERS:
+    # The first filter has this pole as often as G has poles.
+    for first in (0.5, 0.9, 0.98):
         a = np.atleast_1d(np.poly(np.full(structure.free_poles, first)))[1:]
-        for step in range(STEPS + 1):
-            if step >= FIRST_JUDGED or not structure.free_poles:
+        for step in range(5):
+            # Two steps later it is compared with others.
+            if step >= 2 or not structure.free_poles:
                 squares = solve_linear(samples, structure, a, p).squares
                 tried.append((squares, len(tried), a))
             better = _refined(samples, structure, a, p, y)

@@ -23,7 +23,6 @@ from backlash_ros.core.identification.output_error import (
 
 Array = NDArray[np.float64]
 
-LJUNG_BOX_LAGS = 20  # of the residual, at most
 
 
 class Covariance(NamedTuple):
@@ -69,7 +68,7 @@ def autocorrelation(residual: Array, lags: int) -> Array:
 def ljung_box(residual: Array) -> float:
     """Probability that a white residual looks as correlated as this one."""
     count = int(np.isfinite(residual).sum())
-    lags = min(LJUNG_BOX_LAGS, count // 5)
+    lags = min(20, count // 5)
     r = autocorrelation(residual, lags)[1:]
     q = count * (count + 2.0) * float(np.sum(r**2 / (count - np.arange(1, lags + 1))))
     return float(chi2.sf(q, lags))

@@ -10,7 +10,6 @@ from math import inf, nan
 
 import numpy as np
 
-REMEMBERED = 1000  # latencies that p50 and p99 are taken of
 FEWEST, MOST = 20, 50  # intervals that the rate of y is taken of
 WINDOW_S = 3.0  # what counts as lately
 
@@ -31,7 +30,7 @@ class LoopStatistics:
     limited: int = 0  # commands that met a limit
     still: int = 0  # newest values of y in a row that are equal
     still_swing: float = 0.0  # how far v has moved meanwhile
-    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
     _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MOST + 1))
     _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=MOST))
     _y: float = nan

@@ -16,14 +16,13 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from backlash_ros import topics
 from backlash_ros.core.loop.causes import UNNAMED
 from backlash_ros.nodes.diagnostics.presence import Presence
+from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.spin import ProcessNode
 
-LOOK_S = 0.2  # between two looks at the graph
 # What discovery mostly takes: a publisher that is found so soon after the start of a node was there
 # before it. Controllers of this machine are waited for however long it takes.
 SETTLE_S = 0.7
 HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
-SILENT_S = 3.0  # periods of /diagnostics, after which a controller that has said something is gone
 OWN_S = 1.0  # for the graph to show a publisher of this very process
 # Keys in /diagnostics by which controllers know each other.
 ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
@@ -119,7 +118,7 @@ class RivalWatch:
         self._others: frozenset[str] = frozenset()
         self._hello_until = -inf
         self._diagnostics: Subscription | None = None  # listened to only beside others
-        node.create_timer(LOOK_S, self.look, clock=node.steady_clock)
+        node.create_timer(0.2, self.look, clock=node.steady_clock)
 
     @property
     def settled(self) -> bool:

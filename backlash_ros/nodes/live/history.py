@@ -9,14 +9,13 @@ from math import isfinite
 
 V, U = 'v', 'u_hat'
 LOOP = 'loop'
-FLOAT_DIGITS = 7  # more than a picture can show
 
 Curves = dict[str, list[float | None]]
 
 
 def rounded(value: float) -> float | None:
     """A number for JSON, which has no nan: None."""
-    return float(f'{value:.{FLOAT_DIGITS}g}') if isfinite(value) else None
+    return float(f'{value:.7g}') if isfinite(value) else None
 
 
 class CurvePoints:

@@ -20,8 +20,6 @@ from backlash_ros.topics import BACKLASH
 EXECUTABLE = 'live'
 REFRESH_S = 0.1  # between two frames of the page
 SHOWN_S = 10.0  # width of the curves
-# A machine that is held up for a second loses no point.
-DEPTH = 30
 LABELS = (
     *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
     'y_m', 'y', 'u_d', 'v', 'u_hat',
@@ -36,7 +34,8 @@ class LiveNode(ProcessNode):
 
     def __init__(self, wanted: Sequence[str], bound: socket.socket) -> None:
         super().__init__(EXECUTABLE)
-        self._followed = FollowedControllers(self, wanted, LABELS, DEPTH)
+        # A machine that is held up for a second loses no point.
+        self._followed = FollowedControllers(self, wanted, LABELS, depth=30)
         self._socket = bound
         self._start_ns = time.time_ns()
         self._points: dict[str, CurvePoints] = {}

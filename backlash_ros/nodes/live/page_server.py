@@ -13,7 +13,6 @@ from aiohttp.typedefs import Handler
 PAGE = Path(__file__).with_name('page.html')
 HOST = '127.0.0.1'
 MOST_READERS = 16  # pages that are open at once
-GOODBYE_S = 0.2  # for browsers that do not take what they are sent
 
 
 def bound_socket(port: int) -> socket.socket:
@@ -57,7 +56,8 @@ class PageServer:
         application.router.add_get('/', self._page)
         application.router.add_get('/events', self._events)
         self._runner = web.AppRunner(
-            application, access_log=None, handle_signals=False, shutdown_timeout=GOODBYE_S
+            # Some browsers do not take what they are sent.
+            application, access_log=None, handle_signals=False, shutdown_timeout=0.2,
         )
 
     async def start(self) -> None:

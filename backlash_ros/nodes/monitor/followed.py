@@ -16,9 +16,7 @@ from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.spin import ProcessNode
 from backlash_ros.topics import BACKLASH
 
-LOOK_S = 1.0  # between two looks for further controllers
 NICENESS = 10  # of a process that only shows: the loop comes first
-STATUSES = 100  # of all nodes of the domain that may wait: some robots have many
 MARK = topics.of_node(topics.watched(BACKLASH[0])).removeprefix('~')  # of a controller
 
 
@@ -67,8 +65,9 @@ class FollowedControllers:
         self._node, self._labels, self._depth = node, labels, depth
         self._wanted = ['/' + name.strip('/') for name in wanted]
         self.by_name: dict[str, Followed] = {}
-        self._diagnostics = Inbox(node, DiagnosticArray, topics.DIAGNOSTICS, STATUSES)
-        node.create_timer(LOOK_S, self._look, clock=node.steady_clock)
+        # Those of all nodes of the domain: some robots have many.
+        self._diagnostics = Inbox(node, DiagnosticArray, topics.DIAGNOSTICS, depth=100)
+        node.create_timer(1.0, self._look, clock=node.steady_clock)
         self._look()
 
     @property

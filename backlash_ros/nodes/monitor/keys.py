@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-LONGEST = 100  # bytes that are read at once
 # Arrows and function keys come as sequences of which a part looks like other keys.
 SEQUENCE = re.compile(r'\x1b(\[|O)[0-9;]*.?')
 
@@ -31,7 +30,7 @@ def pressed_keys(stream: TextIO) -> Iterator[Callable[[], str]]:
     def read() -> str:
         if not select.select([descriptor], [], [], 0.0)[0]:
             return ''
-        return SEQUENCE.sub('', os.read(descriptor, LONGEST).decode(errors='ignore'))
+        return SEQUENCE.sub('', os.read(descriptor, 100).decode(errors='ignore'))
 
     try:
         tty.setcbreak(descriptor)

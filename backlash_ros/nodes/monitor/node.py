@@ -27,9 +27,8 @@ from backlash_ros.topics import BACKLASH
 EXECUTABLE = 'monitor'
 REFRESH_S = 0.2  # of the screen
 LINE_S = 1.0  # between two plain lines
-CONFIRM_S = 3.0  # within which a second r resets
 ANSWER_S = 5.0  # longest wait for a service
-NOTICE_S = 3.0  # for which a notice is shown
+NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
 
 
 @dataclass
@@ -148,7 +147,7 @@ class MonitorNode(ProcessNode):
         """Call the service behind a key."""
         service, switch = ACTIONS[key]
         if key == 'r' and time.monotonic() > self._confirmed_until_s:
-            self._confirmed_until_s = time.monotonic() + CONFIRM_S
+            self._confirmed_until_s = time.monotonic() + NOTICE_S
             self._say(f'press r once more to reset the estimates of {state.name}')
             return
         self._confirmed_until_s = 0.0

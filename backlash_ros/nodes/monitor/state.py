@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 
+from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.topics import BACKLASH
 
-REMEMBERED = 20  # events
 DIGITS = re.compile(r'[\d.]+')  # a text in which a figure has changed tells nothing new
-SILENT_S = 3.0  # without diagnostics, which come every second, nobody is there any more
 
 
 @dataclass
@@ -33,7 +32,7 @@ class ControllerState:
         default_factory=lambda: dict.fromkeys(BACKLASH, (nan, nan))
     )
     scales: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BACKLASH, 0.0))
-    events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=20))
 
     def take_diagnostics(
         self, level: int, message: str, values: Mapping[str, str], now_s: float, clock: str,

@@ -21,6 +21,7 @@ from backlash_ros.core.loop.level_log import LevelLog
 # Deep enough that a recorder which is held up for a second misses nothing.
 DEPTH = 1000
 DIAGNOSTICS_PERIOD_S = 1.0  # of every node, besides each change
+SILENT_S = 3.0 * DIAGNOSTICS_PERIOD_S  # after which a node that has said something is gone
 # In lockstep a missed message would stop the loop for good: who comes late gets it all the same.
 KEPT = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

@@ -16,7 +16,6 @@ import yaml
 
 from backlash_ros.core.parameters.table import NODES
 
-SIMILAR = 0.8  # of difflib: a misspelt name rather than somebody else's node
 OPTION = '--params-file'
 
 
@@ -55,7 +54,8 @@ def unused(
             if not (inside and namespace) or last != own:
                 yield name, f'/**/{own}'
         elif last not in NODES and '*' not in last:
-            near = difflib.get_close_matches(last, [executable], n=1, cutoff=SIMILAR)
+            # A misspelt name rather than somebody else's node.
+            near = difflib.get_close_matches(last, [executable], n=1, cutoff=0.8)
             if near:
                 yield name, f'/**/{own}'
 

@@ -27,8 +27,6 @@ from typing import IO
 from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.bringup.process_groups import group_exists, stop_groups
 
-LOG_LINES = 10  # of a log that an error message quotes
-
 
 class RunError(RuntimeError):
     """A run that was accepted and then failed; the message is for the user."""
@@ -100,7 +98,7 @@ class Child:
         """The last lines of the log, indented."""
         log = self.plan.log
         lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
-        quoted = ''.join(f'\n    {line}' for line in lines[-LOG_LINES:])
+        quoted = ''.join(f'\n    {line}' for line in lines[-10:])
         return f'{log}:{quoted}' if quoted else f'{log} is empty'
 
     def describe_exit(self) -> str:

@@ -18,8 +18,6 @@ BAG, LOGS = 'bag', 'logs'
 DRIVER, ELSEWHERE = 'driver', 'none'
 LIVE = 'live'
 AXIS_MARK = '{axis}'
-# The last command of the controller acts from the next sample of the driver on.
-LAST_COMMAND_PERIODS, LONGEST_LINGER_S = 2.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -220,11 +218,12 @@ def _driver(
     if len(axes) > 1:
         names = [axis.name for axis in axes]
         name, log = f'{DRIVER} of {", ".join(names)}', plan.out / LOGS / f'{"_".join(names)}.log'
-    linger = LAST_COMMAND_PERIODS * max(axis.sample_period for axis in axes)
+    # The last command of the controller acts from the next sample of the driver on.
+    linger = 2.0 * max(axis.sample_period for axis in axes)
     return ProcessPlan(
         name, command, log,
         foreign_environment(child_environment(log.parent, domain)),
-        foreign=True, linger_s=min(linger, LONGEST_LINGER_S),
+        foreign=True, linger_s=min(linger, 1.0),
     )
 
 

@@ -19,7 +19,6 @@ CATCH_UP_DEADLINE_S = 10.0  # for the recorder, after the last sample
 # Reports without anything that was unheard, after which nothing is to come. The middleware sends
 # again what got lost on the way to a recorder that was held up, with its own settings every 3 s.
 STANDS_STILL = 20
-LISTEN_S = 0.1  # between two looks at signals, deadlines and dead processes
 
 # Where y may come from, as the ends of full names.
 OUTPUTS = (f'/{topics.PLANT_OUTPUT}', f'/{topics.JOINT_STATES}')
@@ -136,7 +135,7 @@ class Run:
                 ))
 
     def _listen(self) -> None:
-        for event in self._supervisor.events(LISTEN_S):
+        for event in self._supervisor.events(0.1):
             self._note(event)
         if self._requests.count and not self._over:
             raise RunError(f'interrupted by {self._requests.last}, stopping')

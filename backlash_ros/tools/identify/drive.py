@@ -38,7 +38,6 @@ LOOK_S = 0.25  # between two looks at the record
 FEWEST = 3  # samples that are a record
 FIRST_LOOK_S = 3.0  # of motion before the first estimate
 SHARE_OF_TIME = 0.25  # of the time that estimates may take: the actuator needs the processor
-KINDER = 5  # niceness by which estimates give way to the driver and to what moves it
 
 
 def drive(
@@ -149,7 +148,7 @@ class _Estimate:
 
     def _look(self) -> None:
         if sys.platform == 'linux':
-            os.nice(KINDER)  # of this thread alone
+            os.nice(5)  # this thread alone gives way to the driver and to what moves it
         started = time.monotonic()
         while not self._given_up.is_set():
             try:

@@ -36,7 +36,7 @@ WIDER_THAN_GAP, MOST_OF_REACH = 0.75, 0.8  # amplitude in gaps that shows the ga
 SHARE_OF_REACH = 0.4  # of the range of v less the gap, which the reference asks for
 LITTLE = 0.1  # of the gain at the lowest frequency: faster motion of y takes too much of v
 USUAL_FREQUENCY = np.pi / 10.0  # [rad/sample] at which tracking.input_weight takes |G|
-PREVIEW, USUAL_PREVIEW, LONGEST_PREVIEW = 6.0, 60, 600  # radians of that motion; samples
+PREVIEW, LONGEST_PREVIEW = 6.0, 600  # radians of that motion; samples
 
 
 def identified_parameters(
@@ -153,10 +153,13 @@ def _weights(found: Identification) -> dict[str, Value]:
     if not len(beyond):
         return {}
     last = max(int(beyond[0]) - 1, 0)
-    default = BY_NAME['tracking.input_weight'].default
+    default, usual = (
+        BY_NAME[f'tracking.{name}'].default for name in ('input_weight', 'preview')
+    )
     assert isinstance(default, float)
+    assert isinstance(usual, int)
     weight, w = default * max(float(gain[last] / gain[-1]), 1.0)**2, w[last]
-    preview = min(max(round(PREVIEW / w), USUAL_PREVIEW), LONGEST_PREVIEW)
+    preview = min(max(round(PREVIEW / w), usual), LONGEST_PREVIEW)
     return {'tracking.input_weight': float(f'{weight:.2g}'), 'tracking.preview': preview}
 
 

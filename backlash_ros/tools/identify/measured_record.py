@@ -15,6 +15,7 @@ from backlash_ros import topics
 from backlash_ros.bags.content import is_bag
 from backlash_ros.core.control.controller import LARGEST
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
+from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
 from backlash_ros.tools.cli.errors import InputError
 from backlash_ros.tools.report.command import BAG, open_source
 from backlash_ros.tools.run_files.bag_reading import read_plain_numbers
@@ -27,10 +28,6 @@ Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values
 COLUMNS = ('t', 'v', 'y')
 COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
 OFF_GRID = 0.25  # of a period that a row of a CSV may miss its time
-# Of a sample period: a stamp that is later is that of the next sample, and the clock of the driver
-# is slower by this per sample at most.
-LATEST, CLOCK_SLACK = 0.85, 0.01
-ENDS, MOST_DIGITS = 2.0**0.5, 9  # independent latenesses of two stamps; digits of a period
 SIMULATED_BEFORE_NS = 10**17  # stamps: the clock of a machine is far beyond
 LONGEST = 1_000_000  # samples, lost ones included: more is a t that jumps
 
@@ -258,7 +255,8 @@ def from_messages(
         # All stamps together tell it better than one step does, but for how late the ends were.
         period, offset = np.polyfit(index, stamps * 1e-9, 1).tolist()
         late = float(np.std(stamps * 1e-9 - period * index - offset))
-        period = _rounded(period, ENDS * late / float(index[-1]))
+        # The first and the last stamp are late independently of each other.
+        period = _rounded(period, 2.0**0.5 * late / float(index[-1]))
     count = int(index[-1]) + 1
     y = np.full(count, nan)
     y[index] = output[1]
@@ -278,7 +276,7 @@ def _numbered(times: Array) -> NDArray[np.int64]:
     begin, number = float(times[0]), 0
     passed = np.zeros(len(times), dtype=np.int64)
     for i, time in enumerate(times.tolist()):
-        newest = max(int(time - begin + 1.0 - LATEST), number)
+        newest = max(int(time - begin + 1.0 - JITTER), number)
         begin = min(begin + CLOCK_SLACK * (newest - number), time - newest)
         passed[i] = number = newest
     # Strictly rising, the last of a heap keeping its place.
@@ -289,7 +287,7 @@ def _numbered(times: Array) -> NDArray[np.int64]:
 
 def _rounded(period: float, deviation: float) -> float:
     """The period with the fewest digits that is within its deviation."""
-    for digits in range(1, MOST_DIGITS):
+    for digits in range(1, 9):
         text = f'{period:.{digits}g}'
         if abs(float(text) - period) <= deviation:
             return float(text)

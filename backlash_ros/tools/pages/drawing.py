@@ -16,8 +16,6 @@ from backlash_ros.tools.report.analysis import thinned
 
 Array = NDArray[np.float64]
 
-WIDTH = 10.0  # inches
-DPI = 130  # of every picture
 TIME = 'time t [s]'  # label of an axis
 # Okabe-Ito and Tol: told apart with every kind of colour vision.
 COLOURS = {
@@ -34,7 +32,7 @@ UNITS = {'m': 'unit of u/v', 'c_r': 'unit of v', 'c_l': 'unit of v'}
 
 def new_figure(height: float) -> Figure:
     """Figure of the common width that needs no display."""
-    return Figure(figsize=(WIDTH, height), dpi=DPI, layout='constrained')
+    return Figure(figsize=(10.0, height), dpi=130, layout='constrained')
 
 
 def png(figure: Figure) -> bytes:

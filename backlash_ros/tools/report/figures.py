@@ -46,8 +46,6 @@ Array = NDArray[np.float64]
 
 WHOLE = Part('Whole run', slice(None))
 DECADES = 8.0  # that a logarithmic axis shows at most: what is below them is as good as zero
-DIVERGED = 1e3  # times the largest error of the best law: more need not be told apart
-STD_MARGIN = 0.25  # of the range of the estimates that is left for their standard deviations
 
 
 def draw_parameter_errors(
@@ -122,7 +120,8 @@ def draw_estimates(run: RunRecord) -> Figure:
             band(axes, t, estimate - 2 * std, estimate + 2 * std, COLOURS[name],
                  '±2 standard deviations')
             # The first, nearly boundless uncertainty would flatten everything else.
-            axes.set_ylim(*limits([estimate, run.column(f'true_{name}')], STD_MARGIN))
+            # The margin is for the standard deviations.
+            axes.set_ylim(*limits([estimate, run.column(f'true_{name}')], 0.25))
             title += f' ± {2 * std[-1]:.2g}'
         shade(axes, t, frozen(run), 'frozen')
         label(axes, f'{title} at the end', f'${ESTIMATES[name]}$ [{UNITS[name]}]')
@@ -178,7 +177,7 @@ def _draw_sizes(axes: Axes, traces: Sequence[LawTrace], part: Part) -> None:
     # A law that diverges leaves the axes, which are made for those that do not.
     highest = [float(size.max()) for size in sizes if size.size]
     if highest:
-        top = min(max(highest), DIVERGED * min(highest))
+        top = min(max(highest), 1e3 * min(highest))
         # Not the least of all: an error begins at zero.
         low = float(np.percentile(np.concatenate(sizes), 2))
         limit_decades(axes, low, top, DECADES)

@@ -19,8 +19,6 @@ from backlash_ros.topics import BACKLASH
 
 COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#332288', '#777777', '#000000')
 MARKERS = 'osD^vP*X'
-WIDE_RANGE = 20.0  # ratio of the largest to the smallest value from which an axis is logarithmic
-SMALLEST_PERCENT = 1e-10  # a smaller error is drawn here: the logarithm has no zero
 
 Groups = Sequence[tuple[Mapping[str, Value], Sequence[Outcome]]]
 
@@ -86,7 +84,8 @@ def _rmse_percent(outcomes: Sequence[Outcome], parameter: str) -> float:
     if not truth.all():
         return nan  # nothing is a percentage of zero
     relative = np.array([outcome.final[i] for outcome in whole]) / truth - 1.0
-    return max(100.0 * float(np.sqrt(np.mean(relative**2))), SMALLEST_PERCENT)
+    # The logarithm has no zero.
+    return max(100.0 * float(np.sqrt(np.mean(relative**2))), 1e-10)
 
 
 def _settling(outcomes: Sequence[Outcome]) -> float:
@@ -99,5 +98,5 @@ def _settling(outcomes: Sequence[Outcome]) -> float:
 def _scale(panel: Axes, axis: Sweep, places: Sequence[float], numbers: bool) -> None:
     if not numbers:
         panel.set_xticks(places, [value_text(value) for value in axis.values])
-    elif min(places) > 0.0 and max(places) / min(places) >= WIDE_RANGE:
+    elif min(places) > 0.0 and max(places) / min(places) >= 20.0:
         panel.set_xscale('log')

@@ -18,8 +18,6 @@ Array = NDArray[np.float64]
 # Variance of the disturbance per sample, seen in y, over that of the noise on y: from an observer
 # that believes its model to one that believes y alone.
 CONFIDENCES = (1e-4, 1e-1, 1e2, 1e5)
-FREQUENCIES = 120  # at which the distance from instability is looked at, on a log scale
-SLOWEST = 1e-3  # of them [rad per sample]
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ def _distance(plant: StateModel, feedback: Feedback, confidence: float) -> float
     gain = np.append(feedback.gain, 0.0)
     closed = believed - np.outer(drive, gain)
     closed -= np.outer(correction, seen @ closed)
-    z = np.exp(1j * np.geomspace(SLOWEST, np.pi, FREQUENCIES))[:, None, None]
+    z = np.exp(1j * np.geomspace(1e-3, np.pi, 120))[:, None, None]
     x = np.linalg.solve(z * np.eye(plant.order) - plant.a, plant.b[:, None])
     x_hat = np.linalg.solve(z * np.eye(len(gain)) - closed, z * correction[:, None])
     z = z[:, 0, 0]
