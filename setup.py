@@ -26,8 +26,13 @@ setup(
         (f'share/{PACKAGE}/config', sorted(glob('config/*'))),
         (f'share/{PACKAGE}/launch', sorted(glob('launch/*.launch.py'))),
         (f'share/{PACKAGE}/examples', sorted(glob('examples/*.py'))),
-        (f'share/{PACKAGE}/docs', sorted(glob('docs/*.md'))),
-        (f'share/{PACKAGE}/docs/images', sorted(glob('docs/images/*'))),
+        *(
+            (f'share/{PACKAGE}/{folder}', sorted(glob(f'{folder}/{pattern}')))
+            for folder, pattern in (
+                ('docs', '*.md'), ('docs/images', '*'), ('docs/reference', '*.md'),
+                ('docs/results', '*.md'), ('docs/results/images', '*'),
+            )
+        ),
     ],
     zip_safe=False,
     python_requires='>=3.10',

@@ -26,7 +26,7 @@ from reporting import (
     text_table,
 )
 
-DOCUMENT = ROOT / 'docs' / 'estimation_results.md'
+DOCUMENT = ROOT / 'docs' / 'results' / 'estimation_results.md'
 SEEDS, FIRST_SEED = 200, 1
 
 POINTS: dict[int, Callable[[Benchmark], Outcome]] = {

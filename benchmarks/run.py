@@ -25,7 +25,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.tools.config.configuration import load_config
 
-DOCUMENT = ROOT / 'docs' / 'performance.md'
+DOCUMENT = ROOT / 'docs' / 'results' / 'performance.md'
 DURATION_S = 20.0
 LATENCY_LAWS = ('moving_horizon', 'lms')
 SPEED_HEADER = ('law', 'samples/s')

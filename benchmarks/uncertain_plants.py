@@ -22,7 +22,7 @@ sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 from accuracy.uncertain_points import CASE_HEADER, POINTS, Benchmark
 from reporting import CHECK_HEADER, ROOT, Check, markdown_table, processors, text_table
 
-DOCUMENT = ROOT / 'docs' / 'uncertain_plants.md'
+DOCUMENT = ROOT / 'docs' / 'results' / 'uncertain_plants.md'
 BACKLASHES, FIRST_SEED = 20, 1
 NOTES_SHOWN = 12
 

@@ -1,8 +1,8 @@
 """Regenerates every picture and every number of the documents: `make docs`.
 
 Pictures go to docs/images. Numbers go between the marks
-`<!-- name: made by docs/made_by/figures.py -->` and `<!-- end -->` of the pages; docs/parameters.md
-and docs/constants.md are written as a whole.
+`<!-- name: made by docs/made_by/figures.py -->` and `<!-- end -->` of the pages; parameters.md and
+constants.md in docs/reference are written as a whole.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from backlash_ros.tools.report.figures import draw_hysteresis, draw_laws
 
 DOCS = Path(__file__).resolve().parents[1]
 IMAGES = DOCS / 'images'
-PAGES = [DOCS.parent / 'README.md', *DOCS.glob('*.md')]
+PAGES = [DOCS.parent / 'README.md', *DOCS.rglob('*.md')]
 MARK = re.compile(
     r'(<!-- (\w+): made by docs/made_by/figures\.py -->\n).*?(<!-- end -->)', re.DOTALL
 )

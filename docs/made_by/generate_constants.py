@@ -1,4 +1,4 @@
-"""Writes docs/constants.md: every number that the package has as a constant, and its meaning."""
+"""Writes docs/reference/constants.md: every number that is a constant, and its meaning."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ NUMBERS = (ast.Constant, ast.UnaryOp, ast.BinOp, ast.Tuple)
 BEGIN = """# Constants
 
 Numbers that are no parameters, as nobody has to choose them: tolerances, deadlines, sizes. Those of
-the estimator stand in [estimation.md](estimation.md#constants). Made from the code and the comments
-beside them by `make docs`.
+the estimator stand in [estimation.md](../estimation.md#constants). Made from the code and the
+comments beside them by `make docs`.
 """
 
 
@@ -41,7 +41,7 @@ def constants_page() -> str:
                      '| constant | value | meaning | file |\n| --- | --- | --- | --- |\n')
         for found in of_folder:
             names = ', '.join(f'`{name}`' for name in found.names)
-            link = f'[{found.path.name}](../{found.path.relative_to(DOCS.parent).as_posix()})'
+            link = f'[{found.path.name}](../../{found.path.relative_to(DOCS.parent).as_posix()})'
             meaning = found.meaning.replace('|', '\\|').replace('*', '\\*')
             parts.append(f'| {names} | `{found.value}` | {meaning} | {link} |\n')
     return ''.join(parts)
@@ -88,4 +88,4 @@ def _meaning(lines: list[str], node: ast.Assign) -> str:
 
 def write_constants() -> None:
     """Write the page."""
-    (DOCS / 'constants.md').write_text(constants_page(), encoding='utf-8')
+    (DOCS / 'reference' / 'constants.md').write_text(constants_page(), encoding='utf-8')

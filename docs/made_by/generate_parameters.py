@@ -1,4 +1,4 @@
-"""Writes docs/parameters.md from the one table of parameters; `make docs` calls it."""
+"""Writes docs/reference/parameters.md from the one table of parameters; `make docs` calls it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from pathlib import Path
 
 from backlash_ros.core.parameters.table import PARAMETERS, Parameter, as_yaml
 
-PAGE = Path(__file__).resolve().parents[1] / 'parameters.md'
+PAGE = Path(__file__).resolve().parents[1] / 'reference' / 'parameters.md'
 HEAD = """# Parameters
 
-Made from [table.py](../backlash_ros/core/parameters/table.py) by `make docs`; do not edit.
+Made from [table.py](../../backlash_ros/core/parameters/table.py) by `make docs`; do not edit.
 The nodes, `bringup` and `simulate` all read one YAML file:
-[paper_example.yaml](../config/paper_example.yaml) shows every group.
+[paper_example.yaml](../../config/paper_example.yaml) shows every group.
 `y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in
 a running node; all others of `controller`, but for `io.*`, `lockstep`, `autostart`,
 `wait_for_subscribers` and `estimator.use_applied_control`, while it is unconfigured.

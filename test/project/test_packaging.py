@@ -82,6 +82,7 @@ def test_installation_holds_what_ros2_run_and_the_tools_look_for(installation: P
     assert installed == {path.name: path.read_bytes() for path in ROOT.glob('config/*')}
     for folder, pattern in (
         ('launch', '*.py'), ('examples', '*.py'), ('docs', '*.md'), ('docs/images', '*'),
+        ('docs/reference', '*.md'), ('docs/results', '*.md'), ('docs/results/images', '*'),
     ):
         beside = {path.name for path in (share / 'backlash_ros' / folder).glob(pattern)}
         assert beside == {path.name for path in (ROOT / folder).glob(pattern)} != set()

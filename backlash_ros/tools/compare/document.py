@@ -60,7 +60,7 @@ def draw_comparison(results: Sequence[Result]) -> Figure:
 def comparison_document(
     scenario: Parameters, results: Sequence[Result], figure: str,
 ) -> str:
-    """docs/comparison.md as text."""
+    """docs/results/comparison.md as text."""
     lines = [
         '# Comparison of laws and structures', '',
         f'![Control error and tracking error of every loop over time]({figure})', '',
