@@ -7,7 +7,7 @@ be published (schedule.py names them).
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from math import inf
 
@@ -42,6 +42,7 @@ from backlash_ros.core.estimation.regression.play import Start
 Array = NDArray[np.float64]
 Task = Generator[None, None, bool]
 
+LASTING = 1.0 / BY_CHANCE  # of the usual deviations, for an error that lasts
 CAPACITY = 2 * LONGEST  # samples kept: those that are fitted, and those that come meanwhile
 
 
@@ -79,7 +80,8 @@ class Learning:
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
     again. changed: what theta seems to have become. refitted: whether it was refitted since the
     record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
-    do not deny it. held: covariance (3, 3) of the m, c_r, c_l that are published, None before.
+    do not deny it; supported: what they say alone, where that is precise enough to speak for it.
+    held: covariance (3, 3) of the m, c_r, c_l that are published, None before.
     """
 
     bounds: Bounds
@@ -100,6 +102,7 @@ class Learning:
     refitted: bool = False
     changed: Prior | None = None
     unconfirmed: Prior | None = None
+    supported: Crossings | None = None
     held: Array | None = None
 
     @property
@@ -167,7 +170,7 @@ class Learning:
         deviations has to be small, not one of them.
         """
         lasting = self.around.inherited and self.fit.solution.moved_otherwise
-        return 1.0 / BY_CHANCE if lasting else 1.0
+        return LASTING if lasting else 1.0
 
     def judged(self, found: Crossings | None, estimate: Estimate) -> Belief:
         """What becomes of a fit beside the estimate that held so far.
@@ -203,6 +206,7 @@ class Learning:
         they may be as wrong. So may they where something else moves y, which denies nothing.
         """
         prior, (fit, solution, _) = self.unconfirmed, self.fit
+        self.supported = None
         if prior is None or not self.reversed_often(fit):
             return False
         alone = solution.alone or fit.solve(alone=True)
@@ -214,7 +218,29 @@ class Learning:
         denied = contradicted and differs(found, prior) and not otherwise
         if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
             self.unconfirmed = None
+        elif not contradicted and is_precise(found, fit.swing, LASTING):
+            self.supported = found
         return denied
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether the samples speak for what is published."""
+        known = self.unconfirmed is None or self.supported is not None
+        return self.current is not None and known
+
+    def doubted(self, found: Crossings | None) -> Crossings | None:
+        """The same, known no better than from the samples alone as long as they only support it.
+
+        Another backlash that they do not tell from the one that was learned before is within
+        these deviations.
+        """
+        alone = self.supported
+        if found is None or alone is None:
+            return found
+        return replace(
+            found, std_m=alone.std_m, std_c_r=alone.std_c_r, std_c_l=alone.std_c_l,
+            std_gap=alone.std_gap, cov=alone.cov,
+        )
 
     def drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""

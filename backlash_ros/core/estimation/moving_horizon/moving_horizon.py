@@ -251,9 +251,7 @@ class MovingHorizon:
             return reason
         if self._following.since_motion > self.model.memory:
             return Status.NOT_EXCITED
-        learning = self._learning
-        known = learning.current is not None and learning.unconfirmed is None
-        return Status.TRACKING if known else Status.ACQUIRING
+        return Status.TRACKING if self._learning.confirmed else Status.ACQUIRING
 
     # --- after the command -----------------------------------------------------------------------
 
@@ -305,7 +303,7 @@ class MovingHorizon:
             if not kept:
                 learning.held = None
             return
-        found = learning.usable(current, learning.share)
+        found = learning.doubted(learning.usable(current, learning.share))
         belief = learning.judged(found, self.estimate)
         if belief is Belief.REPLACES and found is not None:
             self._take_over(found)
