@@ -55,8 +55,8 @@ def identified_parameters(
     scale = WIDER * max(found.gap, found.c_r, -found.c_l)
     values.update({
         'sample_period': found.sample_period,
-        'plant.numerator': tuple(_significant(found.numerator)),
-        'plant.denominator': tuple(_significant(found.denominator)),
+        'plant.numerator': found.numerator,
+        'plant.denominator': found.denominator,
         'plant.uncertainty': found.uncertainty,
         'control.delay_samples': found.delay,
         'estimator.initial.m': found.m,
@@ -112,8 +112,8 @@ def _actuator(found: Identification) -> dict[str, Value]:
                 'actuator.wind_up': (0.0, 0.0)}
     lag, (right, left) = found.actuator.lag, found.actuator.wind_up
     return {
-        'actuator.numerator': tuple(_significant(tuple(lag.numerator.tolist()))),
-        'actuator.denominator': tuple(_significant(tuple(lag.denominator.tolist()))),
+        'actuator.numerator': tuple(lag.numerator.tolist()),
+        'actuator.denominator': tuple(lag.denominator.tolist()),
         'actuator.wind_up': (float(f'{right:.6g}'), float(f'{left:.6g}')),
     }
 
@@ -170,11 +170,6 @@ def _limits(found: Identification) -> dict[str, Value]:
         'control.min': float(f'{found.v.min():.4g}'), 'control.max': float(f'{found.v.max():.4g}'),
         'control.rate_max': float(f'{fastest:.4g}'),
     }
-
-
-def _significant(values: tuple[float, ...]) -> list[float]:
-    """Twelve digits: fewer would move poles near 1, more are noise."""
-    return [float(f'{value:.12g}') for value in values]
 
 
 def numbers(found: Identification) -> dict[str, Any]:
