@@ -89,7 +89,7 @@ def gear_of(inertia: float, bandwidth: float) -> Gear:
 def cell(job: tuple[float, float]) -> Cell:
     """Identify with the defaults, and close the loop with what was found, of use or not."""
     gear = gear_of(*job)
-    source = identified(gear, False, attempts={'': Options()})
+    source = identified(gear, False, attempts={'': Options()}, slower=())
     lost, found = gear.lost_motion, source.found
     said = '' if found.usable and not source.refused else source.said
     share = found.gap / lost

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from math import asin, inf, pi, sin
@@ -43,6 +43,9 @@ ATTEMPTS = {
     '': Options(), '--integrator no': Options(integrators=(False,)),
     '--integrator no --order 1-2': Options(orders=(1, 2), integrators=(False,)),
 }
+# Share of the rate, and times the duration, of further motions where the messages say to move more
+# slowly, at lower frequencies, or for longer.
+SLOWER = ((0.5, 2.0), (0.25, 2.0))
 STROKES_S = 20.0  # of the motion for identification, at most 4000 samples
 SETTLING_S = 0.5  # at rest before a record
 PERIODS, FIRST = 4, 2  # of a motion, and those of them that do not count
@@ -168,31 +171,43 @@ class Identified:
 
 def identified(
     gear: Gear, encoder: bool, rate: float = 1.0, seconds: float = STROKES_S,
-    attempts: Mapping[str, Options] = ATTEMPTS,
+    attempts: Mapping[str, Options] = ATTEMPTS, slower: Sequence[tuple[float, float]] = SLOWER,
 ) -> Identified:
     """Identify from v, or from the motor encoder; if it is not of use, again as told to.
 
-    rate: share of the largest speed of v at which it moves for that.
+    rate: share of the largest speed of v at which it moves for that. slower: shares of that, and
+    times the seconds, at which it moves again where no attempt is of use.
     """
-    v, motor, y = record(replace(gear, rate=rate * gear.rate), seconds)
+    results: list[Identified] = []
+    for share, longer in ((1.0, 1.0), *slower):
+        moved = record(replace(gear, rate=share * rate * gear.rate), longer * seconds)
+        for option, choice in attempts.items():
+            one = _identified(gear, moved, encoder, choice)
+            pace = '' if share == 1.0 else f'--rate {share:.0%}'
+            results.append(replace(one, option=f'{pace} {option}'.strip()))
+            if one.found.usable and not one.refused:
+                return results[-1]
+    return next((one for one in results if one.parameters is not None), results[0])
+
+
+def _identified(
+    gear: Gear, moved: tuple[Array, Array, Array], encoder: bool, choice: Options,
+) -> Identified:
+    """From one record (v, motor, load encoder), told one thing."""
+    v, motor, y = moved
     reach = gear.scale * gear.reach
     given: dict[str, Value] = {
         'sample_period': gear.sample_period, 'control.min': -reach, 'control.max': reach,
         'control.rate_max': gear.scale * gear.rate,
         'estimator.use_applied_control': 'true' if encoder else 'false',
     }
-    results = []
-    for option, choice in attempts.items():
-        found = identify(motor if encoder else v, y, gear.sample_period, choice)
-        if encoder:
-            found = with_actuator(found, v)
-        try:
-            results.append(Identified(found, option, identified_parameters(found, given)))
-        except ParameterError as error:
-            results.append(Identified(found, option, None, str(error)))
-        if found.usable and not results[-1].refused:
-            return results[-1]
-    return next((one for one in results if one.parameters is not None), results[0])
+    found = identify(motor if encoder else v, y, gear.sample_period, choice)
+    if encoder:
+        found = with_actuator(found, v)
+    try:
+        return Identified(found, '', identified_parameters(found, given))
+    except ParameterError as error:
+        return Identified(found, '', None, str(error))
 
 
 def learning(found: Identification, parameters: Parameters) -> AdaptiveController:
