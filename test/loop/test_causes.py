@@ -125,6 +125,8 @@ def test_the_model_is_blamed_where_nothing_else_is_known() -> None:
 @pytest.mark.parametrize(('changes', 'text'), [
     ({'unexplained': 0.234},
      '23.4 % of m*gap of the motion of u fits no G and no backlash: check G(z), load, sensor'),
+    ({'coasts': True, 'unexplained': 0.234},
+     'the load coasts in the gap (23 % of m*gap): brake it, or move more slowly'),
     ({'wrong_sign': True, 'unexplained': 0.3},
      'plant_output moves against v: reverse it, or the sign of plant.numerator'),
     # What noise leaves, or what has no gap to be compared with, is no reason.

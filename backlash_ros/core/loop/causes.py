@@ -90,6 +90,11 @@ def _contradiction(f: LoopFigures) -> Finding:
         return model._replace(
             text=f'{f.output.name} moves against v: reverse it, or the sign of plant.numerator'
         )
+    if f.coasts:
+        return model._replace(
+            text=f'the load coasts in the gap ({100.0 * f.unexplained:.2g} % of m*gap): brake it, '
+            'or move more slowly'
+        )
     if UNEXPLAINED <= f.unexplained < inf:
         return model._replace(
             text=f'{100.0 * f.unexplained:.3g} % of m*gap of the motion of u fits no G and no '

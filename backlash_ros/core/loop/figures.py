@@ -75,6 +75,7 @@ class LoopFigures:
     inconsistent_s: float = 0.0  # how long that status has been INCONSISTENT
     unexplained: float = nan  # motion of u that no G and no backlash explains, over m times the gap
     wrong_sign: bool = False  # whether y moves against v
+    coasts: bool = False  # whether the load runs on within the gap
     adapting: bool = True
     given: bool = False  # whether the estimates are taken as the parameters give them
     silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not

@@ -17,7 +17,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCH_GROWTH,
     SEARCHED,
 )
-from backlash_ros.core.estimation.fit.prior import Prior, contradicts
+from backlash_ros.core.estimation.fit.prior import Prior, contradicts, prior_of
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
@@ -29,6 +29,7 @@ from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.acquisition import confirmed
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimation.regression.play import Start
 
 Array = NDArray[np.float64]
 
@@ -45,7 +46,7 @@ def note_block(learning: Learning, fits: bool, number: int, count: int, changed:
         if since is not None and learning.consistent >= RECOVERED:
             # Whatever it was, it is over: what was measured meanwhile says nothing.
             learning.record.lose(np.arange(since, number + count - learning.consistent))
-            learning.contradicted_from = None
+            learning.contradicted_from = learning.contradiction = None
         return
     learning.consistent = 0
     if learning.contradicted_from is None:
@@ -151,6 +152,8 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         return learning.go_on_from(whole, record.first)
     if end - since >= RECOVERED:
         learning.reason = Status.INCONSISTENT
+        if around.inherited:
+            learning.contradiction = yield from _as_known(learning, estimate)
     if end - since > SEARCHED:
         learning.begin_acquisition(estimate)
     return False
@@ -175,6 +178,16 @@ def _best_of_all(
         if result is not None and result.keeps_prior and learning.usable(result) is not None:
             results.append(result)
     return most_likely(results) if results else None
+
+
+def _as_known(learning: Learning, estimate: Estimate) -> Generator[None, None, Fitted]:
+    """The newest samples around what was known, though it does not explain them."""
+    record = learning.record
+    v, y = record.since(max(record.first, record.end - SEARCHED))
+    gap = estimate.c_r - estimate.c_l
+    around = learning.around._replace(prior=prior_of(estimate, learning.held), walk=0.0)
+    start = Start(gap, float(v[0]) + 0.5 * gap)
+    return (yield from fitted(v, y, around, start, estimate.m, learning.pace))
 
 
 def _has_changed(

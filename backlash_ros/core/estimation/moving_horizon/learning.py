@@ -21,6 +21,7 @@ from backlash_ros.core.estimation.constants import (
     GROWTH,
     LONGEST,
     MEMORIES_SEARCHED,
+    PRECISE_GAP,
     RECOVERED,
     REPLACING,
     REVERSALS,
@@ -81,7 +82,8 @@ class Learning:
     again. changed: what theta seems to have become. refitted: whether it was refitted since the
     record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
     do not deny it; supported: what they say alone, where that is precise enough to speak for it.
-    held: covariance (3, 3) of the m, c_r, c_l that are published, None before.
+    contradiction: fit of samples that nothing explains, around what was known; None while there are
+    none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before.
     """
 
     bounds: Bounds
@@ -103,6 +105,7 @@ class Learning:
     changed: Prior | None = None
     unconfirmed: Prior | None = None
     supported: Crossings | None = None
+    contradiction: Fitted | None = None
     held: Array | None = None
 
     @property
@@ -242,6 +245,19 @@ class Learning:
             std_gap=alone.std_gap, cov=alone.cov,
         )
 
+    def coasts(self, estimate: Estimate) -> bool:
+        """Whether the load runs on while v crosses the gap of an estimate that was known before.
+
+        Unlike a lag, which makes the gap seem wider, that makes it seem narrower: y is ahead. And
+        y moves by more in a way of its own than the gap may be uncertain where an error lasts.
+        """
+        fitted = self.contradiction or self.current
+        alone = None if fitted is None else fitted.solution.alone
+        if fitted is None or alone is None or not self.around.inherited:
+            return False
+        narrower = alone.gap < estimate.c_r - estimate.c_l
+        return narrower and fitted.fit.unexplained(fitted.solution) > PRECISE_GAP * LASTING
+
     def drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""
         found = solution.crossings
@@ -260,6 +276,8 @@ class Learning:
         self.refit_at, self.moved_at = 0.0, 0
         self.refitted = False
         self.contradicted_from = self.changed = self.unconfirmed = None
+        if inherited is None:
+            self.contradiction = None
 
     def go_on_from(self, result: Fitted, first: int, changed: bool = False) -> bool:
         """Go on from this fit of the record from sample `first` on; it is to be published.
@@ -275,6 +293,7 @@ class Learning:
         self.refit_at = min(growth * result.fit.length, LONGEST)
         self.moved_at = result.fit.length + BLOCK[1]
         self.contradicted_from = self.changed = self.acquisition.rejected = None
+        self.contradiction = None
         if changed:
             self.consistent = RECOVERED if self.expects_changes else 0
         return True

@@ -11,7 +11,7 @@ share. docs/estimation.md explains the method and measures it.
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf, nan
+from math import hypot, inf, nan
 from time import perf_counter
 
 import numpy as np
@@ -67,6 +67,8 @@ class MovingHorizon:
         self._task: Task | None = None
         self._adapting = True
         self._paused = False  # whether samples are left out, as nothing moves
+        self._coasts = False
+        self._stds = initial.std_c_r, initial.std_c_l  # of the crossings, while nothing coasts
         self._lost_in_a_row = 0
 
     # --- what it tells -------------------------------------------------------------------------
@@ -138,8 +140,14 @@ class MovingHorizon:
 
         Where there is no estimate: of the last fit that gave none, nan before.
         """
-        fitted = self._learning.current or self._learning.acquisition.rejected
+        learning = self._learning
+        fitted = learning.contradiction or learning.current or learning.acquisition.rejected
         return fitted.fit.unexplained(fitted.solution) if fitted is not None else nan
+
+    @property
+    def coasts(self) -> bool:
+        """Whether there is no better estimate because the load runs on within the gap."""
+        return self._coasts
 
     @property
     def wrong_sign(self) -> bool:
@@ -288,6 +296,7 @@ class MovingHorizon:
             self._task = None
             if done.value:
                 self._publish()
+            self._note_coasting()
 
     # --- what comes out --------------------------------------------------------------------------
 
@@ -309,15 +318,30 @@ class MovingHorizon:
             self._take_over(found)
         if belief is Belief.REFUSED:
             learning.reason = Status.INCONSISTENT
-            if not self._following.begun:
-                return
         elif learning.contradicted_from is None:
             learning.reason = Status.TRACKING
+        if belief is Belief.REFUSED and not self._following.begun:
+            return
         self._following.follow(current, self.estimate, learning.record)
+
+    def _note_coasting(self) -> None:
+        """Let motion of a load that coasts count as doubt of both crossings, until it is over.
+
+        A structure that shrinks them by their deviations pushes the load less.
+        """
+        learning, estimate = self._learning, self.estimate
+        self._coasts = learning.reason is Status.INCONSISTENT and learning.coasts(estimate)
+        stds = self._stds
+        if self._coasts:
+            doubt = self.unexplained * (estimate.c_r - estimate.c_l)
+            stds = hypot(stds[0], doubt), hypot(stds[1], doubt)
+        if stds != (estimate.std_c_r, estimate.std_c_l) and estimate.learned:
+            self.estimate = replace(estimate, std_c_r=stds[0], std_c_l=stds[1])
 
     def _take_over(self, found: Crossings) -> None:
         m, c_r, c_l = self._learning.bounds.project(found.m, found.c_r, found.c_l)
         self._learning.held = found.cov
+        self._stds = found.std_c_r, found.std_c_l
         self.estimate = Estimate(
             m, c_r, c_l, self.estimate.f, found.std_m, found.std_c_r, found.std_c_l,
             self.estimate.status,
