@@ -183,13 +183,15 @@ class Learning:
         otherwise: after a contradiction a fit has to foretell some, before it says something else
         or says it less precisely.
         """
-        held = self.held
+        held, around, solution = self.held, self.fit.around, self.fit.solution
         if found is None or self.fit.contested:
             return Belief.REFUSED
         if held is None:
             return Belief.REPLACES
+        if around.inherited and around.prior is not None and solution.alone is None:
+            return Belief.AGREES  # so few samples say nothing alone
         proven = self.consistent >= RECOVERED
-        otherwise = self.fit.solution.moved_otherwise
+        otherwise = solution.moved_otherwise
         if beyond_chance(difference(found, estimate), found.cov + held):
             sure = proven and not (otherwise and self.around.error.count == 0)
             return Belief.REPLACES if sure else Belief.REFUSED
