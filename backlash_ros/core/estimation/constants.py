@@ -14,6 +14,7 @@ REVERSALS = 2  # changes of the engaged side before the first estimate, or anoth
 PRECISE_SLOPE = 0.2  # relative deviation of m below which an estimate is published
 PRECISE_GAP = 0.3  # relative deviation of the gap below which it is
 NO_GAP = 0.01  # of the swing of v: a gap known this well may be 0
+LASTING = 1.0 / BY_CHANCE  # of these deviations: those that an error which lasts may leave
 REPLACING = 0.04  # of these deviations: those of an estimate that replaces one that held
 GATE = 6.0  # standard deviations of an innovation beyond which y is an outlier
 OUTLIERS = 5  # outliers in a row that are none

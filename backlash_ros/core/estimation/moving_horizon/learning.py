@@ -7,8 +7,7 @@ be published (schedule.py names them).
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass, field, replace
-from enum import Enum, auto
+from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
@@ -16,43 +15,31 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import (
     BLOCK,
-    BY_CHANCE,
     FIRST_SEARCH,
     GROWTH,
     LONGEST,
     MEMORIES_SEARCHED,
-    PRECISE_GAP,
     RECOVERED,
-    REPLACING,
     REVERSALS,
     SEARCH_GROWTH,
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.crossings import Crossings, difference
+from backlash_ros.core.estimation.fit.crossings import Crossings
 from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance, contradicts, drifted
+from backlash_ros.core.estimation.fit.prior import Prior, drifted
 from backlash_ros.core.estimation.fit.record import Record
 from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
-from backlash_ros.core.estimation.moving_horizon.acceptance import differs, is_precise, usable
+from backlash_ros.core.estimation.moving_horizon.acceptance import usable
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
 
 Array = NDArray[np.float64]
 Task = Generator[None, None, bool]
 
-LASTING = 1.0 / BY_CHANCE  # of the usual deviations, for an error that lasts
 CAPACITY = 2 * LONGEST  # samples kept: those that are fitted, and those that come meanwhile
-
-
-class Belief(Enum):
-    """Whether a fit is believed: it takes the place of the estimate, adds nothing to it, or not."""
-
-    REPLACES = auto()
-    AGREES = auto()
-    REFUSED = auto()
 
 
 @dataclass
@@ -166,99 +153,10 @@ class Learning:
         return usable(result, self.bounds, share)
 
     @property
-    def share(self) -> float:
-        """Of the usual deviations, up to which the fit is of use.
-
-        What no backlash and no G explains is an error that lasts: all of what chance makes of the
-        deviations has to be small, not one of them.
-        """
-        lasting = self.around.inherited and self.fit.solution.moved_otherwise
-        return LASTING if lasting else 1.0
-
-    def judged(self, found: Crossings | None, estimate: Estimate) -> Belief:
-        """What becomes of a fit beside the estimate that held so far.
-
-        found: what the fit says, None if it is of no use.
-        Few samples can be fitted by a backlash that never was, and so can many where y moves
-        otherwise: after a contradiction a fit has to foretell some, before it says something else
-        or says it less precisely.
-        """
-        held, around, solution = self.held, self.fit.around, self.fit.solution
-        if found is None or self.fit.contested:
-            return Belief.REFUSED
-        if held is None:
-            return Belief.REPLACES
-        if around.inherited and around.prior is not None and solution.alone is None:
-            return Belief.AGREES  # so few samples say nothing alone
-        proven = self.consistent >= RECOVERED
-        otherwise = solution.moved_otherwise
-        if beyond_chance(difference(found, estimate), found.cov + held):
-            sure = proven and not (otherwise and self.around.error.count == 0)
-            return Belief.REPLACES if sure else Belief.REFUSED
-        if otherwise and not self.expects_changes:
-            sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
-        else:
-            sure = proven or not np.any(np.diag(found.cov) > np.diag(held))
-        if sure:
-            return Belief.REPLACES
-        return Belief.AGREES if proven else Belief.REFUSED
-
-    def confirm(self) -> bool:
-        """Ask the samples alone about what was learned before; return whether they deny it.
-
-        They deny what is off by more than an estimate may be uncertain at all. What contradicts
-        them by less is neither denied nor confirmed: in a plant that is no backlash and no linear G
-        they may be as wrong. So may they where something else moves y, which denies nothing.
-        """
-        prior, (fit, solution, _) = self.unconfirmed, self.fit
-        self.supported = None
-        if prior is None or not self.reversed_often(fit):
-            return False
-        alone = solution.alone or fit.solve(alone=True)
-        found = alone.crossings
-        if found is None or not is_precise(found, fit.swing):
-            return False
-        contradicted = contradicts(alone.of_theta, prior)
-        otherwise = solution.moved_otherwise or self.around.walk > 0.0
-        denied = contradicted and differs(found, prior) and not otherwise
-        if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
-            self.unconfirmed = None
-        elif not contradicted and is_precise(found, fit.swing, LASTING):
-            self.supported = found
-        return denied
-
-    @property
     def confirmed(self) -> bool:
         """Whether the samples speak for what is published."""
         known = self.unconfirmed is None or self.supported is not None
         return self.current is not None and known
-
-    def doubted(self, found: Crossings | None) -> Crossings | None:
-        """The same, known no better than from the samples alone as long as they only support it.
-
-        Another backlash that they do not tell from the one that was learned before is within
-        these deviations.
-        """
-        alone = self.supported
-        if found is None or alone is None:
-            return found
-        return replace(
-            found, std_m=alone.std_m, std_c_r=alone.std_c_r, std_c_l=alone.std_c_l,
-            std_gap=alone.std_gap, cov=alone.cov,
-        )
-
-    def coasts(self, estimate: Estimate) -> bool:
-        """Whether the load runs on while v crosses the gap of an estimate that was known before.
-
-        Unlike a lag, which makes the gap seem wider, that makes it seem narrower: y is ahead. And
-        y moves by more in a way of its own than the gap may be uncertain where an error lasts.
-        """
-        fitted = self.contradiction or self.current
-        alone = None if fitted is None else fitted.solution.alone
-        if fitted is None or alone is None or not self.around.inherited:
-            return False
-        narrower = alone.gap < estimate.c_r - estimate.c_l
-        return narrower and fitted.fit.unexplained(fitted.solution) > PRECISE_GAP * LASTING
 
     def drifts_more(self, solution: Solution, samples: int) -> bool:
         """Whether drift over so many samples is more than the noise leaves unknown."""

@@ -25,7 +25,14 @@ from backlash_ros.core.estimation.constants import (
 from backlash_ros.core.estimation.fit.crossings import Crossings
 from backlash_ros.core.estimation.fit.learned_error import response_std
 from backlash_ros.core.estimation.fit.solution import SMALLEST_NOISE, Around
-from backlash_ros.core.estimation.moving_horizon.learning import CAPACITY, Belief, Learning, Task
+from backlash_ros.core.estimation.moving_horizon.belief import (
+    Belief,
+    believable,
+    denied_by_samples,
+    judged,
+    load_coasts,
+)
+from backlash_ros.core.estimation.moving_horizon.learning import CAPACITY, Learning, Task
 from backlash_ros.core.estimation.moving_horizon.schedule import next_task
 from backlash_ros.core.estimation.observer.state_following import Sample, StateFollowing
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
@@ -304,7 +311,7 @@ class MovingHorizon:
         """Make the newest fit the estimate where it is good enough, and go on from its state."""
         learning = self._learning
         current = learning.fit
-        if learning.confirm():
+        if denied_by_samples(learning):
             # The estimate was that of another plant.
             kept = learning.around.inherited
             learning.begin_acquisition(self.estimate if kept else None)
@@ -312,8 +319,8 @@ class MovingHorizon:
             if not kept:
                 learning.held = None
             return
-        found = learning.doubted(learning.usable(current, learning.share))
-        belief = learning.judged(found, self.estimate)
+        found = believable(learning)
+        belief = judged(learning, found, self.estimate)
         if belief is Belief.REPLACES and found is not None:
             self._take_over(found)
         if belief is Belief.REFUSED:
@@ -330,7 +337,7 @@ class MovingHorizon:
         A structure that shrinks them by their deviations pushes the load less.
         """
         learning, estimate = self._learning, self.estimate
-        self._coasts = learning.reason is Status.INCONSISTENT and learning.coasts(estimate)
+        self._coasts = learning.reason is Status.INCONSISTENT and load_coasts(learning, estimate)
         stds = self._stds
         if self._coasts:
             doubt = self.unexplained * (estimate.c_r - estimate.c_l)

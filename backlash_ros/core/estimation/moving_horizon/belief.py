@@ -1,0 +1,110 @@
+"""What is believed of the fit beside what was published and known before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from enum import Enum, auto
+
+import numpy as np
+
+from backlash_ros.core.estimation.constants import LASTING, PRECISE_GAP, RECOVERED, REPLACING
+from backlash_ros.core.estimation.fit.crossings import Crossings, difference
+from backlash_ros.core.estimation.fit.prior import beyond_chance, contradicts
+from backlash_ros.core.estimation.moving_horizon.acceptance import differs, is_precise
+from backlash_ros.core.estimation.moving_horizon.learning import Learning
+from backlash_ros.core.estimation.protocol import Estimate
+
+
+class Belief(Enum):
+    """Whether a fit is believed: it takes the place of the estimate, adds nothing to it, or not."""
+
+    REPLACES = auto()
+    AGREES = auto()
+    REFUSED = auto()
+
+
+def believable(learning: Learning) -> Crossings | None:
+    """What the fit says, with all its doubt; None if it is of no use.
+
+    What no backlash and no G explains is an error that lasts: all of what chance makes of the
+    deviations has to be small, not one of them. And what was learned before is known no better than
+    from the samples alone as long as they only support it: another backlash that they do not tell
+    from it is within these deviations.
+    """
+    fit, alone = learning.fit, learning.supported
+    lasting = learning.around.inherited and fit.solution.moved_otherwise
+    found = learning.usable(fit, LASTING if lasting else 1.0)
+    if found is None or alone is None:
+        return found
+    return replace(
+        found, std_m=alone.std_m, std_c_r=alone.std_c_r, std_c_l=alone.std_c_l,
+        std_gap=alone.std_gap, cov=alone.cov,
+    )
+
+
+def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> Belief:
+    """What becomes of a fit beside the estimate that held so far.
+
+    found: what the fit says, None if it is of no use.
+    Few samples can be fitted by a backlash that never was, and so can many where y moves
+    otherwise: after a contradiction a fit has to foretell some, before it says something else
+    or says it less precisely.
+    """
+    held, around, solution = learning.held, learning.fit.around, learning.fit.solution
+    if found is None or learning.fit.contested:
+        return Belief.REFUSED
+    if held is None:
+        return Belief.REPLACES
+    if around.inherited and around.prior is not None and solution.alone is None:
+        return Belief.AGREES  # so few samples say nothing alone
+    proven = learning.consistent >= RECOVERED
+    otherwise = solution.moved_otherwise
+    if beyond_chance(difference(found, estimate), found.cov + held):
+        sure = proven and not (otherwise and learning.around.error.count == 0)
+        return Belief.REPLACES if sure else Belief.REFUSED
+    if otherwise and not learning.expects_changes:
+        sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
+    else:
+        sure = proven or not np.any(np.diag(found.cov) > np.diag(held))
+    if sure:
+        return Belief.REPLACES
+    return Belief.AGREES if proven else Belief.REFUSED
+
+
+def denied_by_samples(learning: Learning) -> bool:
+    """Ask the samples alone about what was learned before; return whether they deny it.
+
+    They deny what is off by more than an estimate may be uncertain at all. What contradicts
+    them by less is neither denied nor confirmed: in a plant that is no backlash and no linear G
+    they may be as wrong. So may they where something else moves y, which denies nothing.
+    """
+    prior, (fit, solution, _) = learning.unconfirmed, learning.fit
+    learning.supported = None
+    if prior is None or not learning.reversed_often(fit):
+        return False
+    alone = solution.alone or fit.solve(alone=True)
+    found = alone.crossings
+    if found is None or not is_precise(found, fit.swing):
+        return False
+    contradicted = contradicts(alone.of_theta, prior)
+    otherwise = solution.moved_otherwise or learning.around.walk > 0.0
+    denied = contradicted and differs(found, prior) and not otherwise
+    if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
+        learning.unconfirmed = None
+    elif not contradicted and is_precise(found, fit.swing, LASTING):
+        learning.supported = found
+    return denied
+
+
+def load_coasts(learning: Learning, estimate: Estimate) -> bool:
+    """Whether the load runs on while v crosses the gap of an estimate that was known before.
+
+    Unlike a lag, which makes the gap seem wider, that makes it seem narrower: y is ahead. And
+    y moves by more in a way of its own than the gap may be uncertain where an error lasts.
+    """
+    fitted = learning.contradiction or learning.current
+    alone = None if fitted is None else fitted.solution.alone
+    if fitted is None or alone is None or not learning.around.inherited:
+        return False
+    narrower = alone.gap < estimate.c_r - estimate.c_l
+    return narrower and fitted.fit.unexplained(fitted.solution) > PRECISE_GAP * LASTING
