@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
@@ -67,3 +70,52 @@ def test_own_commands_of_the_same_moment_outdate_a_report() -> None:
     assert loop.statistics.interruptions == 1
     assert max(sent) > 2.0 * MOVE
     assert max(abs(np.diff(sent))) <= MOVE * (1.0 + 1e-9)
+
+
+class SilentDriver:
+    """A loop whose driver was given up when v was 8.5."""
+
+    def __init__(self) -> None:
+        self.sent: list[float] = []
+        self._k = 0
+        self._p = Parameters({
+            'estimator.law': 'fixed', 'control.min': -10.0, 'control.max': 10.0,
+            'control.rate_max': 100.0 * MOVE,
+        })
+        self.loop = ControlLoop(
+            self._p, self.sent.append, lambda: self._k * PERIOD_NS, None,
+            SampleCounter(0.01, from_zero=False), 8.0,
+        )
+        self.loop.take_reference(30.0)
+        self.answer(8.0)
+        self._k += 50
+        self.loop.give_up()
+
+    def narrow(self, high: float) -> None:
+        self.loop.take_up(self._p.replaced({'control.max': high}))
+
+    def answer(self, reported: float) -> float:
+        """The v that answers an output with this report."""
+        self._k += 1
+        stamp_ns = self._k * PERIOD_NS
+        self.loop.take_applied(reported, stamp_ns - 1)
+        self.loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, self._k))
+        return self.sent[-1]
+
+
+def test_limits_that_were_narrowed_meanwhile_are_met_at_the_rate() -> None:
+    driver = SilentDriver()
+    before = driver.sent[-1]
+    driver.narrow(3.0)
+    assert driver.answer(before) == pytest.approx(before - MOVE)
+    while driver.sent[-1] > 3.0:
+        before = driver.sent[-1]
+        assert driver.answer(before) == pytest.approx(max(before - MOVE, 3.0))
+
+
+@given(reported=st.floats(-1e12, 1e12), high=st.sampled_from([3.0, 9.0]))
+def test_no_report_leads_v_further_out(reported: float, high: float) -> None:
+    driver = SilentDriver()
+    before = driver.sent[-1]
+    driver.narrow(high)
+    assert -10.0 <= driver.answer(reported) <= max(before - MOVE, high)

@@ -234,9 +234,13 @@ class ControlLoop:
             core.structure = structure
 
     def _go_on_from(self, v: float) -> None:
-        # From a v beyond the limits the commands would begin there.
-        limits = self.core.limits
-        self.v, self.knows_v = min(max(v, limits.low), limits.high), True
+        """Go on from a v that others tell of."""
+        low, high = self.core.limits.low, self.core.limits.high
+        if self.knows_v:
+            # Limits may have been narrowed since: then the way back is no jump either.
+            low, high = min(low, self.v), max(high, self.v)
+        # Whatever they tell, it leads no command further out.
+        self.v, self.knows_v = min(max(v, low), high), True
 
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
