@@ -6,6 +6,7 @@ from dataclasses import replace
 from math import inf, nan
 
 import numpy as np
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -176,6 +177,23 @@ def test_new_estimates_move_v_no_faster_than_the_gap_is_crossed(f: float) -> Non
     c.compensating = False
     before = c.inverse.v
     assert abs(c.step(0.0, y_m + 1e-6).v - before) <= 0.1 * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize('f', [0.0, 0.22])
+@pytest.mark.parametrize('onward', [-1e-3, 1e-3])
+@pytest.mark.parametrize('rests_from', [0, 1, 100])
+def test_estimates_further_off_than_the_gap_move_v_no_faster_either(
+    f: float, onward: float, rests_from: int,
+) -> None:
+    estimator = Notebook(replace(PAPER, m=8.0, f=f))
+    c = controller(estimator, inverse=BacklashInverse(take_up=0.1))
+    for y_m in (*np.arange(0.0, 30.0), *np.arange(30.0, 20.0, -0.1)):
+        c.step(0.0, y_m)
+    estimator.estimate = replace(PAPER, f=f)
+    for k in range(200):
+        # Whether y_m rests as the estimate changes, or later, for a while.
+        before, y_m = c.inverse.v, y_m + (0.0 if rests_from <= k < rests_from + 20 else onward)
+        assert abs(c.step(0.0, y_m).v - before) <= 0.1 + 2e-3
 
 
 @given(move=st.floats(0.1, 3.0), y_m=st.floats(-20.0, 20.0), f=st.sampled_from([0.0, 0.22]),

@@ -32,7 +32,7 @@ class Proportional:
     needs_output = False
 
     def __init__(self) -> None:
-        self._estimate: Estimate | None = None  # that of the sample before
+        self._estimate: Estimate | None = None  # that v was made with
 
     def go_on_from(self, other: Structure, state_known: bool = True) -> None:
         """Take over what the present v was made with."""
@@ -52,16 +52,19 @@ class Proportional:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
         y_m, estimate = inputs.y_m, inputs.estimate
         m, c_r, c_l, f = estimate.m, estimate.c_r, estimate.c_l, estimate.f
+        if f == 0.0 and not inverse.taking_up and inverse.direction(y_m) is Region.GAP:
+            return Command(y_m, inverse.v, f)  # first case of (2.3)
         before, self._estimate = self._estimate, estimate
+        if before is not None and before is not estimate and inverse.take_up < inf:
+            # The inverse is slow only as far as u does not move: it cannot tell what u_d, or the
+            # line that it lies on, owe to a new estimate.
+            now, then = _solution(y_m, estimate, inverse), _solution(y_m, before, inverse)
+            if abs(now - then) > inverse.take_up:
+                inverse.slow_down()
         if f == 0.0:  # nothing to solve
             return Command(y_m, inverse.step(y_m, m, c_r, c_l), f)
         if f > LARGEST_F_OVER_M * m:
             f = LARGEST_F_OVER_M * m
-        if before is not None and before is not estimate and inverse.take_up < inf:
-            # A new estimate moves u_d too, so the inverse cannot tell by itself.
-            now, then = _solution(y_m, estimate, inverse), _solution(y_m, before, inverse)
-            if abs(now - then) > inverse.take_up:
-                inverse.slow_down()
         right = m * (y_m + f * c_r) / (m - f)
         left = m * (y_m + f * c_l) / (m - f)
         v = inverse.v
