@@ -16,7 +16,7 @@ from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.controller import plausible
 from backlash_ros.core.driver_check.findings import (
     WRONG,
@@ -156,15 +156,17 @@ class CheckDriverNode(ProcessNode):
 
     def _v_at_start(self) -> float:
         """The v that acts before the drive, 0 where nobody says it."""
-        told = [self.settings.get_float('control.initial')]
-        told += [message.value for message in self._heard.applied[-1:]]
-        known = [v for v in told if plausible(v)]
-        if not known:
+        initial = self.settings.get_float('control.initial')
+        known = initial if plausible(initial) else None
+        reported = [message.value for message in self._heard.applied[-1:]]
+        if reported and plausible(reported[0]):
+            return build_limits(self.settings).go_on_from(reported[0], known)
+        if known is None:
             print(
                 f'{self.program}: nobody says which v acts now, so the drive goes on from 0: '
                 f'publish {topics.APPLIED_CONTROL}, or set control.initial', file=sys.stderr,
             )
-        return known[-1] if known else 0.0
+        return known or 0.0
 
     def _command(self, v: float) -> None:
         now = time.time_ns()

@@ -6,7 +6,6 @@ from dataclasses import replace
 from math import inf, nan
 
 import numpy as np
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -156,6 +155,16 @@ def test_whatever_is_asked_what_is_sent_is_a_number_that_keeps_the_limits(
     outside, outside_before = (max(low - x, x - low - width, 0.0) for x in (sent, v))
     assert outside <= max(outside_before - move, 0.0) + 1e-12
     assert abs(Limits(move=move).apply(asked, v)) <= LARGEST
+
+
+@pytest.mark.parametrize(('told', 'known', 'begins'), [
+    (4.0, None, 4.0), (9.0, None, 5.0), (-9.0, None, -5.0), (9.0, 3.0, 5.0),
+    (9.0, 9.0, 9.0), (7.0, 9.0, 7.0), (20.0, 9.0, 9.0), (-9.0, 9.0, -5.0), (-9.0, -7.0, -7.0),
+])
+def test_what_others_tell_of_v_leads_it_no_further_out(
+    told: float, known: float | None, begins: float,
+) -> None:
+    assert Limits(-5.0, 5.0, 0.1).go_on_from(told, known) == begins
 
 
 @pytest.mark.parametrize('f', [0.0, 0.22])

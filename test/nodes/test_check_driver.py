@@ -247,15 +247,24 @@ def test_the_way_to_rest_has_a_deadline(tmp_path: Path) -> None:
     assert '--rest=1' in err
 
 
-def first_commands(folder: Path, *options: str) -> tuple[list[float], str]:
-    """What a drive begins with, and what is printed about it."""
+def first_commands(
+    folder: Path, *options: str, reported: float | None = None,
+) -> tuple[list[float], str]:
+    """What a drive begins with, beside a driver that reports this v, and what is printed."""
     with bench(folder, 'none') as beside:
         probe = Probe(beside.domain)
         try:
             controls = probe.collect('control', Float64)
+            reports = probe.publisher('applied_control', Float64)
+
+            def driven() -> bool:
+                if reported is not None:
+                    reports.publish(Float64(data=reported))
+                return len(controls) > 20
+
             process = beside.start('--drive', '--duration', '60', *options)
             try:
-                probe.wait_until(lambda: len(controls) > 20, 'commands')
+                probe.wait_until(driven, 'commands')
                 process.send_signal(signal.SIGINT)
                 probe.wait_until(lambda: process.poll() is not None, 'the end')
                 err = process.communicate()[1]
@@ -271,6 +280,11 @@ def test_the_drive_goes_on_from_control_initial(tmp_path: Path) -> None:
     step = LIMITS.rate * PERIOD_S * (1.0 + 1e-9)
     assert max(abs(b - a) for a, b in pairwise([-4.0, *v])) <= step
     assert 'nobody says' not in err
+
+
+def test_a_report_beyond_the_limits_leads_no_drive_out_of_them(tmp_path: Path) -> None:
+    v, _ = first_commands(tmp_path, reported=4096.0)
+    assert LIMITS.high - 2.0 * LIMITS.rate * PERIOD_S <= v[0] <= LIMITS.high
 
 
 def test_the_drive_says_that_nobody_knows_v(tmp_path: Path) -> None:

@@ -47,6 +47,17 @@ class Limits:
         """The v nearest to 0 within the bounds."""
         return min(max(0.0, self.low), self.high)
 
+    def go_on_from(self, told: float, known: float | None) -> float:
+        """The v from which commands go on where others tell that it acts.
+
+        Whatever they tell leads no command out of the bounds, or further out than known is: the v
+        that acted before, None where nobody knows it. The bounds may have been narrowed since.
+        """
+        low, high = self.low, self.high
+        if known is not None:
+            low, high = min(low, known), max(high, known)
+        return min(max(told, low), high)
+
     def apply(self, v: float, v_before: float) -> float:
         """What may be sent instead of v after v_before: every command passes through here, last.
 

@@ -233,14 +233,9 @@ class ControlLoop:
             structure.go_on_from(core.structure)
             core.structure = structure
 
-    def _go_on_from(self, v: float) -> None:
-        """Go on from a v that others tell of."""
-        low, high = self.core.limits.low, self.core.limits.high
-        if self.knows_v:
-            # Limits may have been narrowed since: then the way back is no jump either.
-            low, high = min(low, self.v), max(high, self.v)
-        # Whatever they tell, it leads no command further out.
-        self.v, self.knows_v = min(max(v, low), high), True
+    def _go_on_from(self, told: float) -> None:
+        known = self.v if self.knows_v else None
+        self.v, self.knows_v = self.core.limits.go_on_from(told, known), True
 
     def _note_missing(self, arrival: Arrival) -> None:
         self._missing += arrival.missing
