@@ -28,6 +28,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from fault_loop.fault_controller import Controller
 from fault_loop.fault_world import SENSOR_FAULTS, Actuator, Driver, Sensor
+from fault_loop.uninterrupted import Uninterrupted
 
 PERIOD_S = 0.01
 SAMPLES = (300, 800)
@@ -157,7 +158,9 @@ class Sequence:
         self._usual = 0.0  # largest move of v so far
         self._moves = 0
         self._v_before = 0.0  # that acted before the newest command
-        self._v_answered = self._y_m = 0.0  # of the newest answer
+        self._newcomer = False  # whether the controller knows v from reports alone
+        self._v_answered = 0.0  # of the newest answer
+        self._uninterrupted: Uninterrupted | None = None  # what would follow on it
         self._last: Estimate | None = None
         self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
         self._loop: object = None
@@ -254,7 +257,8 @@ class Sequence:
             self._foreign = True
         self._told(f'    with {estimate}')
         # Where the driver does not say which v acts, whoever starts the controller does.
-        controller.restart(estimate, None if self.driver.reports else self.actuator.v)
+        self._newcomer = self.driver.reports
+        controller.restart(estimate, None if self._newcomer else self.actuator.v)
         self._forget()
 
     def _cycle(self, tick: int) -> None:
@@ -334,6 +338,9 @@ class Sequence:
     def _sent(self, v: float, limits: Limits) -> None:
         found, before = self.findings, self.actuator.v
         self._v_before = before
+        if self._newcomer:
+            # It cannot tell a v beyond its limits from a wrong report.
+            before, self._newcomer = limits.go_on_from(before, None), False
         found.commands += 1
         where = f'sample {self.driver.tick}: v {before:.6g} -> {v:.6g}, {limits}'
         beyond, beyond_before = (
@@ -360,21 +367,32 @@ class Sequence:
         goes_on = renewed and self.p.get_str('structure') != 'pole_placement'
         # A v that was led to zero meanwhile starts from there.
         goes_on = goes_on and self._v_before == self._v_answered
-        if goes_on and self._moves >= LEARNED_MOVES and self._last is not None:
-            allowed = JUMP * self._usual + _shift(self._last, e, v)
-            if self.p.get_str('structure') == 'proportional':
-                # (3.2) answers at once to what y_m has done meanwhile.
-                allowed += abs(step.y_m - self._y_m) / (e.m * (1.0 - LARGEST_F_OVER_M))
-            if move > allowed + ROUNDING * (1.0 + abs(v)):
-                self.findings.jumps.append(
-                    f'sample {self.driver.tick}: v moved by {move:.3g}, usual {self._usual:.3g}'
-                )
+        if goes_on and self._last is not None:
+            self._judge_first(step, self._last, move)
+        if self.p.get_str('structure') == 'proportional':
+            self._uninterrupted = Uninterrupted(self.controller.loop.core)
         self._moves += 1
         self._usual = max(self._usual, move)
-        self._last, self._v_answered, self._y_m = e, v, step.y_m
+        self._last, self._v_answered = e, v
         if self._frozen is not None and self._moves and renewed:
             self._frozen = None
         self._judge(e)
+
+    def _judge_first(self, step: ControlStep, before: Estimate, move: float) -> None:
+        """Judge the first answer after an interruption over which v was held."""
+        v, rounding = step.v, ROUNDING * (1.0 + abs(step.v))
+        where = f'sample {self.driver.tick}: v moved by {move:.3g}'
+        if self._uninterrupted is not None:
+            loop, p = self.controller.loop, self.controller.p
+            asked = self._uninterrupted.command(
+                step, loop.core, p.get_float('inverse.direction_band')
+            )
+            if abs(v - asked) > rounding:
+                self.findings.jumps.append(f'{where} to {v:.6g}, uninterrupted to {asked:.6g}')
+        elif self._moves >= LEARNED_MOVES and move > (
+            JUMP * self._usual + _shift(before, step.estimate, v) + rounding
+        ):
+            self.findings.jumps.append(f'{where}, usual {self._usual:.3g}')
 
     def _judge(self, e: Estimate) -> None:
         if e.status is not Status.TRACKING or was_given(e):
