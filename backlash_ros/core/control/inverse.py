@@ -19,8 +19,9 @@ class BacklashInverse:
     direction_band: u_d has turned only when it came back from its extreme by more than this
         [unit of u_d]; until then v is held. 0 is the printed inverse.
     take_up: largest move of v per sample while the gap is crossed (2.3: "a line segment with a
-        finite slope"), and over to a line that new estimates have moved by more than that [unit
-        of v]; inf jumps. From there on v goes as far as u_d does.
+        finite slope"), and over to a line that new estimates have moved by more than that, until
+        u moves or, after slow_down, until it is there [unit of v]; inf jumps. From there on v goes
+        as far as u_d does.
     """
 
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:

@@ -148,8 +148,8 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('inverse.direction_band', 0.0,
               'u_d has turned only after coming back by more than this', 'u', low=0.0, live=True),
     Parameter('inverse.take_up_rate', inf,
-              'largest speed of v while it crosses the gap, and while it goes over to a line that '
-              'new estimates have moved', 'v/s',
+              'largest speed of v while it crosses the gap; in proportional also while it goes '
+              'over to a line that new estimates have moved', 'v/s',
               low=0.0, above=True, live=True, infinite=True),
     Parameter('autostart', True, 'configure and activate at the start, without being asked'),
     Parameter('on_stop', 'hold',
