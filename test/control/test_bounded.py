@@ -30,8 +30,9 @@ from backlash_ros.core.control.structure import (
     ControlInput,
     Structure,
 )
-from backlash_ros.core.control.tracking.design import Weights, design
-from backlash_ros.core.control.tracking.tracking import Tracking
+from backlash_ros.core.control.tracking.design import Weights, design, feedback_around
+from backlash_ros.core.control.tracking.rest import TOLERANCE
+from backlash_ros.core.control.tracking.tracking import FADING, Tracking
 from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.four_blocks import place_poles
@@ -147,6 +148,84 @@ def test_a_state_far_from_the_trajectory_moves_a_loop_at_rest_no_further(status:
         source.x_hat = (1e6 * rng.standard_normal(2)).tolist() if k > 300 else [0.0, 0.0]
         command = structure.control(ControlInput(0.0, 0.0, known, source), inverse)
         assert abs(command.u_d) <= (1.0 + LARGEST_FEEDBACK) * asked, k
+
+
+@settings(max_examples=200)
+@given(noise_std=st.sampled_from([0.0, 1e-3]), sequence=st.lists(st.one_of(
+    st.tuples(st.just('state'), st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)),
+    st.tuples(st.just('estimate'), st.floats(0.1, 100.0), st.floats(0.01, 100.0),
+              st.floats(-100.0, -0.01), st.sampled_from(Status),
+              st.sampled_from([float('nan'), 0.0, 0.1])),
+    st.tuples(st.just('renewal'), st.floats(-1e3, 1e3), st.just(False)),
+    st.tuples(st.just('redesign'), st.sampled_from([1e-3, 1e-2, 1e-1]), st.just(True)),
+), max_size=15))
+def test_a_loop_that_nothing_is_asked_of_moves_u_d_no_further_than_its_doubts_allow(
+    noise_std: float, sequence: list[tuple[Any, ...]],
+) -> None:
+    def following(weights: Weights) -> Tracking:
+        return Tracking(design(MODEL, weights), weights, 1.0, noise_std)
+
+    weights, source, estimate = WEIGHTS, Told(), Estimate(1.0, 1.0, -1.0, 0.0)
+    source.x_cov = 1e-12 * np.eye(2)
+    structure, inverse = following(weights), BacklashInverse()
+    handed_over = called_for = 0.0
+    for what, *values in sequence:
+        if what == 'state':
+            source.x_hat = values
+        elif what == 'estimate':
+            m, c_r, c_l, status, std = values
+            estimate = Estimate(m, c_r, c_l, 0.0, std, std, std, status)
+        else:
+            weights = Weights(values[0], 0.0, 5) if what == 'redesign' else weights
+            before, structure = structure, following(weights)
+            structure.go_on_from(before, state_known=what == 'redesign')
+        if what == 'renewal':
+            inverse.start_from(values[0])
+            beyond = abs(values[0]) + max(estimate.c_r, -estimate.c_l)
+            handed_over = estimate.m * beyond
+        gain = feedback_around(MODEL, weights, 1.0).gain
+        called_for = TOLERANCE * noise_std * float(np.linalg.norm(gain))
+        for _ in range(12):
+            u_d = structure.control(ControlInput(0.0, 0.0, estimate, source), inverse).u_d
+            allowed = LARGEST_IN_ACQUISITION * estimate.m * (estimate.c_r - estimate.c_l)
+            known = estimate.status not in (Status.ACQUIRING, Status.INCONSISTENT)
+            if known and estimate.learned:
+                allowed = LARGEST_FEEDBACK * max(allowed / LARGEST_IN_ACQUISITION, called_for)
+            assert abs(u_d) <= (allowed + handed_over) * (1.0 + 1e-9)
+            handed_over *= FADING
+
+
+def driven(structure: Structure, inverse: BacklashInverse, slopes: list[float]) -> list[float]:
+    """v of a loop with a moving reference, with these m of a law that has learned nothing yet."""
+    source = Told()
+    v = []
+    for k, m in enumerate(slopes):
+        estimate = Estimate(m, 1.0, -1.0, 0.0)
+        inputs = ControlInput(sin(0.1 * k), 0.0, estimate, source)
+        v.append(structure.control(inputs, inverse).v)
+    return v
+
+
+def test_v_goes_on_from_where_it_is_though_another_slope_has_led_it_there() -> None:
+    inverse, before, structure = (
+        BacklashInverse(), structure_named('tracking'), structure_named('tracking'),
+    )
+    driven(before, inverse, [100.0] * 30)
+    structure.go_on_from(before, state_known=False)
+    inverse.start_from(50.0)  # somebody else has
+    v = driven(structure, inverse, [0.2] * 10)
+    assert v[0] == 50.0
+    assert max(np.diff([abs(x) for x in v])) <= 0.0
+
+
+def test_another_design_inverts_the_slope_that_was_in_use() -> None:
+    inverse, before, structure = (
+        BacklashInverse(), structure_named('tracking'), structure_named('tracking'),
+    )
+    v = driven(before, inverse, [1.0, *[100.0] * 29])
+    structure.go_on_from(before)
+    onward = driven(structure, inverse, [100.0])
+    assert abs(onward[0] - v[-1]) <= 2.0 * abs(v[-1] - v[-2])
 
 
 numbers = st.floats(-1e6, 1e6)

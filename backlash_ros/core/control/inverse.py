@@ -114,6 +114,18 @@ class BacklashInverse:
         """Let v go on to where u_d wants it like it crosses the gap, until it is there."""
         self.taking_up = self._slowed = True
 
+    def resume(self, m: float, c_r: float, c_l: float) -> float:
+        """Return the u_d with which v stays where it is, for these parameters from now on.
+
+        Other parameters have moved the line that is engaged: on the new one, v stands for another
+        u than on the one that has led it there.
+        """
+        if self.side is not GAP and self._play != (m, c_r, c_l):
+            self.extreme = m * (self.v - (c_r if self.side is RIGHT else c_l))
+            self.taking_up = self._slowed = False
+            self._play = m, c_r, c_l
+        return self.extreme
+
     def aim(self, u_d: float, side: Region) -> None:
         """Let the next step go to u_d on the line of this side, whatever it came from."""
         self.side, self.extreme, self.taking_up = side, u_d, True

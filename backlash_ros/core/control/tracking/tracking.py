@@ -141,6 +141,7 @@ class Tracking:
             self._in_use_for, self._engaged_for = other._in_use_for, other._engaged_for
             self._asked, self._known = other._asked, other._known
             self._resumes, self._blind_for = other._resumes, other._blind_for
+            self._slope = other._slope
         else:
             # However well the backlash is known, the first x_hat are full of noise.
             self._resumes, self._blind_for, self._sharp_counts = True, self.model.order, 1
@@ -179,15 +180,20 @@ class Tracking:
         if bounded:
             feedback = min(max(feedback, -most), most) if feedback == feedback else 0.0
         u_d = ideal - feedback
-        rest = self._rest
+        rest, slope = self._rest, self._slope_of(estimate)
+        handed_over = self._handover
         if self._resumes:
-            self._resumes, self._handover = False, FADING * (inverse.extreme - u_d)
-            u_d = inverse.extreme
+            self._resumes = False
+            crossings = shrunk_crossings(estimate, self._shrinkage, self._known)
+            going_on = inverse.resume(slope, *crossings)
+            handed_over, u_d = going_on - u_d, going_on
             rest.stay(u_d)
-        elif self._handover:
-            faded = u_d + self._handover
-            self._handover = FADING * self._handover if faded != u_d else 0.0
+        elif handed_over:
+            faded = u_d + handed_over
+            if faded == u_d:
+                handed_over = 0.0
             u_d = faded
+        self._handover = FADING * handed_over
         before = rest.mode
         mode = rest.decide(
             inputs.y, window, x, onward, deviation,
@@ -204,10 +210,14 @@ class Tracking:
                 rest.stay(ideal)
             u_d, shrinkage = rest.u_d, rest.shrinkage
             inverse.widen_band(0.0)
+        # Whatever has made u_d: nothing leads it further from what the reference asks for.
+        reach = most if self._trusted_for > 0 else LARGEST_IN_ACQUISITION * self._scale
+        reach += abs(handed_over)
+        u_d = min(max(u_d, ideal - reach), ideal + reach)
         self._ideal, self._x, self._u_d = ideal, onward, u_d
         c_r, c_l = shrunk_crossings(estimate, shrinkage, self._known)
         side = inverse.side
-        v = inverse.step(u_d, self._slope_of(estimate), c_r, c_l)
+        v = inverse.step(u_d, slope, c_r, c_l)
         crosses = inverse.taking_up or inverse.side is not side
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         if gains.integral:
