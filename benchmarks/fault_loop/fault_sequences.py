@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from itertools import product
-from math import inf, isfinite
+from math import isfinite
 
 import numpy as np
 from accuracy.random_cases import NEAR_ONE, random_plant
@@ -20,7 +19,6 @@ from backlash_ros.core.assembly import (
 )
 from backlash_ros.core.control.controller import ControlStep, Limits
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
-from backlash_ros.core.control.structure import LARGEST_FEEDBACK
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.parameters import Parameters
@@ -28,6 +26,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from fault_loop.fault_controller import Controller
 from fault_loop.fault_world import SENSOR_FAULTS, Actuator, Driver, Sensor
+from fault_loop.promised_bound import PromisedBound
 from fault_loop.uninterrupted import Uninterrupted
 
 PERIOD_S = 0.01
@@ -43,7 +42,6 @@ WITHOUT = 0.2  # of m and of the gap: an error of laws without deviations that i
 JUMP = 2.5  # usual moves of v in the first one after an interruption
 LEARNED_MOVES = 50  # commands from which it is known which moves are usual
 NOTHING = 'nothing yet'
-TWICE = 2.0  # an interruption may ask for what the reference alone does not
 
 
 class Without(Enum):
@@ -159,15 +157,12 @@ class Sequence:
         self._moves = 0
         self._v_before = 0.0  # that acted before the newest command
         self._newcomer = False  # whether the controller knows v from reports alone
-        self._v_answered = 0.0  # of the newest answer
+        self._v_answered = self._y_m = 0.0  # of the newest answer
         self._uninterrupted: Uninterrupted | None = None  # what would follow on it
         self._last: Estimate | None = None
-        self._segments: list[tuple[float, list[float]]] = []  # y and y_m of each new loop
         self._loop: object = None
         self._lately = NOTHING  # what has happened last
-        self._weights = {p.get_float('tracking.input_weight')}  # with which u_d was asked for
-        self._u_d = 0.0
-        self._widest = 0.0
+        self._bound = PromisedBound(p)
         inherited = None
         if rng.random() < 0.2:
             inherited = self._saved_elsewhere()
@@ -196,7 +191,7 @@ class Sequence:
                 y_m = self._frozen
             self.controller.run(y_m)
         self.findings.samples = samples
-        self._conclude()
+        self.findings.unbounded.extend(self._bound.exceeded())
         return self.findings
 
     def _event(self, tick: int) -> None:
@@ -291,7 +286,7 @@ class Sequence:
         change = changes[int(rng.integers(len(changes)))]
         self._told(f'    {change}')
         self.controller.take_up(p.replaced(change))
-        self._weights.add(self.controller.p.get_float('tracking.input_weight'))
+        self._bound.take_up(self.controller.p)
 
     def _call_service(self, tick: int) -> None:
         rng, loop = self.rng, self.controller.loop
@@ -358,10 +353,8 @@ class Sequence:
         e, v = step.estimate, step.v
         if self._loop is not self.controller.loop:
             self._loop = self.controller.loop
-            self._segments.append((step.y, []))
-        self._segments[-1][1].append(step.y_m)
-        self._u_d = max(self._u_d, abs(step.u_d))
-        self._widest = max(self._widest, e.m * (e.c_r - e.c_l))
+            self._bound.begin(step.y)
+        self._bound.note(step, renewed, self._v_before)
         move = abs(v - self._v_before)
         # Through the four blocks u_d answers at once to what y has done meanwhile.
         goes_on = renewed and self.p.get_str('structure') != 'pole_placement'
@@ -373,7 +366,7 @@ class Sequence:
             self._uninterrupted = Uninterrupted(self.controller.loop.core)
         self._moves += 1
         self._usual = max(self._usual, move)
-        self._last, self._v_answered = e, v
+        self._last, self._v_answered, self._y_m = e, v, step.y_m
         if self._frozen is not None and self._moves and renewed:
             self._frozen = None
         self._judge(e)
@@ -422,49 +415,10 @@ class Sequence:
             f'c_l {e.c_l:.5g} ({c_l:.5g}) ± {e.std_c_l:.2g}; after: {self._lately}'
         )
 
-    def _conclude(self) -> None:
-        """Say whether u_d has gone further than a loop ever may."""
-        p = self.p
-        if p.get_str('structure') == 'proportional':
-            f = max(
-                abs(p.get_float('proportional.f')), *map(abs, p.get_pair('proportional.bounds'))
-            )
-            allowed = (p.get_float('amplitude') + f * 100.0) / (1.0 - LARGEST_F_OVER_M)
-        else:
-            # The gapless loop is only run where it may matter.
-            allowed = TWICE * (1.0 + LARGEST_FEEDBACK) * self._widest
-            if self._u_d > allowed:
-                asked = max(self._asked(), self._widest)
-                allowed = TWICE * (1.0 + LARGEST_FEEDBACK) * asked
-        if not self._u_d <= allowed:
-            self.findings.unbounded.append(f'u_d reached {self._u_d:.3g}, allowed {allowed:.3g}')
-
-    def _asked(self) -> float:
-        """Largest |u_d| of a loop that knows a plant without a gap, for the same references."""
-        known = self.p.replaced({
-            'estimator.law': 'fixed', 'estimator.initial.m': self.p.get_float('backlash.m'),
-            'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
-            'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'output_noise_std': 0.0,
-            'control.min': -inf, 'control.max': inf, 'control.rate_max': inf,
-            'on_stop': 'hold', 'on_timeout': 'hold', 'inverse.take_up_rate': inf,
-            'truth.scale_frequency': 1.0,
-        })
-        largest = 0.0
-        # tracking begins at the first y, the four blocks at 0.
-        starts = ((begin, references) for y, references in self._segments for begin in (y, 0.0))
-        for (begin, references), weight in product(starts, sorted(self._weights)):
-            p = known.replaced({'tracking.input_weight': weight})
-            core, plant = build_controller(p), build_plant(p)
-            for y_m in references:
-                step = core.step(plant.measure(), y_m - begin)
-                plant.step(step.v)
-                largest = max(largest, abs(step.u_d))
-        return largest
-
     def _freeze(self) -> None:
         """Hold y_m until the loop goes on: then v has no reason to move."""
-        if self._segments:
-            self._frozen = self._segments[-1][1][-1]
+        if self._loop is not None:
+            self._frozen = self._y_m
 
     def _forget(self) -> None:
         """What was usual is not any more: another estimate is in use, or v was moved."""
