@@ -11,7 +11,9 @@ from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
 # Whoever imports one of these runs processes against the clock.
-HELPERS = '|'.join(['bringup_processes', 'hosts', 'live_pages', 'paced_driver', 'ros_processes'])
+HELPERS = '|'.join([
+    'bringup_processes', r'drivers\.paced_driver', 'hosts', 'live_pages', 'ros_processes',
+])
 IMPORT = re.compile(rf'^from ({HELPERS})[. ]', re.MULTILINE)
 # Their tests look at the same runs, so one worker makes these for all of them.
 SHARE_RUNS = {

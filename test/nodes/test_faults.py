@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from paced_driver import controller_and_driver
+from drivers.paced_driver import controller_and_driver
 from ros_processes import ros_world
 from std_msgs.msg import Float64
 

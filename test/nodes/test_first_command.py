@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from paced_driver import NOISE, PacedDriver
+from drivers.paced_driver import NOISE, PacedDriver
 from ros_processes import NodeProcess, RosWorld, ros_world
 from test_lifecycle import Asked, Transition
 

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from drivers.paced_driver import PacedDriver, controller_and_driver
 from fuzzing import node_with
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from paced_driver import PacedDriver, controller_and_driver
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.parameter import Parameter
 from ros_processes import RosWorld, ros_world

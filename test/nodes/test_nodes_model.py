@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from paced_driver import NOISE, controller_and_driver
+from drivers.paced_driver import NOISE, controller_and_driver
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from ros_processes import Probe, ros_world
 from std_msgs.msg import Float64MultiArray

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 from builtin_interfaces.msg import Time
+from drivers.paced_driver import NOISE, TRUTH, PacedDriver, controller_and_driver
 from lifecycle_msgs.msg import Transition
-from paced_driver import NOISE, TRUTH, PacedDriver, controller_and_driver
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_processes import NodeProcess, ros_world, wait_until

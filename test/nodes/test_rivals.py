@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from drivers.paced_driver import NOISE, PacedDriver
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from paced_driver import NOISE, PacedDriver
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from ros_processes import NodeProcess, RosWorld, ros_world

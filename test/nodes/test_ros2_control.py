@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from builtin_interfaces.msg import Time
-from paced_driver import NOISE, PacedDriver
+from drivers.paced_driver import NOISE, PacedDriver
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_processes import RosWorld, ros_world
 from sensor_msgs.msg import JointState

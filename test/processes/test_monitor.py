@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from math import isnan
 from pathlib import Path
 
-from paced_driver import PacedDriver, controller_and_driver
+from drivers.paced_driver import PacedDriver, controller_and_driver
 from ros_processes import DEADLINE_S, RosWorld, ros_world
 
 from backlash_ros.nodes.monitor.view import BLOCKS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-from paced_driver import controller_and_driver
+from drivers.paced_driver import controller_and_driver
 from ros_processes import ros_world
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from paced_driver import controller_and_driver
+from drivers.paced_driver import controller_and_driver
 from rclpy.node import Node
 from ros_processes import ros_world
 from std_msgs.msg import Float64

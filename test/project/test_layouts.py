@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
-from paced_driver import controller_and_driver
+from drivers.paced_driver import controller_and_driver
 from ros_processes import ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 

@@ -1,6 +1,6 @@
 """The loop at 1 kHz: nothing lost, answers beside a bare echo node, memory of the controller.
 
-    python benchmarks/soak.py [--seconds 60] [--minutes 10]
+    python benchmarks/real_time/soak.py [--seconds 60] [--minutes 10]
 
 G(z) of the paper's example, resampled to a period of 1 ms, on real nodes in real time. Beside them
 a bare clock, which does nothing but sleep until the next period, tells for how many periods the
@@ -19,15 +19,16 @@ from pathlib import Path
 # Before rclpy reads it, and before numpy is imported.
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('OMP_NUM_THREADS', '1')
+sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
 import numpy as np
-from real_time.loop_latency import LATENCY_HEADER, measure_latency
-from real_time.node_processes import node_command, processes, wait_for_event
 from reporting import CHECK_HEADER, ROOT, Check, text_table
 from scipy import linalg, signal
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.bringup.processes import Child, ProcessSupervisor
+from real_time.loop_latency import LATENCY_HEADER, measure_latency
+from real_time.node_processes import node_command, processes, wait_for_event
 
 PERIOD_S = 1e-3
 LATENCY_LIMIT = 1.5  # of p99

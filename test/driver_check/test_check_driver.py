@@ -14,7 +14,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from made_up_driver import LIMITS, PERIOD_S, parameters
+from drivers.made_up_driver import LIMITS, PERIOD_S, parameters
 from ros_processes import ForkedNode, Probe, wait_until
 from std_msgs.msg import Float64
 
@@ -91,7 +91,7 @@ def bench(folder: Path, fault: str = '') -> Iterator[Bench]:
         beside = Bench(folder, domain)
         if fault:
             beside.driver = subprocess.Popen(
-                [sys.executable, str(HERE / 'faulty_driver.py'), fault], text=True,
+                [sys.executable, str(HERE / 'drivers' / 'faulty_driver.py'), fault], text=True,
                 env=beside.environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
             )
         try:

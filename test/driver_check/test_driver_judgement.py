@@ -8,9 +8,7 @@ from math import nan
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
-from made_up_driver import (
+from drivers.made_up_driver import (
     GOOD_GRAPH,
     LIMITS,
     PERIOD_S,
@@ -20,6 +18,8 @@ from made_up_driver import (
     parameters,
     subjects,
 )
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from backlash_ros.core.driver_check.findings import (
     FITS,

@@ -15,7 +15,7 @@ from tqdm import tqdm
 Item = TypeVar('Item')
 Result = TypeVar('Result')
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @dataclass(frozen=True)
