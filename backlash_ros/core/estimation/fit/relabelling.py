@@ -225,19 +225,23 @@ def most_likely(results: Sequence[Fitted]) -> Fitted:
 def with_better_model(
     v: Array, y: Array, result: Fitted, pace: Pace,
 ) -> Generator[None, None, Fitted]:
-    """Let G move to the one of low order that fits best, until the evidence grows no more."""
+    """Let G move to the one of low order that fits best, until the evidence grows no more.
+
+    Every move begins with the G of `result`, whose prior it is: from move to move the samples leave
+    some directions open, and G would go astray there.
+    """
     weights = np.where(np.isfinite(y), weights_of(y), 0.0)
+    transfer, error = result.around.model.transfer_function, result.around.error
     for _ in range(MODELS):
         solution, around = result.solution, result.around
         posterior = solution.posterior
         if not solution.m > 0.0 or not wants_another_model(result.fit, solution):
             break
-        transfer = around.model.transfer_function
         u = result.fit.input(solution, v)
-        newest = slice(-max(pace.pieces(around.error.taps + 2), FEWEST_ROWS), None)
+        newest = slice(-max(pace.pieces(error.taps + 2), FEWEST_ROWS), None)
         problem = OutputError(transfer, u[newest], y[newest], weights[newest], posterior.noise_std)
         yield
-        better = yield from low_order(transfer, around.error, problem, posterior.scale)
+        better = yield from low_order(transfer, error, problem, posterior.scale)
         if better is None or not _allowed(better):
             break
         model = StateModel(better)
@@ -246,10 +250,10 @@ def with_better_model(
         other = yield from fitted(v, y, moved, result.beginning(v), solution.m, pace)
         gained = other.evidence - result.evidence
         # What moving K coefficients may cost or bring by chance.
-        if gained < -around.error.count:
+        if gained < -error.count:
             break
         result = other
-        if gained < around.error.count:
+        if gained < error.count:
             break
     return result
 

@@ -75,21 +75,16 @@ def refit(learning: Learning) -> Task:
     around, start, first = yield from _shortened(learning, current)
     v, y = learning.record.since(first)
     start = start.with_gap(current.solution.gap, v)
-    results: list[Fitted] = []
-    # The G that was told is as good a beginning as one that was moved; the scale that is found for
-    # its error holds for both, whether or not this fit has moved it.
-    for beginning in reversed(learning.beginnings(around)):
-        if results:
-            told = results[0]
-            scale = max(told.around.scale, told.solution.posterior.scale)
-            beginning = beginning._replace(scale=scale)
-        results.insert(0, (yield from fitted_with_model(
-            v, y, beginning, start, current.solution.m, learning.pace
-        )))
-    # Another G that is likelier by no more than chance would only make the structure follow it.
-    result, afresh = results[0], results[-1]
-    if afresh.evidence > result.evidence + around.error.count:
-        result = afresh
+    m = current.solution.m
+    *present, told = learning.beginnings(around)
+    result = afresh = yield from fitted_with_model(v, y, told, start, m, learning.pace)
+    for beginning in present:
+        # The scale of the error of the G that was told holds, whether or not this fit has moved it.
+        scale = max(afresh.around.scale, afresh.solution.posterior.scale)
+        kept = yield from fitted(v, y, beginning._replace(scale=scale), start, m, learning.pace)
+        # A G that is likelier by no more than chance would only make the structure follow it.
+        if afresh.evidence <= kept.evidence + around.error.count:
+            result = kept
     result = yield from with_walk(v, y, result, learning.pace)
     if len(v) > SEARCHED:
         return learning.go_on_from(result, first)
