@@ -14,6 +14,9 @@ from backlash_ros.core.estimation.moving_horizon.acceptance import differs, is_p
 from backlash_ros.core.estimation.moving_horizon.learning import Learning
 from backlash_ros.core.estimation.protocol import Estimate
 
+# Motion that no backlash and no G explains, over m times the gap: no more than the gap may be
+# uncertain by an error that lasts.
+MOST_UNEXPLAINED = PRECISE_GAP * LASTING
 
 class Belief(Enum):
     """Whether a fit is believed: it takes the place of the estimate, adds nothing to it, or not."""
@@ -91,7 +94,8 @@ def denied_by_samples(learning: Learning) -> bool:
     denied = contradicted and differs(found, prior) and not otherwise
     if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
         learning.unconfirmed = None
-    elif not contradicted and is_precise(found, fit.swing, LASTING):
+    elif not contradicted and is_precise(found, fit.swing, LASTING) \
+            and fit.unexplained(solution) <= MOST_UNEXPLAINED:
         learning.supported = found
     return denied
 
@@ -107,4 +111,4 @@ def load_coasts(learning: Learning, estimate: Estimate) -> bool:
     if fitted is None or alone is None or not learning.around.inherited:
         return False
     narrower = alone.gap < estimate.c_r - estimate.c_l
-    return narrower and fitted.fit.unexplained(fitted.solution) > PRECISE_GAP * LASTING
+    return narrower and fitted.fit.unexplained(fitted.solution) > MOST_UNEXPLAINED
