@@ -75,3 +75,13 @@ def test_more_than_it_holds_is_refused() -> None:
         record.append(float(k), 0.0)
     with pytest.raises(OverflowError, match='let old ones go'):
         record.append(4.0, 0.0)
+
+
+def test_a_reading_in_doubt_that_a_fit_has_gone_on_without_stays_lost() -> None:
+    record = Record(10)
+    for k in range(4):
+        record.append(0.0, nan, nan)
+        record.doubt(k, 10.0 + k)
+    record.decide_doubts(2)
+    record.restore([0, 1, 2, 3])
+    assert np.array_equal(record.since(0)[1], [nan, nan, 12.0, 13.0], equal_nan=True)

@@ -79,11 +79,15 @@ class Record:
             if number in self._doubted:
                 self._y[self._begin + number - self.first] = self._doubted.pop(number)
 
+    def decide_doubts(self, number: int) -> None:
+        """Let the y in doubt before this number stay lost: a fit has gone on without them."""
+        self._doubted = {k: y for k, y in self._doubted.items() if k >= number}
+
     def forget_before(self, number: int) -> None:
         """Let go of all samples older than this one."""
         self._begin += number - self.first
         self.first = number
-        self._doubted = {k: y for k, y in self._doubted.items() if k >= number}
+        self.decide_doubts(number)
 
     def _compact(self) -> None:
         kept = len(self)

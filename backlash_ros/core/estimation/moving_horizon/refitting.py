@@ -54,6 +54,7 @@ def take_block(learning: Learning) -> Task:
     explained = np.isfinite(doubted) & ~outliers
     y[explained] = doubted[explained]
     record.restore((number + np.flatnonzero(explained)).tolist())
+    record.decide_doubts(number + len(y))
     outliers &= np.isfinite(y)
     valid = np.isfinite(y)
     if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
