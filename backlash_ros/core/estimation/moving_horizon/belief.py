@@ -18,6 +18,7 @@ from backlash_ros.core.estimation.protocol import Estimate
 # uncertain by an error that lasts.
 MOST_UNEXPLAINED = PRECISE_GAP * LASTING
 
+
 class Belief(Enum):
     """Whether a fit is believed: it takes the place of the estimate, adds nothing to it, or not."""
 
@@ -77,6 +78,7 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
 def denied_by_samples(learning: Learning) -> bool:
     """Ask the samples alone about what was learned before; return whether they deny it.
 
+    Whether they confirm or support it is noted in `learning`.
     They deny what is off by more than an estimate may be uncertain at all. What contradicts
     them by less is neither denied nor confirmed: in a plant that is no backlash and no linear G
     they may be as wrong. So may they where something else moves y, which denies nothing.
