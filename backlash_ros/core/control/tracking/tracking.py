@@ -180,20 +180,9 @@ class Tracking:
         if bounded:
             feedback = min(max(feedback, -most), most) if feedback == feedback else 0.0
         u_d = ideal - feedback
-        rest, slope = self._rest, self._slope_of(estimate)
-        handed_over = self._handover
-        if self._resumes:
-            self._resumes = False
-            crossings = shrunk_crossings(estimate, self._shrinkage, self._known)
-            going_on = inverse.resume(slope, *crossings)
-            handed_over, u_d = going_on - u_d, going_on
-            rest.stay(u_d)
-        elif handed_over:
-            faded = u_d + handed_over
-            if faded == u_d:
-                handed_over = 0.0
-            u_d = faded
-        self._handover = FADING * handed_over
+        rest, slope, handed_over = self._rest, self._slope_of(estimate), 0.0
+        if self._resumes or self._handover:
+            u_d, handed_over = self._with_handover(u_d, slope, estimate, inverse)
         before = rest.mode
         mode = rest.decide(
             inputs.y, window, x, onward, deviation,
@@ -223,6 +212,22 @@ class Tracking:
         if gains.integral:
             self._integrate(window.item(0), inputs.y, x[0], trusted, bounded or inverse.limited)
         return Command(u_d, v, 0.0)
+
+    def _with_handover(
+        self, u_d: float, slope: float, estimate: Estimate, inverse: BacklashInverse,
+    ) -> tuple[float, float]:
+        """u_d with what was handed over to this loop, which fades, and how much that is."""
+        if self._resumes:
+            self._resumes = False
+            crossings = shrunk_crossings(estimate, self._shrinkage, self._known)
+            together = inverse.resume(slope, *crossings)
+            handed_over = together - u_d
+            self._rest.stay(together)
+        else:
+            together = u_d + self._handover
+            handed_over = self._handover if together != u_d else 0.0
+        self._handover = FADING * handed_over
+        return together, handed_over
 
     def design(self, model: StateModel) -> Iterator[Adoption | None]:
         """Redesign for a better model, see `better_design_in_pieces`."""

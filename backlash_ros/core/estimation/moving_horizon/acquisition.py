@@ -17,6 +17,7 @@ from backlash_ros.core.estimation.constants import (
 from backlash_ros.core.estimation.fit.learned_error import plausible
 from backlash_ros.core.estimation.fit.prior import contradicts, prior_of
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, motionless, searched
+from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
@@ -68,22 +69,31 @@ def confirmed(
     free: a fit without it, if there is one.
     """
     current, pace = learning.current, learning.pace
-    prior = prior_of(inherited, learning.held if learning.around.inherited else None)
     # G is no worse known than it was: it does not explain whatever has happened.
     most = TOLD if current is None else current.solution.posterior.scale
     alone = learning.free._replace(most=most)
-    gap = inherited.c_r - inherited.c_l
-    start = Start(gap, float(v[0]) + 0.5 * gap)
-    kept = yield from fitted(v, y, alone._replace(prior=prior), start, inherited.m, pace)
+    kept = yield from fitted_around(learning, v, y, inherited, alone)
+    gap, prior = inherited.c_r - inherited.c_l, kept.around.prior
     still = yield from motionless(v, y, alone, inherited.m, float(np.ptp(v)) + gap, pace)
     least = still.solution.rms
     if free is not None:
         usable = learning.usable(free, REPLACING) is not None
-        if usable and contradicts(free.solution.of_theta, prior):
+        if usable and prior is not None and contradicts(free.solution.of_theta, prior):
             return None
         least = min(least, free.solution.rms)
     good = kept.solution.rms <= AS_GOOD * least and plausible(kept.fit, kept.solution)
     return kept if good and kept.keeps_prior else None
+
+
+def fitted_around(
+    learning: Learning, v: Array, y: Array, known: Estimate, around: Around,
+) -> Generator[None, None, Fitted]:
+    """A fit with what was known before as the prior of `around`, and of where it begins."""
+    prior = prior_of(known, learning.held if learning.around.inherited else None)
+    gap = known.c_r - known.c_l
+    start = Start(gap, float(v[0]) + 0.5 * gap)
+    around = around._replace(prior=prior)
+    return (yield from fitted(v, y, around, start, known.m, learning.pace))
 
 
 def _explain(learning: Learning, result: Fitted | None) -> None:

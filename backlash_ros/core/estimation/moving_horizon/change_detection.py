@@ -17,7 +17,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCH_GROWTH,
     SEARCHED,
 )
-from backlash_ros.core.estimation.fit.prior import Prior, contradicts, prior_of
+from backlash_ros.core.estimation.fit.prior import Prior, contradicts
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
@@ -26,10 +26,9 @@ from backlash_ros.core.estimation.fit.relabelling import (
     searched,
 )
 from backlash_ros.core.estimation.fit.solution import Around
-from backlash_ros.core.estimation.moving_horizon.acquisition import confirmed
+from backlash_ros.core.estimation.moving_horizon.acquisition import confirmed, fitted_around
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.protocol import Estimate, Status
-from backlash_ros.core.estimation.regression.play import Start
 
 Array = NDArray[np.float64]
 
@@ -153,7 +152,11 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     if end - since >= RECOVERED:
         learning.reason = Status.INCONSISTENT
         if around.inherited:
-            learning.contradiction = yield from _as_known(learning, estimate)
+            # The newest samples around what was known, though it does not explain them.
+            v, y = record.since(max(record.first, end - SEARCHED))
+            learning.contradiction = yield from fitted_around(
+                learning, v, y, estimate, learning.around._replace(walk=0.0)
+            )
     if end - since > SEARCHED:
         learning.begin_acquisition(estimate)
     return False
@@ -178,16 +181,6 @@ def _best_of_all(
         if result is not None and result.keeps_prior and learning.usable(result) is not None:
             results.append(result)
     return most_likely(results) if results else None
-
-
-def _as_known(learning: Learning, estimate: Estimate) -> Generator[None, None, Fitted]:
-    """The newest samples around what was known, though it does not explain them."""
-    record = learning.record
-    v, y = record.since(max(record.first, record.end - SEARCHED))
-    gap = estimate.c_r - estimate.c_l
-    around = learning.around._replace(prior=prior_of(estimate, learning.held), walk=0.0)
-    start = Start(gap, float(v[0]) + 0.5 * gap)
-    return (yield from fitted(v, y, around, start, estimate.m, learning.pace))
 
 
 def _has_changed(
