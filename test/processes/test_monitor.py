@@ -108,6 +108,8 @@ def test_a_controller_is_shown_and_obeys_the_keys(tmp_path: Path) -> None:
         screen.press('f')
         driver.run_until(switched(driver, 'learning', 'False'), 'to hold the estimates')
         driver.run_until(lambda: 'estimates are held' in screen.frame(), 'the answer')
+        # The key goes by the state that is shown, and diagnostics may come after the answer.
+        driver.run_until(lambda: 'frozen' in screen.frame(), 'the state')
         screen.press('f')
         driver.run_until(switched(driver, 'learning', 'True'), 'to learn again')
         screen.press('c')
