@@ -89,6 +89,23 @@ def test_what_was_learned_is_as_sure_as_it_says() -> None:
     assert 0.0 <= found.unexplained < 0.05
 
 
+def test_the_structure_gets_a_finer_model_than_the_fit_needs() -> None:
+    p = MOTOR.replaced({'structure': 'tracking', 'truth.scale_frequency': 1.03})
+    loop = build_closed_loop(p)
+    loop.run(1600)
+    adopted = loop.controller.adopted
+    assert adopted is not None
+    z = np.exp(1j * p.get_float('sample_period') * np.array([4.0, 8.0, 16.0]))
+    true, one = build_true_model(p), np.ones(1, complex)
+
+    def off(model: TransferFunction) -> float:
+        gain = true.response(one) / model.response(one)
+        return float(np.abs(gain * model.response(z) / true.response(z) - 1.0).max())
+
+    assert off(adopted.transfer_function) < 0.05 * off(loop.told)
+    assert law(loop).learned_model is adopted
+
+
 def test_exact_model_has_no_deviations() -> None:
     found = build_closed_loop(MOTOR.replaced({'plant.uncertainty': 0.0})).run(600).learned
     assert found is not None

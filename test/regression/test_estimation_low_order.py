@@ -7,7 +7,7 @@ import pytest
 from records import PERIOD_S, resonance, swing
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.fit.low_order import OutputError, low_order
+from backlash_ros.core.estimation.fit.low_order import OutputError, low_order, memory_of
 from backlash_ros.core.estimation.fit.pace import drained
 from backlash_ros.core.estimation.regression.error_model import ErrorModel, build_error_model
 from backlash_ros.core.plant.state_model import StateModel
@@ -29,7 +29,7 @@ def learned(
     weights = np.ones(600)
     weights[:60] = 0.0
     error = build_error_model(StateModel(told), 0.2)
-    problem = OutputError(told, u, y, weights, NOISE)
+    problem = OutputError(told, u, y, weights, np.zeros(memory_of(told)), NOISE)
     model = told
     for _ in range(3):  # as the fit of a record does
         better = drained(low_order(model, error.around(StateModel(model)), problem, 1.0))
@@ -88,6 +88,20 @@ def test_an_integrator_stays_one_and_a_drift_is_not_taken_for_it() -> None:
     assert model is not None
     assert np.abs(model.poles - 1.0).min() < 1e-9
     assert off(model, true) <= 5e-3
+
+
+def test_u_before_the_record_acts_on_its_first_samples() -> None:
+    true = TransferFunction(resonance().numerator.tolist(), [*resonance().denominator, 0.0, 0.0])
+    u = swing(700, seed=2)
+    y = lfilter(true.numerator, true.denominator, np.append(u, 0.0))[1:]
+    memory = memory_of(true)
+
+    def misfit(before: np.ndarray) -> float:
+        """Of the true G over samples from the middle of a motion on."""
+        return OutputError(true, u[100:], y[100:], np.ones(600), before, NOISE).misfit(true)
+
+    assert misfit(u[100 - memory:100]) < 1e-9
+    assert misfit(np.zeros(memory)) > 1e3
 
 
 def test_an_exact_model_stays_what_it_is() -> None:

@@ -71,7 +71,7 @@ def test_deviation_is_that_of_plants_drawn_from_the_posterior() -> None:
         m, e = drawn[layout.n + 1], drawn[layout.base:layout.base + layout.errors]
         # The record says m G (1 + Delta).
         squares += np.abs(shares @ (e / m)) ** 2
-    assert response_std(fit, solution, POINTS) == pytest.approx(
+    assert response_std(fit, solution, fit.model, POINTS) == pytest.approx(
         np.sqrt(squares / len(draws)), rel=0.1
     )
 
@@ -81,15 +81,27 @@ def test_true_response_lies_within_a_few_deviations(frequency_hz: float) -> None
     true = resonance(frequency_hz)
     fit, solution = fit_of(true, resonance(), 0.2)[:2]
     off = np.abs(true.response(POINTS) / resonance().response(POINTS) - 1.0)
-    std = response_std(fit, solution, POINTS)
+    std = response_std(fit, solution, fit.model, POINTS)
     assert np.all(off <= 3.0 * std)
     # And they are no empty promise: where y moves G is known.
     assert std[0] < 0.02 + 2.0 * off[0]
 
 
+def test_deviation_is_that_from_the_model_in_question() -> None:
+    true = resonance(5.2)
+    fit, solution = fit_of(true, resonance(), 0.2)[:2]
+    for given in (resonance(), resonance(5.5)):
+        off = np.abs(true.response(POINTS) / given.response(POINTS) - 1.0)
+        std = response_std(fit, solution, StateModel(given), POINTS)
+        assert std[:3] == pytest.approx(off[:3], rel=0.2)
+    # All that is left of the true one is what the record does not tell.
+    left = response_std(fit, solution, StateModel(true), POINTS)
+    assert np.all(left[:3] < 0.2 * off[:3])
+
+
 def test_exact_model_has_no_deviation() -> None:
     fit, solution = fit_of(resonance(), resonance(), 0.0)[:2]
-    assert response_std(fit, solution, POINTS).tolist() == [0.0] * len(FREQUENCIES)
+    assert response_std(fit, solution, fit.model, POINTS).tolist() == [0.0] * len(FREQUENCIES)
 
 
 def test_leak_of_an_integrator_counts() -> None:
@@ -100,4 +112,5 @@ def test_leak_of_an_integrator_counts() -> None:
         * posterior.noise_std**2 * solution.inflation
     # Far below every other frequency only the leak is left.
     low = np.exp(1j * np.array([1e-9]))
-    assert response_std(fit, solution, low) == pytest.approx([np.sqrt(leak) / 1e-9], rel=1e-3)
+    std = response_std(fit, solution, fit.model, low)
+    assert std == pytest.approx([np.sqrt(leak) / 1e-9], rel=1e-3)

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 SCHEDULE = (1e1, 1e2, 1e3, 1e4)
 # Times the input weight with which feedback around a better G is tried in turn until its loop is
 # as safe as the one it replaces. The trajectory keeps the weight that was asked for.
-SAFER = (1.0, 3.0, 10.0, 30.0, 100.0)
+SAFER = (1.0, 1.1, 1.4, 2.0, 4.0, 10.0, 30.0, 100.0)
 # Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
 # are led astray by any feedback that would help, and learn faster than they go astray without.
 WRONG_SLOPE = 1.35

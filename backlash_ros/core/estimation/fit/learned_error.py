@@ -10,15 +10,18 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.constants import BY_CHANCE, LINEAR
 from backlash_ros.core.estimation.fit.solution import Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
+from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
 
-def response_std(fit: WindowFit, solution: Solution, z: NDArray[np.complex128]) -> Array:
-    """Relative deviation of the response of the true G from `model` at z (M,), shape (M,).
+def response_std(
+    fit: WindowFit, solution: Solution, model: StateModel, z: NDArray[np.complex128],
+) -> Array:
+    """Relative deviation of the response of the true G from that of `model` at z (M,), shape (M,).
 
     The root of the mean of |dG/G|^2 over the posterior of the error of G and of the leak of its
-    integrator. What is known of the error counts as well, as `model` goes without it. The gain
+    integrator. What is known of the error counts as far as `model` goes without it. The gain
     at rest is part of m. 0 where G is exact.
     """
     layout, posterior = fit.layout, solution.posterior
@@ -34,7 +37,9 @@ def response_std(fit: WindowFit, solution: Solution, z: NDArray[np.complex128]) 
         by[:, layout.n + 1] = -(by[:, part] @ posterior.mean[part]) / m
     variance = np.einsum('mp,pq,mq->m', by, posterior.cov, by.conj()).real
     spread = posterior.noise_std**2 * solution.inflation
-    return np.asarray(np.sqrt(np.abs(known) ** 2 + np.maximum(variance, 0.0) * spread))
+    of_fit, given = (one.transfer_function.response(z) for one in (fit.model, model))
+    left = np.abs(known + (of_fit - given) / of_fit) ** 2 + np.maximum(variance, 0.0) * spread
+    return np.asarray(np.sqrt(left) * np.abs(of_fit / given))
 
 
 def plausible(fit: WindowFit, solution: Solution) -> bool:

@@ -12,7 +12,7 @@ nonlinear least squares problems whose variables separate, SIAM J. Numer. Anal. 
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,43 +31,66 @@ SHORTER = 0.3  # share of a step that is tried where the whole step leads uphill
 NO_TAP = 1e-6  # share of the largest tap below which the last ones are none
 
 
+def memory_of(model: TransferFunction) -> int:
+    """Samples of u that a numerator of low order reaches back."""
+    return model.delay + max(SHIFTS) + model.order + MORE_TAPS
+
+
 class OutputError:
     """The problem: u (N,), applied from k to k+1, and y (N,) after it, with its weights.
 
-    weights: 0 where y was lost or is not to be compared. noise_std: of y. integrate: denominator
-    of the integrators of G.
+    weights: 0 where y was lost or is not to be compared. before: u of the samples before these, as
+    many as `memory_of` G: it acts on the first y through the numerator. noise_std: of y. integrate:
+    denominator of the integrators of G.
     """
 
     def __init__(
-        self, model: TransferFunction, u: Array, y: Array, weights: Array, noise_std: float,
+        self, model: TransferFunction, u: Array, y: Array, weights: Array, before: Array,
+        noise_std: float,
     ) -> None:
         self.integrators = int(np.count_nonzero(np.abs(model.poles - 1.0) < ON_CIRCLE))
         self.integrate = np.atleast_1d(np.poly([1.0] * self.integrators))
-        self._rows = np.flatnonzero(weights > 0.0)
-        self._u, self._y = u, y[self._rows]
-        self._root = np.sqrt(weights[self._rows]) / noise_std
+        compared = np.flatnonzero(weights > 0.0)
+        self._rows = len(before) + compared
+        self._u, self._y = np.concatenate([before, u]), y[compared]
+        self._root = np.sqrt(weights[compared]) / noise_std
 
     def residual(self, b: Array, a: Array, delay: int) -> tuple[Array, Array]:
         """Weighted residual without the free response, and the response (N,)."""
-        answer = lfilter(
-            np.append(np.zeros(delay - 1), b), np.convolve(a, self.integrate), self._u
-        )
-        return self._without_free((self._y - answer[self._rows]) * self._root, a), answer
+        answer = lfilter(np.append(np.zeros(delay - 1), b), self._poles(a), self._u)
+        rows = (self._y - answer[self._rows]) * self._root
+        return self._without_free(rows, self._poles(a)), answer
+
+    def misfit(self, model: TransferFunction) -> float:
+        """Twice the negative log-likelihood of another G; its gain at rest is free."""
+        poles = np.trim_zeros(model.denominator, 'b')
+        answer = lfilter(model.numerator[1:], poles, self._u)[self._rows] * self._root
+        # Where nothing but free responses is left of y or of u, there is nothing to compare.
+        y = self._without_free(self._y * self._root, poles)
+        answer = self._without_free(answer, poles)
+        power = float(answer @ answer)
+        gain = float(answer @ y) / power if power > 0.0 else 0.0
+        left = y - gain * answer
+        return float(left @ left)
 
     def slopes(self, a: Array, answer: Array, delay: int, taps: int, prior: Array) -> Array:
         """Derivatives of the weighted response in the directions of the prior, shape (N, ..)."""
         n, count = len(a) - 1, len(self._u)
-        by_input = lfilter([1.0], np.convolve(a, self.integrate), self._u)
+        by_input = lfilter([1.0], self._poles(a), self._u)
         by_output = lfilter([1.0], a, answer)
         columns = np.zeros((count, taps + n))
         for j in range(taps):
             columns[delay - 1 + j:, j] = by_input[:count - delay + 1 - j]
         for i in range(1, n + 1):
             columns[i:, taps + i - 1] = -by_output[:-i]
-        return self._without_free((columns[self._rows] @ prior) * self._root[:, None], a)
+        rows = (columns[self._rows] @ prior) * self._root[:, None]
+        return self._without_free(rows, self._poles(a))
 
-    def _without_free(self, rows: Array, a: Array) -> Array:
-        denominator = np.convolve(a, self.integrate)
+    def _poles(self, a: Array) -> Array:
+        """Denominator of G for that of its stable part."""
+        return np.asarray(np.convolve(a, self.integrate), dtype=np.float64)
+
+    def _without_free(self, rows: Array, denominator: Array) -> Array:
         order = len(denominator) - 1
         if order == 0:
             return rows
@@ -78,8 +101,11 @@ class OutputError:
 
 def low_order(
     model: TransferFunction, error: ErrorModel, problem: OutputError, scale: float,
+    shifts: Sequence[int] = SHIFTS,
 ) -> Generator[None, None, TransferFunction | None]:
-    """Fit G, beginning with `model`. scale: of its error. None where no stable G comes out.
+    """Fit G, beginning with `model`. None where no stable G comes out.
+
+    scale: of the error of `model`. shifts: samples of delay more than it has that are compared.
 
     Yields between pieces.
     """
@@ -92,7 +118,7 @@ def low_order(
     cost, delay = np.inf, model.delay
     b: Array = told
     a: Array = error.stable
-    for shift in SHIFTS:
+    for shift in shifts:
         if model.delay + shift >= 1:
             fit = yield from _fit(told, error.stable, model.delay + shift, problem, prior)
             if fit[0] < cost:

@@ -24,9 +24,9 @@ from backlash_ros.core.estimation.constants import (
     WALKS,
     ZOOM,
 )
+from backlash_ros.core.estimation.fit.better_model import better_model
 from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.learned_error import wants_another_model
-from backlash_ros.core.estimation.fit.low_order import OutputError, low_order
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance, contradicts
 from backlash_ros.core.estimation.fit.search import (
@@ -40,16 +40,11 @@ from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.estimation.regression.readings import weights_of
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.plant.model_check import check_model
-from backlash_ros.core.plant.state_model import StateModel
-from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
 RELABELLINGS = 8  # of relabelling, at most
 STANDS = 0.02  # standard deviations by which the gap may still move
-FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
 NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
 SAME = 1.5  # ratio of deviations of the gap up to which they say the same
 MODELS = 6  # times that G may move in one fit
@@ -230,30 +225,24 @@ def with_better_model(
     Every move begins with the G of `result`, whose prior it is: from move to move the samples leave
     some directions open, and G would go astray there.
     """
-    weights = np.where(np.isfinite(y), weights_of(y), 0.0)
-    transfer, error = result.around.model.transfer_function, result.around.error
+    count = result.around.error.count
     for _ in range(MODELS):
         solution, around = result.solution, result.around
         posterior = solution.posterior
         if not solution.m > 0.0 or not wants_another_model(result.fit, solution):
             break
-        u = result.fit.input(solution, v)
-        newest = slice(-max(pace.pieces(error.taps + 2), FEWEST_ROWS), None)
-        problem = OutputError(transfer, u[newest], y[newest], weights[newest], posterior.noise_std)
-        yield
-        better = yield from low_order(transfer, error, problem, posterior.scale)
-        if better is None or not _allowed(better):
+        model = yield from better_model(v, y, result.fit, solution, pace)
+        if model is None:
             break
-        model = StateModel(better)
         moved = around.moved_to(model)._replace(scale=max(around.scale, posterior.scale))
         yield
         other = yield from fitted(v, y, moved, result.beginning(v), solution.m, pace)
         gained = other.evidence - result.evidence
         # What moving K coefficients may cost or bring by chance.
-        if gained < -error.count:
+        if gained < -count:
             break
         result = other
-        if gained < error.count:
+        if gained < count:
             break
     return result
 
@@ -281,10 +270,3 @@ def with_walk(
     around = still._replace(walk=WALKS[best] * size)
     return (yield from fitted(v, y, around, walking.fit.start, solution.m, pace))
 
-
-def _allowed(model: TransferFunction) -> bool:
-    try:
-        check_model(model)
-    except ParameterError:
-        return False
-    return True

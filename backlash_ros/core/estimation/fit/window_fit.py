@@ -298,6 +298,13 @@ class WindowFit:
             labels.held * held + labels.v_a * m - labels.right * right - labels.left * left + walked
         )
 
+    def input_before(self, solution: Solution, samples: int) -> Array:
+        """u of so many samples before the first one: at rest, as far as none are remembered."""
+        past = self.start.past
+        p = self.start.labels(past).p if len(past) else np.array([solution.start])
+        m, right = solution.posterior.mean[self.layout.n + 1:self.layout.n + 3]
+        return np.pad(m * p - right, (samples, 0), mode='edge')[-samples:]
+
 
 @lru_cache(maxsize=64)
 def step_norm(model: StateModel) -> float:

@@ -35,6 +35,7 @@ from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.moving_horizon.acceptance import usable
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 Task = Generator[None, None, bool]
@@ -70,7 +71,8 @@ class Learning:
     record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
     do not deny it; supported: what they say alone, where that is precise enough to speak for it.
     contradiction: fit of samples that nothing explains, around what was known; None while there are
-    none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before.
+    none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before. refined: the G
+    that explains y better than that of the fit does without its error, None while there is none.
     """
 
     bounds: Bounds
@@ -94,6 +96,7 @@ class Learning:
     supported: Crossings | None = None
     contradiction: Fitted | None = None
     held: Array | None = None
+    refined: StateModel | None = None
 
     @property
     def expects_changes(self) -> bool:
@@ -133,6 +136,11 @@ class Learning:
         """Samples of the record that no fit has taken in yet."""
         taken = self.current.fit.length if self.current is not None else 0
         return len(self.record) - taken
+
+    @property
+    def learned_model(self) -> StateModel:
+        """The G that explains y best."""
+        return self.refined or self.around.model
 
     def beginnings(self, around: Around) -> list[Around]:
         """This one, and that of the G that was told where it is another one.
@@ -179,11 +187,15 @@ class Learning:
         if inherited is None:
             self.contradiction = None
 
-    def go_on_from(self, result: Fitted, first: int, changed: bool = False) -> bool:
+    def go_on_from(
+        self, result: Fitted, first: int, changed: bool = False, refined: StateModel | None = None,
+    ) -> bool:
         """Go on from this fit of the record from sample `first` on; it is to be published.
 
-        changed: whether it is of a plant that has changed.
+        changed: whether it is of a plant that has changed. refined: G, where it was looked for.
         """
+        if refined is not None or result.around.model is not self.around.model:
+            self.refined = refined
         self.current, self.around = result, result.around
         if result.around.prior is not self.unconfirmed:
             self.unconfirmed = None

@@ -131,7 +131,7 @@ class MovingHorizon:
     @property
     def learned_model(self) -> StateModel:
         """The G behind the newest estimates, whether or not a structure has taken it up."""
-        return self._learning.around.model
+        return self._learning.learned_model
 
     @property
     def noise_ratio(self) -> float:
@@ -170,7 +170,7 @@ class MovingHorizon:
         current = self._learning.current
         if current is None:
             return np.full(len(z), nan)
-        return response_std(current.fit, current.solution, z)
+        return response_std(current.fit, current.solution, self.learned_model, z)
 
     @property
     def waiting(self) -> int:
@@ -197,7 +197,9 @@ class MovingHorizon:
         self._following.change_model(model)
         learning = self._learning
         if learning.current is not None:
-            self._following.follow(learning.current, self.estimate, learning.record)
+            self._following.follow(
+                learning.current, self.estimate, learning.record, self.learned_model
+            )
             return
         learning.around = learning.around.moved_to(model)
 
@@ -329,7 +331,7 @@ class MovingHorizon:
             learning.reason = Status.TRACKING
         if belief is Belief.REFUSED and not self._following.begun:
             return
-        self._following.follow(current, self.estimate, learning.record)
+        self._following.follow(current, self.estimate, learning.record, self.learned_model)
 
     def _note_coasting(self) -> None:
         """Let motion of a load that coasts count as doubt of both crossings, until it is over.

@@ -17,6 +17,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
+from backlash_ros.core.estimation.fit.better_model import refined_model
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
@@ -87,18 +88,26 @@ def refit(learning: Learning) -> Task:
         if afresh.evidence <= kept.evidence + around.error.count:
             result = kept
     result = yield from with_walk(v, y, result, learning.pace)
-    if len(v) > SEARCHED:
-        return learning.go_on_from(result, first)
-    if around.prior is None:
-        # The gap of a short record may be one of several.
-        other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
-        if other is not None:
-            result = result.with_gap_spread(other.fit.gap_spread)
-            if learning.usable(other) is not None:
-                result = most_likely([result, other])
-    else:
-        result = yield from with_other_gaps(v, y, result, around.prior, learning.pace)
-    return learning.go_on_from(result, first)
+    if len(v) <= SEARCHED:
+        result = yield from _beside_other_gaps(learning, v, y, result)
+    refined = yield from refined_model(
+        v, y, result.fit, result.solution, learning.learned_model, learning.pace
+    )
+    return learning.go_on_from(result, first, refined=refined)
+
+
+def _beside_other_gaps(
+    learning: Learning, v: Array, y: Array, result: Fitted,
+) -> Generator[None, None, Fitted]:
+    """The fit of a short record, whose gap may be one of several."""
+    prior = learning.around.prior
+    if prior is not None:
+        return (yield from with_other_gaps(v, y, result, prior, learning.pace))
+    other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
+    if other is None:
+        return result
+    result = result.with_gap_spread(other.fit.gap_spread)
+    return result if learning.usable(other) is None else most_likely([result, other])
 
 
 def _shortened(

@@ -53,7 +53,7 @@ class StateFollowing:
         self._observer: Observer | None = None
         self._attribution: Attribution | None = None  # of this observer
         self._p = self._v = nan
-        self._exact = False  # whether the fit speaks of `model`
+        self._explains = False  # whether `model` is the G that was learned
         self._refused: list[int] = []  # numbers of the newest samples, one after the other
 
     @property
@@ -109,7 +109,7 @@ class StateFollowing:
         self.since_motion = self.since_motion + 1 if p == self._p else 0
         attribution, there = self._attribution, p
         # An observer of a G that is known to be another one would blame the commands.
-        if attribution is None and other == other and self._exact:
+        if attribution is None and other == other and self._explains:
             attribution = self._attribution = Attribution(observer)
         if attribution is not None:
             if other == other:
@@ -155,20 +155,24 @@ class StateFollowing:
         record.restore(self._refused)
         return False
 
-    def follow(self, current: Fitted, estimate: Estimate, record: Record) -> None:
+    def follow(
+        self, current: Fitted, estimate: Estimate, record: Record, learned: StateModel,
+    ) -> None:
         """Let play operator and observer stand where the fit says that the plant stands.
 
-        current: fit of the first samples of the record. estimate: what is published of it.
+        current: fit of the first samples of the record. estimate: what is published of it. learned:
+        the G that goes with it.
         """
         fit, solution, _ = current
         gap = estimate.c_r - estimate.c_l
         waiting = record.since(record.first + fit.length)[0].tolist()
         noise = solution.posterior.noise_std
         exact, cov = None, None
-        self._exact = fit.model is self.model
-        if self._exact:
+        of_fit = fit.model is self.model
+        self._explains = of_fit or learned is self.model
+        if of_fit:
             exact, cov = fit.state(solution)
-        else:
+        if not self._explains:
             self._attribution = None
         observer = self._observer
         if observer is None or observer.model is not self.model:

@@ -1,0 +1,85 @@
+"""The G of low order that a fit speaks for.
+
+A fit explains y by G (1 + Delta); a structure can only be designed for a G of low order, which
+`low_order` finds in y and in the u of the fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.fit.low_order import (
+    SHIFTS,
+    OutputError,
+    low_order,
+    memory_of,
+)
+from backlash_ros.core.estimation.fit.pace import Pace
+from backlash_ros.core.estimation.fit.solution import Solution
+from backlash_ros.core.estimation.fit.window_fit import WindowFit
+from backlash_ros.core.estimation.regression.readings import weights_of
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.model_check import check_model
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
+
+
+def better_model(
+    v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace,
+    shifts: Sequence[int] = SHIFTS,
+) -> Generator[None, None, StateModel | None]:
+    """Return the G that fits y best, given u of this fit of v (N,) and y (N,), nan where lost.
+
+    None where no G that may be told comes out. shifts: as in `low_order`.
+    """
+    problem = _problem(v, y, fit, solution, pace)
+    yield
+    model, error = fit.model.transfer_function, fit.around.error
+    better = yield from low_order(model, error, problem, solution.posterior.scale, shifts)
+    return StateModel(better) if better is not None and _allowed(better) else None
+
+
+def refined_model(
+    v: Array, y: Array, fit: WindowFit, solution: Solution, present: StateModel, pace: Pace,
+) -> Generator[None, None, StateModel]:
+    """Return the G that explains y best, or the present one as long as that does it as well.
+
+    The fit itself stays around the G that it has: it knows the rest of the error as well.
+    """
+    count = fit.around.error.count
+    if not count or not solution.m > 0.0:
+        return present
+    better = yield from better_model(v, y, fit, solution, pace, shifts=(0,))
+    if better is None:
+        return present
+    problem = _problem(v, y, fit, solution, pace)
+    gained = problem.misfit(present.transfer_function) - problem.misfit(better.transfer_function)
+    # What as many coefficients bring by chance would only make the structure follow the noise.
+    return better if gained > 2.0 * count else present
+
+
+def _problem(v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace) -> OutputError:
+    model = fit.model.transfer_function
+    memory, rows = memory_of(model), max(pace.pieces(fit.around.error.taps + 2), FEWEST_ROWS)
+    u = np.concatenate([fit.input_before(solution, memory), fit.input(solution, v)])
+    first = max(len(v) - rows, 0)
+    weights = np.where(np.isfinite(y), weights_of(y), 0.0)
+    return OutputError(
+        model, u[first + memory:], y[first:], weights[first:], u[first:first + memory],
+        solution.posterior.noise_std,
+    )
+
+
+def _allowed(model: TransferFunction) -> bool:
+    try:
+        check_model(model)
+    except ParameterError:
+        return False
+    return True
