@@ -54,15 +54,16 @@ def refined_model(
     The fit itself stays around the G that it has: it knows the rest of the error as well.
     """
     count = fit.around.error.count
-    if not count or not solution.m > 0.0:
+    if not count or fit.around.inherited or not solution.m > 0.0:
         return present
     better = yield from better_model(v, y, fit, solution, pace, shifts=(0,))
     if better is None:
         return present
     problem = _problem(v, y, fit, solution, pace)
     gained = problem.misfit(present.transfer_function) - problem.misfit(better.transfer_function)
-    # What as many coefficients bring by chance would only make the structure follow the noise.
-    return better if gained > 2.0 * count else present
+    # What as many coefficients bring by chance would only make the structure follow the noise, and
+    # what no G explains is no better explained for that.
+    return better if gained > 2.0 * count * solution.inflation else present
 
 
 def _problem(v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace) -> OutputError:

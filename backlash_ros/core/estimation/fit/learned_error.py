@@ -58,5 +58,6 @@ def wants_another_model(fit: WindowFit, solution: Solution) -> bool:
     if posterior.scale < LINEAR:
         return False
     part = slice(layout.base, layout.base + layout.errors)
-    error, cov = posterior.mean[part], posterior.cov[part, part] * posterior.noise_std**2
+    spread = posterior.noise_std**2 * solution.inflation
+    error, cov = posterior.mean[part], posterior.cov[part, part] * spread
     return float(error @ np.linalg.pinv(cov) @ error) > 2.0 * layout.errors

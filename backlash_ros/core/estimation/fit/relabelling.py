@@ -237,7 +237,7 @@ def with_better_model(
         moved = around.moved_to(model)._replace(scale=max(around.scale, posterior.scale))
         yield
         other = yield from fitted(v, y, moved, result.beginning(v), solution.m, pace)
-        gained = other.evidence - result.evidence
+        gained = (other.evidence - result.evidence) / solution.inflation
         # What moving K coefficients may cost or bring by chance.
         if gained < -count:
             break

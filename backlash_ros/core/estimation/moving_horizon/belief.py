@@ -28,22 +28,13 @@ class Belief(Enum):
 
 
 def believable(learning: Learning) -> Crossings | None:
-    """What the fit says, with all its doubt; None if it is of no use.
+    """What the fit says; None if it is of no use.
 
     What no backlash and no G explains is an error that lasts: all of what chance makes of the
-    deviations has to be small, not one of them. And what was learned before is known no better than
-    from the samples alone as long as they only support it: another backlash that they do not tell
-    from it is within these deviations.
+    deviations has to be small, not one of them.
     """
-    fit, alone = learning.fit, learning.supported
-    lasting = learning.around.inherited and fit.solution.moved_otherwise
-    found = learning.usable(fit, LASTING if lasting else 1.0)
-    if found is None or alone is None:
-        return found
-    return replace(
-        found, std_m=alone.std_m, std_c_r=alone.std_c_r, std_c_l=alone.std_c_l,
-        std_gap=alone.std_gap, cov=alone.cov,
-    )
+    lasting = learning.around.inherited and learning.fit.solution.moved_otherwise
+    return learning.usable(learning.fit, LASTING if lasting else 1.0)
 
 
 def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> Belief:
@@ -52,9 +43,10 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
     found: what the fit says, None if it is of no use.
     Few samples can be fitted by a backlash that never was, and so can many where y moves
     otherwise: after a contradiction a fit has to foretell some, before it says something else
-    or says it less precisely.
+    or says it less precisely. And what was learned before stays as it is until samples that are as
+    precise on their own say otherwise, or confirm it: together they would say what neither says.
     """
-    held, around, solution = learning.held, learning.fit.around, learning.fit.solution
+    held, around, (fit, solution, _) = learning.held, learning.fit.around, learning.fit
     if found is None or learning.fit.contested:
         return Belief.REFUSED
     if held is None:
@@ -63,20 +55,30 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
         return Belief.AGREES  # so few samples say nothing alone
     proven = learning.consistent >= RECOVERED
     otherwise = solution.moved_otherwise
+    wider = bool(np.any(np.diag(found.cov) > np.diag(held)))
     if beyond_chance(difference(found, estimate), found.cov + held):
-        sure = proven and not (otherwise and learning.around.error.count == 0)
+        sure = proven and not (otherwise and around.error.count == 0)
+        if learning.unconfirmed is not None:
+            alone = None if solution.alone is None else solution.alone.crossings
+            sure = sure and alone is not None and is_precise(alone, fit.swing, REPLACING)
         return Belief.REPLACES if sure else Belief.REFUSED
+    if around.inherited and not learning.expects_changes:
+        # Samples that agree with what was known before do not make it less certain.
+        sure = learning.unconfirmed is None and not wider
+        return Belief.REPLACES if sure else Belief.AGREES
     if otherwise and not learning.expects_changes:
         sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
     else:
-        sure = proven or not np.any(np.diag(found.cov) > np.diag(held))
+        sure = proven or not wider
     if sure:
         return Belief.REPLACES
     return Belief.AGREES if proven else Belief.REFUSED
 
 
-def denied_by_samples(learning: Learning) -> bool:
+def denied_by_samples(learning: Learning, estimate: Estimate) -> bool:
     """Ask the samples alone about what was learned before; return whether they deny it.
+
+    estimate: the published one.
 
     Whether they confirm or support it is noted in `learning`.
     They deny what is off by more than an estimate may be uncertain at all. What contradicts
@@ -84,7 +86,7 @@ def denied_by_samples(learning: Learning) -> bool:
     they may be as wrong. So may they where something else moves y, which denies nothing.
     """
     prior, (fit, solution, _) = learning.unconfirmed, learning.fit
-    learning.supported = None
+    learning.supported = False
     if prior is None or not learning.reversed_often(fit):
         return False
     alone = solution.alone or fit.solve(alone=True)
@@ -96,10 +98,22 @@ def denied_by_samples(learning: Learning) -> bool:
     denied = contradicted and differs(found, prior) and not otherwise
     if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
         learning.unconfirmed = None
-    elif not contradicted and is_precise(found, fit.swing, LASTING) \
-            and fit.unexplained(solution) <= MOST_UNEXPLAINED:
-        learning.supported = found
+    else:
+        learning.supported = (
+            not contradicted and is_precise(_furthest(estimate, found), fit.swing, LASTING)
+            and fit.unexplained(solution) <= MOST_UNEXPLAINED
+        )
     return denied
+
+
+def _furthest(estimate: Estimate, found: Crossings) -> Crossings:
+    """What was found, with how far an estimate is from the furthest that it makes likely."""
+    m, c_r, c_l = np.abs(difference(found, estimate)).tolist()
+    gap = abs(found.gap - (estimate.c_r - estimate.c_l))
+    return replace(
+        found, std_m=m + found.std_m, std_c_r=c_r + found.std_c_r, std_c_l=c_l + found.std_c_l,
+        std_gap=gap + found.std_gap,
+    )
 
 
 def load_coasts(learning: Learning, estimate: Estimate) -> bool:

@@ -69,7 +69,7 @@ class Learning:
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
     again. changed: what theta seems to have become. refitted: whether it was refitted since the
     record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
-    do not deny it; supported: what they say alone, where that is precise enough to speak for it.
+    do not deny it; supported: whether they alone are precise enough to speak for it.
     contradiction: fit of samples that nothing explains, around what was known; None while there are
     none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before. refined: the G
     that explains y better than that of the fit does without its error, None while there is none.
@@ -93,7 +93,7 @@ class Learning:
     refitted: bool = False
     changed: Prior | None = None
     unconfirmed: Prior | None = None
-    supported: Crossings | None = None
+    supported: bool = False
     contradiction: Fitted | None = None
     held: Array | None = None
     refined: StateModel | None = None
@@ -163,7 +163,7 @@ class Learning:
     @property
     def confirmed(self) -> bool:
         """Whether the samples speak for what is published."""
-        known = self.unconfirmed is None or self.supported is not None
+        known = self.unconfirmed is None or self.supported
         return self.current is not None and known
 
     def drifts_more(self, solution: Solution, samples: int) -> bool:
@@ -197,7 +197,7 @@ class Learning:
         if refined is not None or result.around.model is not self.around.model:
             self.refined = refined
         self.current, self.around = result, result.around
-        if result.around.prior is not self.unconfirmed:
+        if result.around.prior is None:
             self.unconfirmed = None
         self.record.forget_before(first)
         # As long as the gap may be another one the search for it goes on.

@@ -313,7 +313,7 @@ class MovingHorizon:
         """Make the newest fit the estimate where it is good enough, and go on from its state."""
         learning = self._learning
         current = learning.fit
-        if denied_by_samples(learning):
+        if denied_by_samples(learning, self.estimate):
             # The estimate was that of another plant.
             kept = learning.around.inherited
             learning.begin_acquisition(self.estimate if kept else None)
@@ -334,15 +334,15 @@ class MovingHorizon:
         self._following.follow(current, self.estimate, learning.record, self.learned_model)
 
     def _note_coasting(self) -> None:
-        """Let motion of a load that coasts count as doubt of both crossings, until it is over.
+        """Let motion of a load that coasts count as doubt of the gap, until it is over.
 
-        A structure that shrinks them by their deviations pushes the load less.
+        A structure that shrinks it by its deviations pushes the load less.
         """
         learning, estimate = self._learning, self.estimate
         self._coasts = learning.reason is Status.INCONSISTENT and load_coasts(learning, estimate)
         stds = self._stds
         if self._coasts:
-            doubt = self.unexplained * (estimate.c_r - estimate.c_l)
+            doubt = 0.5 * self.unexplained * (estimate.c_r - estimate.c_l)  # of each crossing
             stds = hypot(stds[0], doubt), hypot(stds[1], doubt)
         if stds != (estimate.std_c_r, estimate.std_c_l) and estimate.learned:
             self.estimate = replace(estimate, std_c_r=stds[0], std_c_l=stds[1])
