@@ -74,9 +74,3 @@ def test_a_model_that_does_as_well_stays() -> None:
     assert refined(true, SKIPPED, present=once) is once
     assert refined(plant(5.2), present=once) is not once
 
-
-def test_an_exact_model_stays() -> None:
-    fit = fit_of(TOLD, uncertainty=0.0)
-    y = output(plant(5.1), V, TRUTH, NOISE)
-    present = fit.fit.model
-    assert drained(refined_model(V, y, fit.fit, fit.solution, present, Pace())) is present

@@ -53,12 +53,12 @@ def refined_model(
 
     The fit itself stays around the G that it has: it knows the rest of the error as well.
     """
-    count = fit.around.error.count
-    if not count or fit.around.inherited or not solution.m > 0.0:
+    if not solution.m > 0.0:
         return present
     better = yield from better_model(v, y, fit, solution, pace, shifts=(0,))
     if better is None:
         return present
+    count = fit.around.error.count
     problem = _problem(v, y, fit, solution, pace)
     gained = problem.misfit(present.transfer_function) - problem.misfit(better.transfer_function)
     # What as many coefficients bring by chance would only make the structure follow the noise, and

@@ -36,6 +36,7 @@ from backlash_ros.core.estimation.observer.attribution import attributed
 from backlash_ros.core.estimation.observer.observer import Observer
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.estimation.regression.readings import weights_of
+from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
@@ -90,9 +91,11 @@ def refit(learning: Learning) -> Task:
     result = yield from with_walk(v, y, result, learning.pace)
     if len(v) <= SEARCHED:
         result = yield from _beside_other_gaps(learning, v, y, result)
-    refined = yield from refined_model(
-        v, y, result.fit, result.solution, learning.learned_model, learning.pace
-    )
+    refined: StateModel | None = None
+    if around.error.count and not around.inherited:
+        refined = yield from refined_model(
+            v, y, result.fit, result.solution, learning.learned_model, learning.pace
+        )
     return learning.go_on_from(result, first, refined=refined)
 
 
