@@ -53,9 +53,13 @@ def plausible(fit: WindowFit, solution: Solution) -> bool:
 
 
 def wants_another_model(fit: WindowFit, solution: Solution) -> bool:
-    """Whether the error of G is more than chance: then a G of low order may take it over."""
+    """Whether the error of G is more than chance: then a G of low order may take it over.
+
+    But where G was identified with the backlash, its uncertainty was measured: what is far beyond
+    that is no error of G.
+    """
     layout, posterior = fit.layout, solution.posterior
-    if posterior.scale < LINEAR:
+    if posterior.scale < LINEAR or (fit.around.inherited and posterior.scale > BY_CHANCE):
         return False
     part = slice(layout.base, layout.base + layout.errors)
     spread = posterior.noise_std**2 * solution.inflation
