@@ -85,8 +85,9 @@ def halve(learning: Learning) -> Task:
     if around.inherited:
         known = learning.around.prior
         # A lag may pass for a gap, and what was known before the record may hold on.
-        if not learning.reversed_often(newer.fit) or not learning.is_another(newer.solution) \
-                or not (known is None or contradicts(newer.solution.of_theta, known)):
+        if not learning.reversed_often(newer.fit) or not (
+            known is None or contradicts(newer.solution.of_theta, known)
+        ):
             return False
     if learning.expects_changes and not around.error.count:
         # What the older half says holds as far as theta has not drifted since.
@@ -130,7 +131,6 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
             changes.append(found)
             if (learning.reversed_often(found.fit) or not around.inherited) \
                     and learning.usable(found, REPLACING) is not None \
-                    and learning.is_another(found.solution) \
                     and found.solution.rms <= bound \
                     and _has_changed(current, found, whole, first == record.first):
                 theta = learning.changed = found.solution.of_theta

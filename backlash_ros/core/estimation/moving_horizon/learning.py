@@ -32,7 +32,7 @@ from backlash_ros.core.estimation.fit.record import Record
 from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
-from backlash_ros.core.estimation.moving_horizon.acceptance import differs, usable
+from backlash_ros.core.estimation.moving_horizon.acceptance import usable
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.plant.state_model import StateModel
@@ -159,14 +159,6 @@ class Learning:
     def usable(self, result: Fitted, share: float = 1.0) -> Crossings | None:
         """The crossings of a fit that is precise enough, see acceptance.py."""
         return usable(result, self.bounds, share)
-
-    def is_another(self, solution: Solution) -> bool:
-        """Whether a solution is further from what was learned before than that may be uncertain.
-
-        A plant that is no backlash and no linear G leads samples astray by less.
-        """
-        found, known = solution.crossings, self.unconfirmed
-        return known is None or (found is not None and differs(found, known))
 
     @property
     def confirmed(self) -> bool:
