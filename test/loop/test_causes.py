@@ -10,7 +10,14 @@ from typing import Any
 import pytest
 
 from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.loop.causes import LONGEST_TEXT, STATES, UNNAMED, findings_of
+from backlash_ros.core.loop.causes import (
+    HELD,
+    KNOWN,
+    LONGEST_TEXT,
+    STATES,
+    UNNAMED,
+    findings_of,
+)
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer, TopicFigures
 
 DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
@@ -115,6 +122,16 @@ def test_what_is_known_goes_before_the_model(
 ) -> None:
     if 'status' not in changes:
         assert first(replace(INCONSISTENT, **changes)).text.startswith(text)
+
+
+def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:
+    acquiring = replace(WELL, status=Status.ACQUIRING)
+    assert first(acquiring) == STATES[Status.ACQUIRING]
+    assert first(replace(acquiring, unconfirmed=True)) == KNOWN
+    assert len(KNOWN.text) <= LONGEST_TEXT
+    # It is confirmed where the status says so, or asked for.
+    assert first(replace(WELL, unconfirmed=True)) == STATES[Status.TRACKING]
+    assert first(replace(acquiring, unconfirmed=True, adapting=False)) == HELD
 
 
 def test_the_model_is_blamed_where_nothing_else_is_known() -> None:

@@ -60,6 +60,9 @@ STATES: dict[Status, Finding] = {
 HELD = Finding(
     Level.OK, 'adaptation off', 'estimates held as ~/freeze_adaptation asked; v is still answered'
 )
+KNOWN = Finding(
+    Level.OK, 'known', 'estimates of before hold: only a v at several speeds could confirm them'
+)
 GIVEN = Finding(Level.OK, 'given', 'estimates as given: estimator.law fixed learns nothing')
 
 
@@ -80,6 +83,8 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
         return GIVEN
     if not f.adapting and f.status != Status.INCONSISTENT:
         return HELD
+    if f.unconfirmed and f.status == Status.ACQUIRING:
+        return KNOWN
     return _contradiction(f) if f.status == Status.INCONSISTENT else STATES[f.status]
 
 

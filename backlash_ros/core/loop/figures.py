@@ -76,6 +76,7 @@ class LoopFigures:
     unexplained: float = nan  # motion of u that no G and no backlash explains, over m times the gap
     wrong_sign: bool = False  # whether y moves against v
     coasts: bool = False  # whether the load runs on within the gap
+    unconfirmed: bool = False  # whether estimates of before this run hold that it does not confirm
     adapting: bool = True
     given: bool = False  # whether the estimates are taken as the parameters give them
     silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not

@@ -73,9 +73,9 @@ class Diagnosis:
             and 0.0 < timeout < time.monotonic() - reference_at_s
         control = io.topics.control
         estimator = loop.core.estimator
-        unexplained, wrong_sign, coasts = (
-            estimator.unexplained, estimator.wrong_sign, estimator.coasts
-        ) if isinstance(estimator, MovingHorizon) else (nan, False, False)
+        unexplained, wrong_sign, coasts, unconfirmed = (
+            estimator.unexplained, estimator.wrong_sign, estimator.coasts, estimator.unconfirmed
+        ) if isinstance(estimator, MovingHorizon) else (nan, False, False, False)
         return LoopFigures(
             p.get_float('sample_period'),
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
@@ -83,7 +83,8 @@ class Diagnosis:
             subscribers_of(node, control, io.topics.control_type), rivals,
             standing_down=loop.standing_down,
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
-            unexplained=unexplained, wrong_sign=wrong_sign, coasts=coasts, adapting=loop.adapting,
+            unexplained=unexplained, wrong_sign=wrong_sign, coasts=coasts,
+            unconfirmed=unconfirmed, adapting=loop.adapting,
             given=was_given(loop.estimate),
             silent_s=p.get_float('timeout.plant_output') if loop.silent else 0.0,
             on_timeout=p.get_str('on_timeout'),

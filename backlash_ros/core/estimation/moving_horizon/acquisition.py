@@ -43,7 +43,7 @@ def acquire(learning: Learning) -> Task:
                 learning, v[begin:], y[begin:], search.inherited, found if begin == 0 else None
             )
             if kept is not None:
-                learning.unconfirmed = kept.around.prior
+                learning.unconfirmed = True
                 return learning.go_on_from(kept, first + begin)
         if found is None or learning.usable(found, REPLACING) is None:
             learning.reason = Status.INCONSISTENT

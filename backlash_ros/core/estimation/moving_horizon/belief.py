@@ -9,7 +9,7 @@ import numpy as np
 
 from backlash_ros.core.estimation.constants import LASTING, PRECISE_GAP, RECOVERED, REPLACING
 from backlash_ros.core.estimation.fit.crossings import Crossings, difference
-from backlash_ros.core.estimation.fit.prior import beyond_chance, contradicts
+from backlash_ros.core.estimation.fit.prior import beyond_chance, contradicts, prior_of
 from backlash_ros.core.estimation.moving_horizon.acceptance import differs, is_precise
 from backlash_ros.core.estimation.moving_horizon.learning import Learning
 from backlash_ros.core.estimation.protocol import Estimate
@@ -58,13 +58,13 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
     wider = bool(np.any(np.diag(found.cov) > np.diag(held)))
     if beyond_chance(difference(found, estimate), found.cov + held):
         sure = proven and not (otherwise and around.error.count == 0)
-        if learning.unconfirmed is not None:
+        if learning.unconfirmed:
             alone = None if solution.alone is None else solution.alone.crossings
             sure = sure and alone is not None and is_precise(alone, fit.swing, REPLACING)
         return Belief.REPLACES if sure else Belief.REFUSED
     if around.inherited and not learning.expects_changes:
         # Samples that agree with what was known before do not make it less certain.
-        sure = learning.unconfirmed is None and not wider
+        sure = not learning.unconfirmed and not wider
         return Belief.REPLACES if sure else Belief.AGREES
     if otherwise and not learning.expects_changes:
         sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
@@ -78,26 +78,25 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
 def denied_by_samples(learning: Learning, estimate: Estimate) -> bool:
     """Ask the samples alone about what was learned before; return whether they deny it.
 
-    estimate: the published one.
-
-    Whether they confirm or support it is noted in `learning`.
+    estimate: what is published of it. Whether they confirm or support it is noted in `learning`.
     They deny what is off by more than an estimate may be uncertain at all. What contradicts
     them by less is neither denied nor confirmed: in a plant that is no backlash and no linear G
     they may be as wrong. So may they where something else moves y, which denies nothing.
     """
-    prior, (fit, solution, _) = learning.unconfirmed, learning.fit
+    fit, solution, _ = learning.fit
     learning.supported = False
-    if prior is None or not learning.reversed_often(fit):
+    if not learning.unconfirmed or not learning.reversed_often(fit):
         return False
     alone = solution.alone or fit.solve(alone=True)
     found = alone.crossings
     if found is None or not is_precise(found, fit.swing):
         return False
-    contradicted = contradicts(alone.of_theta, prior)
+    known = prior_of(estimate, learning.held)
+    contradicted = contradicts(alone.of_theta, known)
     otherwise = solution.moved_otherwise or learning.around.walk > 0.0
-    denied = contradicted and differs(found, prior) and not otherwise
+    denied = contradicted and differs(found, known) and not otherwise
     if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
-        learning.unconfirmed = None
+        learning.unconfirmed = False
     else:
         learning.supported = (
             not contradicted and is_precise(_furthest(estimate, found), fit.swing, LASTING)

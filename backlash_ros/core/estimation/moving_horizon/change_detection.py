@@ -142,8 +142,6 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         kept = yield from confirmed(learning, v, y, estimate, found)
         if kept is not None and kept.solution.rms <= bound \
                 and _has_changed(current, kept, whole):
-            if learning.unconfirmed is not None:
-                learning.unconfirmed = kept.around.prior
             return learning.go_on_from(kept, first)
     if whole is not None and changes and not any(
         _has_changed(current, found, whole) for found in changes

@@ -68,8 +68,8 @@ class Learning:
     that moved is reason to do so. contradicted_from: sample from which the fit does not hold;
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
     again. changed: what theta seems to have become. refitted: whether it was refitted since the
-    record contradicts itself. unconfirmed: what was learned before, as long as the samples merely
-    do not deny it; supported: whether they alone are precise enough to speak for it.
+    record contradicts itself. unconfirmed: whether the estimate was learned before, and the samples
+    merely do not deny it; supported: whether they alone are precise enough to speak for it.
     contradiction: fit of samples that nothing explains, around what was known; None while there are
     none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before. refined: the G
     that explains y better than that of the fit does without its error, None while there is none.
@@ -92,7 +92,7 @@ class Learning:
     next_try: int = 0
     refitted: bool = False
     changed: Prior | None = None
-    unconfirmed: Prior | None = None
+    unconfirmed: bool = False
     supported: bool = False
     contradiction: Fitted | None = None
     held: Array | None = None
@@ -163,7 +163,7 @@ class Learning:
     @property
     def confirmed(self) -> bool:
         """Whether the samples speak for what is published."""
-        known = self.unconfirmed is None or self.supported
+        known = not self.unconfirmed or self.supported
         return self.current is not None and known
 
     def drifts_more(self, solution: Solution, samples: int) -> bool:
@@ -183,7 +183,8 @@ class Learning:
         self.acquisition = Acquisition(self.record.end + FIRST_SEARCH, inherited)
         self.refit_at, self.moved_at = 0.0, 0
         self.refitted = False
-        self.contradicted_from = self.changed = self.unconfirmed = None
+        self.contradicted_from = self.changed = None
+        self.unconfirmed = False
         if inherited is None:
             self.contradiction = None
 
@@ -198,7 +199,7 @@ class Learning:
             self.refined = refined
         self.current, self.around = result, result.around
         if result.around.prior is None:
-            self.unconfirmed = None
+            self.unconfirmed = False
         self.record.forget_before(first)
         # As long as the gap may be another one the search for it goes on.
         growth = SEARCH_GROWTH if result.fit.gap_spread > 0.0 else GROWTH

@@ -157,6 +157,11 @@ class MovingHorizon:
         return self._coasts
 
     @property
+    def unconfirmed(self) -> bool:
+        """Whether the estimate was learned before, and the samples do not speak for it yet."""
+        return self._learning.current is not None and not self._learning.confirmed
+
+    @property
     def wrong_sign(self) -> bool:
         """Whether there is no estimate because y moves against v."""
         rejected = self._learning.acquisition.rejected
@@ -324,6 +329,8 @@ class MovingHorizon:
         found = believable(learning)
         belief = judged(learning, found, self.estimate)
         if belief is Belief.REPLACES and found is not None:
+            if learning.held is not None:
+                learning.unconfirmed = False  # it is that of the samples now
             self._take_over(found)
         if belief is Belief.REFUSED:
             learning.reason = Status.INCONSISTENT
