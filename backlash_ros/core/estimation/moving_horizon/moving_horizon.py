@@ -329,8 +329,6 @@ class MovingHorizon:
         found = believable(learning)
         belief = judged(learning, found, self.estimate)
         if belief is Belief.REPLACES and found is not None:
-            if learning.held is not None:
-                learning.unconfirmed = False  # it is that of the samples now
             self._take_over(found)
         if belief is Belief.REFUSED:
             learning.reason = Status.INCONSISTENT
