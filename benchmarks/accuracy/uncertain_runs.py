@@ -166,8 +166,11 @@ def longest(flags: NDArray[np.bool_]) -> int:
 
 
 def swaps_of(models: list[object], moves: Array, period_s: float) -> tuple[int, float, float]:
-    """How many swaps of G there were, and the worst `larger_moves` at one of them, when [s]."""
-    at = [k for k in range(1, len(models)) if models[k] is not models[k - 1]]
+    """How many swaps of G there were, and the worst `larger_moves` at one of them, when [s].
+
+    One that no move of v has followed yet does not count.
+    """
+    at = [k for k in range(1, min(len(models), len(moves))) if models[k] is not models[k - 1]]
     ratios = [larger_moves(moves, k, period_s) for k in at]
     worst = int(np.argmax(ratios)) if at else 0
     return (len(at), ratios[worst], at[worst] * period_s) if at else (0, nan, nan)
