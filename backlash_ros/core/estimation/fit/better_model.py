@@ -6,17 +6,12 @@ A fit explains y by G (1 + Delta); a structure can only be designed for a G of l
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit.low_order import (
-    SHIFTS,
-    OutputError,
-    low_order,
-    memory_of,
-)
+from backlash_ros.core.estimation.fit.low_order import OutputError, low_order, memory_of
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.solution import Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
@@ -33,16 +28,15 @@ FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
 
 def better_model(
     v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace,
-    shifts: Sequence[int] = SHIFTS,
 ) -> Generator[None, None, StateModel | None]:
     """Return the G that fits y best, given u of this fit of v (N,) and y (N,), nan where lost.
 
-    None where no G that may be told comes out. shifts: as in `low_order`.
+    None where no G that may be told comes out.
     """
     problem = _problem(v, y, fit, solution, pace)
     yield
     model, error = fit.model.transfer_function, fit.around.error
-    better = yield from low_order(model, error, problem, solution.posterior.scale, shifts)
+    better = yield from low_order(model, error, problem, solution.posterior.scale)
     return StateModel(better) if better is not None and _allowed(better) else None
 
 
@@ -53,17 +47,19 @@ def refined_model(
 
     The fit itself stays around the G that it has: it knows the rest of the error as well.
     """
+    model, error = fit.model.transfer_function, fit.around.error
     if not solution.m > 0.0:
         return present
-    better = yield from better_model(v, y, fit, solution, pace, shifts=(0,))
+    problem = _problem(v, y, fit, solution, pace)
+    yield
+    better = yield from low_order(model, error, problem, solution.posterior.scale, shifts=(0,))
     if better is None:
         return present
-    count = fit.around.error.count
-    problem = _problem(v, y, fit, solution, pace)
-    gained = problem.misfit(present.transfer_function) - problem.misfit(better.transfer_function)
+    gained = problem.misfit(present.transfer_function) - problem.misfit(better)
     # What as many coefficients bring by chance would only make the structure follow the noise, and
     # what no G explains is no better explained for that.
-    return better if gained > 2.0 * count * solution.inflation else present
+    chance = 2.0 * error.count * solution.inflation
+    return StateModel(better) if gained > chance and _allowed(better) else present
 
 
 def _problem(v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace) -> OutputError:

@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 
 SHIFTS = (0, 1, 2, -1)  # samples of delay more than G has that are compared
 GAUSS_NEWTON_STEPS = 10  # Gauss-Newton steps, those that were too long included
+STANDS = 0.02  # standard deviations by which the coefficients may still move
 SHORTER = 0.3  # share of a step that is tried where the whole step leads uphill
 # --- guards
 NO_TAP = 1e-6  # share of the largest tap below which the last ones are none
@@ -64,10 +65,10 @@ class OutputError:
     def misfit(self, model: TransferFunction) -> float:
         """Twice the negative log-likelihood of another G; its gain at rest is free."""
         poles = np.trim_zeros(model.denominator, 'b')
-        answer = lfilter(model.numerator[1:], poles, self._u)[self._rows] * self._root
+        answer = lfilter(model.numerator[1:], poles, self._u)[self._rows]
         # Where nothing but free responses is left of y or of u, there is nothing to compare.
-        y = self._without_free(self._y * self._root, poles)
-        answer = self._without_free(answer, poles)
+        both = np.column_stack([self._y, answer]) * self._root[:, None]
+        y, answer = self._without_free(both, poles).T
         power = float(answer @ answer)
         gain = float(answer @ y) / power if power > 0.0 else 0.0
         left = y - gain * answer
@@ -158,9 +159,9 @@ def _fit(
             length *= SHORTER
             continue
         xi, length, best = trial, 1.0, (cost, b, a)
-        slopes = problem.slopes(a, answer, delay, taps, prior)
-        step = np.linalg.lstsq(
-            np.concatenate([slopes, np.eye(len(xi))]), np.append(residual, -xi), rcond=None
-        )[0]
+        slopes = np.concatenate([problem.slopes(a, answer, delay, taps, prior), np.eye(len(xi))])
+        step = np.linalg.lstsq(slopes, np.append(residual, -xi), rcond=None)[0]
+        if np.linalg.norm(slopes @ step) <= STANDS:
+            break
         yield
     return best
