@@ -141,6 +141,8 @@ def test_ill_conditioned_data_neither_break_the_filters_nor_mislead(
     assert np.isfinite(run.rows[:, :10]).all()
     assert (run.column('status')[-1] == Status.TRACKING) == learns
     if learns:
+        # Rounding would delay the first estimate at 1 kHz: y is small beside what integrates.
+        assert (run.column('status')[:500] == Status.TRACKING).any()
         std = np.array([run.column(f'std_{name}')[-1] for name in ('m', 'c_r', 'c_l')])
         error = np.abs(estimates(run)[-1] - TRUTH)
         assert np.all(error <= 5.0 * std + 1e-5 * np.abs(TRUTH))

@@ -116,9 +116,8 @@ class Comparison:
     ) -> None:
         self._v, self._model, self._error = v, model, error
         self._told_std = told_std
-        self._kept = np.flatnonzero(np.isfinite(y))
-        self._root = np.sqrt(weights[self._kept])
-        self.rows = float(weights[self._kept].sum())
+        weights = np.where(np.isfinite(y), weights, 0.0)
+        self._root = np.sqrt(weights)
         n = model.order
         inputs = np.zeros((n + 1, len(v)))
         inputs[n] = 1.0
@@ -127,11 +126,11 @@ class Comparison:
         common = self._filtered(inputs, states)
         if error.leak:
             before = np.append(0.0, np.cumsum(held(y, 0.0))[:-1])
-            common = np.vstack([common, before[self._kept] * self._root])
+            common = np.vstack([common, before * self._root])
         self._basis = np.linalg.qr(common.T)[0]
-        self._y = self._projected((y[self._kept] * self._root)[None, :])[0]
+        self._y = self._projected(np.where(weights > 0.0, y, 0.0) * self._root)
         self._energy = float(self._y @ self._y)
-        self._freedom = self.rows - len(common) + NOISE_WEIGHT
+        self._freedom = float(weights.sum()) - len(common) + NOISE_WEIGHT
         self._told = NOISE_WEIGHT * told_std**2
         self.null = float(self._log_likelihood(self._energy + self._told))
 
@@ -146,7 +145,7 @@ class Comparison:
         ]
         best: dict[float, Candidate] = {}
         while pairs:
-            count = pace.pieces(len(self._v))
+            count = pace.pieces(len(self._v) * max(self._error.count, 1))
             part, pairs = np.array(pairs[:count]), pairs[count:]
             evidence, slopes = self._compare(part[:, 0], part[:, 1])
             for (gap, start), value, m in zip(part, evidence, slopes, strict=True):
@@ -158,7 +157,7 @@ class Comparison:
     def _compare(self, gaps: Array, starts: Array) -> tuple[Array, Array]:
         """Evidence and slope of each pair, shape (H,)."""
         p = plays(self._v, gaps, starts)
-        moved = self._projected(self._filtered(p.T))
+        moved = self._projected(self._filtered(p))
         energy = np.einsum('hn,hn->h', moved, moved)
         still = energy <= 0.0  # v never engaged: all is in common
         energy[still] = 1.0
@@ -166,15 +165,14 @@ class Comparison:
         squares = np.maximum(self._energy - slopes**2 * energy, 0.0)
         if not self._error.count:
             return self._log_likelihood(squares + self._told), slopes
-        jumps = np.diff(p, axis=0, prepend=starts[None, :]).T
-        direct = self._answers(jumps)
-        columns = self._error.filtered(direct)[:, self._kept]
-        columns = np.swapaxes(columns @ self._error.spread, 1, 2) * self._root
-        columns = columns - (columns @ self._basis) @ self._basis.T
-        along = np.einsum('hkn,hn->hk', columns, moved) / energy[:, None]
-        columns = columns - along[:, :, None] * moved[:, None, :]
-        gram = columns @ np.swapaxes(columns, 1, 2)
-        s, back = np.linalg.eigh(gram)
+        direct = self._answers(np.diff(p, prepend=starts[:, None]))
+        # Products of the columns alone would lose in rounding what differs from u and from m.
+        columns = self._error.spread.T @ np.swapaxes(self._error.filtered(direct), 1, 2)
+        columns *= self._root
+        columns -= (columns @ self._basis) @ self._basis.T
+        along = columns @ moved[:, :, None] / energy[:, None, None]
+        columns -= along * moved[:, None, :]
+        s, back = np.linalg.eigh(columns @ np.swapaxes(columns, 1, 2))
         target = columns @ self._y
         s = np.maximum(s, 1e-30)
         z2 = (np.einsum('hkj,hk->hj', back, target)) ** 2 / s
@@ -201,7 +199,7 @@ class Comparison:
         return answers
 
     def _filtered(self, inputs: Array, states: Array | None = None) -> Array:
-        return np.asarray(self._answers(inputs, states)[:, self._kept] * self._root)
+        return np.asarray(self._answers(inputs, states) * self._root)
 
     def _projected(self, rows: Array) -> Array:
         return np.asarray(rows - (rows @ self._basis) @ self._basis.T)

@@ -77,13 +77,14 @@ class ErrorModel:
         """Responses of the F_i to signals (..., N) that were 0 before, shape (..., N, K)."""
         once = lfilter([self.gain], self.stable, direct)
         twice = lfilter([self.gain], self.stable, once)
-        out = np.zeros((*direct.shape, self.count))
-        column = 0
+        count = direct.shape[-1]
+        out = np.zeros((*direct.shape[:-1], self.count, count))  # in the order it is written in
+        row = 0
         for signal, delays in ((direct, 2), (once, self.taps), (twice, self.taps)):
             for j in range(delays):
-                out[..., j:, column] = signal[..., :signal.shape[-1] - j]
-                column += 1
-        return out
+                out[..., row, j:] = signal[..., :count - j]
+                row += 1
+        return np.swapaxes(out, -1, -2)
 
     def responses(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """(1 - z^-1) F_i at the points z (M,), shape (M, K)."""

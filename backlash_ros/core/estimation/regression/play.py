@@ -81,7 +81,7 @@ def play(v: Array, gap: float, p0: float) -> tuple[Array, NDArray[np.int8]]:
 
 
 def plays(v: Array, gaps: Array, p0: Array) -> Array:
-    """Play output for many gaps (H,) and starts (H,), shape (N, H).
+    """Play output for many gaps (H,) and starts (H,), shape (H, N).
 
     Only where v turns it has to be stepped: while v rises, p = max(p, v) with the p of the turn
     before; while it falls, p = min(p, v + gap).
@@ -89,14 +89,13 @@ def plays(v: Array, gaps: Array, p0: Array) -> Array:
     rising = np.diff(v, prepend=v[0]) > 0.0
     last: Array = np.append(np.flatnonzero(rising[1:] != rising[:-1]), len(v) - 1)
     held = np.minimum(np.maximum(p0, v[0]), v[0] + gaps)
-    before = np.empty((len(last), len(gaps)))
+    before = np.empty((len(gaps), len(last)))
     for k, (value, up) in enumerate(zip(v[last].tolist(), rising[last].tolist(), strict=True)):
-        before[k] = held
+        before[:, k] = held
         held = np.maximum(held, value) if up else np.minimum(held, value + gaps)
-    p = np.repeat(before, np.diff(last, prepend=-1), axis=0)
-    left = v[:, None] + gaps
-    np.maximum(p, v[:, None], out=p, where=rising[:, None])
-    np.minimum(p, left, out=p, where=~rising[:, None])
+    p = np.repeat(before, np.diff(last, prepend=-1), axis=1)
+    np.maximum(p, v, out=p, where=rising)
+    np.minimum(p, v + gaps[:, None], out=p, where=~rising)
     return p
 
 
