@@ -51,53 +51,57 @@ class OutputError:
     ) -> None:
         self.integrators = int(np.count_nonzero(np.abs(model.poles - 1.0) < ON_CIRCLE))
         self.integrate = np.atleast_1d(np.poly([1.0] * self.integrators))
-        compared = np.flatnonzero(weights > 0.0)
-        self._rows = len(before) + compared
-        self._u, self._y = np.concatenate([before, u]), y[compared]
-        self._root = np.sqrt(weights[compared]) / noise_std
+        self._root = np.sqrt(weights) / noise_std
+        self._y = np.where(weights > 0.0, y, 0.0) * self._root
+        self._u, self._first = np.concatenate([before, u]), len(before)
 
-    def residual(self, b: Array, a: Array, delay: int) -> tuple[Array, Array]:
-        """Weighted residual without the free response, and the response (N,)."""
-        answer = lfilter(np.append(np.zeros(delay - 1), b), self._poles(a), self._u)
-        rows = (self._y - answer[self._rows]) * self._root
-        return self._without_free(rows, self._poles(a)), answer
+    def poles(self, a: Array) -> Array:
+        """Denominator of G for that of its stable part."""
+        return np.asarray(np.convolve(a, self.integrate), dtype=np.float64)
+
+    def free_responses(self, poles: Array) -> Array:
+        """Orthonormal basis of the weighted free responses of G, shape (N, ..)."""
+        free = lfilter([1.0], poles, np.eye(len(poles) - 1, len(self._u)))
+        return np.asarray(np.linalg.qr(self._weighted(free).T)[0])
+
+    def response(self, b: Array, poles: Array, delay: int) -> Array:
+        """Response of G to u and what was before it."""
+        return np.asarray(lfilter(np.append(np.zeros(delay - 1), b), poles, self._u))
+
+    def residual(self, answer: Array, free: Array) -> Array:
+        """Weighted residual of a response without the free responses, shape (N,)."""
+        return _without(free, self._y - self._weighted(answer))
 
     def misfit(self, model: TransferFunction) -> float:
         """Twice the negative log-likelihood of another G; its gain at rest is free."""
         poles = np.trim_zeros(model.denominator, 'b')
-        answer = lfilter(model.numerator[1:], poles, self._u)[self._rows]
+        answer = self._weighted(self.response(model.numerator[1:], poles, 1))
         # Where nothing but free responses is left of y or of u, there is nothing to compare.
-        both = np.column_stack([self._y, answer]) * self._root[:, None]
-        y, answer = self._without_free(both, poles).T
+        y, answer = _without(self.free_responses(poles), np.stack([self._y, answer]))
         power = float(answer @ answer)
         gain = float(answer @ y) / power if power > 0.0 else 0.0
         left = y - gain * answer
         return float(left @ left)
 
-    def slopes(self, a: Array, answer: Array, delay: int, taps: int, prior: Array) -> Array:
-        """Derivatives of the weighted response in the directions of the prior, shape (N, ..)."""
+    def slopes(self, a: Array, answer: Array, delay: int, taps: int, free: Array) -> Array:
+        """Derivatives of the weighted response by the taps and by a, shape (.., N)."""
         n, count = len(a) - 1, len(self._u)
-        by_input = lfilter([1.0], self._poles(a), self._u)
+        by_input = lfilter([1.0], self.poles(a), self._u)
         by_output = lfilter([1.0], a, answer)
-        columns = np.zeros((count, taps + n))
+        slopes = np.zeros((taps + n, count))
         for j in range(taps):
-            columns[delay - 1 + j:, j] = by_input[:count - delay + 1 - j]
+            slopes[j, delay - 1 + j:] = by_input[:count - delay + 1 - j]
         for i in range(1, n + 1):
-            columns[i:, taps + i - 1] = -by_output[:-i]
-        rows = (columns[self._rows] @ prior) * self._root[:, None]
-        return self._without_free(rows, self._poles(a))
+            slopes[taps + i - 1, i:] = -by_output[:-i]
+        return _without(free, self._weighted(slopes))
 
-    def _poles(self, a: Array) -> Array:
-        """Denominator of G for that of its stable part."""
-        return np.asarray(np.convolve(a, self.integrate), dtype=np.float64)
+    def _weighted(self, signals: Array) -> Array:
+        return np.asarray(signals[..., self._first:] * self._root)
 
-    def _without_free(self, rows: Array, denominator: Array) -> Array:
-        order = len(denominator) - 1
-        if order == 0:
-            return rows
-        free = lfilter([1.0], denominator, np.eye(order, len(self._u)))
-        basis = np.linalg.qr(free[:, self._rows].T * self._root[:, None])[0]
-        return np.asarray(rows - basis @ (basis.T @ rows))
+
+def _without(basis: Array, signals: Array) -> Array:
+    """What is left of signals (.., N) beside an orthonormal basis (N, ..)."""
+    return np.asarray(signals - (signals @ basis) @ basis.T)
 
 
 def low_order(
@@ -153,15 +157,18 @@ def _fit(
         b, a = value[:taps], np.append(1.0, value[taps:])
         cost = np.inf
         if np.abs(np.roots(a)).max(initial=0.0) < 1.0 - ON_CIRCLE:
-            residual, answer = problem.residual(b, a, delay)
+            poles = problem.poles(a)
+            free, answer = problem.free_responses(poles), problem.response(b, poles, delay)
+            residual = problem.residual(answer, free)
             cost = float(residual @ residual) + float(trial @ trial)
         if not cost < best[0]:
             length *= SHORTER
             continue
         xi, length, best = trial, 1.0, (cost, b, a)
-        slopes = np.concatenate([problem.slopes(a, answer, delay, taps, prior), np.eye(len(xi))])
-        step = np.linalg.lstsq(slopes, np.append(residual, -xi), rcond=None)[0]
-        if np.linalg.norm(slopes @ step) <= STANDS:
+        slopes = problem.slopes(a, answer, delay, taps, free)
+        rows = np.concatenate([slopes.T @ prior, np.eye(len(xi))])
+        step = np.linalg.lstsq(rows, np.append(residual, -xi), rcond=None)[0]
+        if np.linalg.norm(rows @ step) <= STANDS:
             break
         yield
     return best

@@ -137,14 +137,15 @@ def searched(
     )
     if not found.candidates or found.candidates[0].evidence < found.null + ENGAGED:
         return None
+    # Those far away only tell whether the choice is clear. With an error of G the evidence is that
+    # of the best error for each gap: too flat to tell.
+    tells = around.error.count == 0
     fits = []
-    for candidate in _apart(found.candidates):
+    for candidate in _apart(found.candidates, FAR_CANDIDATES if tells else 0):
         start = Start(candidate.gap, candidate.start)
         fits.append((yield from fitted(v, y, around, start, candidate.m, pace)))
-    # Those far away only tell whether the choice is clear.
     best = most_likely(fits[:CANDIDATES])
-    # With an error of G the evidence is that of the best error for each gap: too flat to tell.
-    if not around.error.count:
+    if tells:
         best = best._replace(decided=not any(_rivals(best, other) for other in fits))
     assert found.comparison is not None
     spread = yield from gap_spread(
@@ -184,10 +185,10 @@ def _rivals(best: Fitted, other: Fitted) -> bool:
     )
 
 
-def _apart(candidates: list[Candidate]) -> list[Candidate]:
-    """The best candidates whose gaps are no neighbours, and the best ones far from them."""
+def _apart(candidates: list[Candidate], far: int) -> list[Candidate]:
+    """The best candidates whose gaps are no neighbours, and `far` of those far from them."""
     chosen: list[Candidate] = []
-    for least, count in ((NEIGHBOURS, CANDIDATES), (ZOOM[0], CANDIDATES + FAR_CANDIDATES)):
+    for least, count in ((NEIGHBOURS, CANDIDATES), (ZOOM[0], CANDIDATES + far)):
         for candidate in candidates:
             if len(chosen) == count:
                 break
