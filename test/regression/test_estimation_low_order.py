@@ -110,6 +110,14 @@ def test_an_exact_model_stays_what_it_is() -> None:
     assert off(model, resonance()) <= 1e-3
 
 
+def test_a_delay_alone_has_no_free_response() -> None:
+    told = TransferFunction([0.5], [1.0, 0.0])
+    true = TransferFunction([0.5], [1.0, 0.0, 0.0])
+    model = learned(true, told)
+    assert model is not None
+    assert off(model, true) <= 1e-3
+
+
 def test_prior_holds_where_rounding_makes_another_pole_of_an_integrator() -> None:
     told, other = (TransferFunction([0.1], np.poly(poles).tolist())
                    for poles in ([0.9, 0.8], [0.9, 0.8, 0.7]))

@@ -61,7 +61,8 @@ class OutputError:
 
     def free_responses(self, poles: Array) -> Array:
         """Orthonormal basis of the weighted free responses of G, shape (N, ..)."""
-        free = lfilter([1.0], poles, np.eye(len(poles) - 1, len(self._u)))
+        order = len(poles) - 1
+        free = lfilter([1.0], poles, np.eye(max(order, 1), len(self._u)))[:order]
         return np.asarray(np.linalg.qr(self._weighted(free).T)[0])
 
     def response(self, b: Array, poles: Array, delay: int) -> Array:
