@@ -29,14 +29,15 @@ def next_task(learning: Learning, estimate: Estimate) -> Task | None:
     wanted = fewest if contradicted else min(max(fit.length // BLOCK_SHARE, fewest), most)
     if learning.waiting >= wanted:
         return take_block(learning)
-    due = record.end >= learning.next_try
     if contradicted:
-        return reconsider(learning, estimate) if due else None
-    moved = abs(solution.gap - fit.start.gap) > MOVED * solution.std_gap
-    if fit.length >= learning.refit_at or (moved and fit.length >= learning.moved_at):
+        return reconsider(learning, estimate) if record.end >= learning.next_try else None
+    if fit.length >= learning.refit_at or (
+        fit.length >= learning.moved_at
+        and abs(solution.gap - fit.start.gap) > MOVED * solution.std_gap
+    ):
         return refit(learning)
     aged = solution.correlation > 0.0 or learning.drifts_more(solution, fit.length)
-    if not (aged and due):
+    if not aged or record.end < learning.next_try:
         return None
     # What contradicts may be a G that went astray: the plant has changed only where the best fit
     # of all says so.
