@@ -65,10 +65,10 @@ def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate(seed: 
     rng = np.random.default_rng(seed)
     step, acting = loop.plant.step, 0.0
 
-    def loses_commands(v: float) -> None:
+    def loses_commands(v: float) -> float:
         nonlocal acting
         acting = acting if loop.plant.sample >= 300 and rng.random() < 0.3 else v
-        step(acting)
+        return step(acting)
 
     loop.plant.step = loses_commands  # type: ignore[method-assign]
     record = loop.run(1500)

@@ -124,14 +124,14 @@ class WindowFit:
         And which of them are outliers. nan where y was lost.
         """
         posterior = solution.posterior
-        var = np.einsum('np,pq,nq->n', rows, posterior.cov, rows) * solution.inflation + 1.0
+        var = np.einsum('np,np->n', rows @ posterior.cov, rows) * solution.inflation + 1.0
         squares: Array = (y - rows @ posterior.mean) ** 2 / (var * posterior.noise_std**2)
         return squares, squares > GATE**2
 
     def _advance(self, labels: Labels) -> None:
         sides = labels.right - labels.left
         before = self._play.side
-        changes = int(np.count_nonzero(np.diff(sides, prepend=float(before))))
+        changes = np.count_nonzero(np.diff(sides)) + int(sides[0] != before)
         # The first engagement is no reversal.
         self.reversals += changes - int(before == 0 and changes > 0)
         self._play = Start(
@@ -260,8 +260,7 @@ class WindowFit:
     def _theta_now(self) -> Array:
         """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""
         layout = self.layout
-        now = np.zeros((3, layout.unknowns))
-        now[:, layout.theta] = np.eye(3)
+        now = np.eye(3, layout.unknowns, layout.theta.start)
         now[1:, layout.walk] = -self._regressors.heights
         return now
 

@@ -63,7 +63,8 @@ def labels_from(
     before = last < 0
     anchor = np.where(before, v_a, v[last])
     sign = np.where(before, side, sides[last])
-    moves = np.diff(p, prepend=p0)
+    moves = np.empty(count)
+    moves[:1], moves[1:] = p[:1] - p0, p[1:] - p[:-1]
     jump = np.zeros(count)
     if side == 0 and len(engaged):
         first = engaged[0]
@@ -127,10 +128,12 @@ class Start(NamedTuple):
 
     def forgotten_after(self, v: Array) -> int:
         """Samples of v (N,) after which p says nothing any more; N + 1 if it always does."""
+        if self.side != 0:
+            return len(v) + 1
         low = float(v[0])
         ends = (play(v, self.gap, p)[0] for p in (low, low + self.gap))
         same = np.flatnonzero(np.equal(*ends))
-        return int(same[0]) + 1 if same.size and self.side == 0 else len(v) + 1
+        return int(same[0]) + 1 if same.size else len(v) + 1
 
     def with_gap(self, gap: float, v: Array) -> Start:
         """The same for another gap, before v (N,): a side that was engaged stays so."""
