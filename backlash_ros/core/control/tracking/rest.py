@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import Enum, auto
-from math import inf, sqrt
+from math import dist, hypot, inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +68,7 @@ class Rest:
         self.shrinkage = 0.0  # standard deviations by which the crossings are shrunk for it
         self._noise_std = noise_std
         self.use(design)
-        self._largest_square = 0.0  # square of the largest |x*| so far
+        self._largest = 0.0  # of |x*| so far
         self._limit = 0.0  # tolerance in use
         self._rested = 0  # samples for which the trajectory has rested
         self._turns, self._side = 0, Region.GAP  # since x* rests; line in use the sample before
@@ -85,7 +85,7 @@ class Rest:
     def go_on_from(self, other: Rest) -> None:
         """Take over where another one of the same model rests."""
         self.mode, self.u_d, self.shrinkage = other.mode, other.u_d, other.shrinkage
-        self._largest_square, self._limit = other._largest_square, other._limit
+        self._largest, self._limit = other._largest, other._limit
         self._pull = other._pull
         self._rested, self._near = other._rested, other._near
         self._turns, self._side = other._turns, other._side
@@ -101,13 +101,10 @@ class Rest:
         be no further than that from u*, whatever x_hat says.
         """
         self._most = most
-        self._largest_square = max(self._largest_square, dot(x, x))
-        least = SHARE * sqrt(self._largest_square)
+        self._largest = max(self._largest, hypot(*x))
+        least = SHARE * self._largest
         tolerance = max(TOLERANCE * self._noise_std, least)
-        motion = 0.0
-        for now, then in zip(x, onward, strict=True):
-            motion += (then - now) ** 2
-        if motion > (STEADY * tolerance) ** 2:
+        if dist(x, onward) > STEADY * tolerance:
             self._low, self._high = inf, -inf
             self._moves_on()
         elif not self._is_still(window):
@@ -139,7 +136,7 @@ class Rest:
         return still
 
     def _mode_for(self, deviation: Sequence[float]) -> Mode:
-        size = sqrt(dot(deviation, deviation))
+        size = hypot(*deviation)
         # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
         # it is due again when y has stayed where it belongs for a while, and is pushed away.
         self._near = self._near + 1 if size <= self._limit else 0

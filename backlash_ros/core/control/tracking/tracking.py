@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from math import isnan, sqrt
+from math import isnan, nan, sqrt
 from operator import sub
 
 import numpy as np
@@ -86,8 +86,10 @@ class Tracking:
         self._scale = 0.0  # that, or the u that the gap takes
         self._bounded_before = False  # whether feedback has met its bound the sample before
         self._width = 1.0  # bound on feedback in scales, while the backlash is unknown
-        self._known = False  # whether the estimate comes from data
-        self._slope: float | None = None  # that of the newest estimate that the law stood by
+        self._estimate: Estimate | None = None  # the newest one; what follows is made of it
+        self._known = False  # whether it comes from data
+        self._slope = nan  # that of the newest one that the law stood by
+        self._crossings = 0.0, 0.0  # shrunk by its uncertainty
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
         self._in_use_for = 0  # samples since an estimate is known
         self._engaged_for = 0  # samples since v has crossed the gap
@@ -114,8 +116,9 @@ class Tracking:
     def _use(self, chosen: TrackingDesign) -> None:
         model, gains, feedback = chosen.model, chosen.gains, chosen.feedback.gain
         self._design = chosen
-        self._a: list[list[float]] = model.a.tolist()
-        self._b: list[float] = model.b.tolist()
+        self._transition: list[tuple[list[float], float]] = list(
+            zip(model.a.tolist(), model.b.tolist(), strict=True)
+        )
         self._k: list[float] = gains.state.tolist()
         self._schedule: list[list[float]] = [gain.tolist() for gain in (feedback, *chosen.schedule)]
         # What an error of y calls for that would not matter at rest: never too much feedback.
@@ -149,6 +152,8 @@ class Tracking:
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
         estimate, gains = inputs.estimate, self._design.gains
+        if estimate is not self._estimate:
+            self._note_estimate(estimate)
         first = self._references.empty
         if first:
             self._begin(inputs)
@@ -180,16 +185,16 @@ class Tracking:
         if bounded:
             feedback = min(max(feedback, -most), most) if feedback == feedback else 0.0
         u_d = ideal - feedback
-        rest, slope, handed_over = self._rest, self._slope_of(estimate), 0.0
+        rest, handed_over = self._rest, 0.0
         if self._resumes or self._handover:
-            u_d, handed_over = self._with_handover(u_d, slope, estimate, inverse)
+            u_d, handed_over = self._with_handover(u_d, inverse)
         before = rest.mode
         mode = rest.decide(
             inputs.y, window, x, onward, deviation,
             None if x_cov is None else self._x_std, inverse.side,
             most if self._trusted_for > 0 else self._acquisition_bound,
         )
-        shrinkage = self._shrinkage
+        crossings = self._crossings
         if mode is Mode.FOLLOW:
             inverse.widen_band(self._noise_band(ideal, inverse))
         else:
@@ -197,30 +202,27 @@ class Tracking:
                 rest.step(estimate, ideal, deviation, inverse, mode is not before)
             elif before is Mode.FOLLOW:
                 rest.stay(ideal)
-            u_d, shrinkage = rest.u_d, rest.shrinkage
+            u_d = rest.u_d
+            crossings = shrunk_crossings(estimate, rest.shrinkage, self._known)
             inverse.widen_band(0.0)
         # Whatever has made u_d: nothing leads it further from what the reference asks for.
         reach = most if self._trusted_for > 0 else LARGEST_IN_ACQUISITION * self._scale
         reach += abs(handed_over)
         u_d = min(max(u_d, ideal - reach), ideal + reach)
         self._ideal, self._x, self._u_d = ideal, onward, u_d
-        c_r, c_l = shrunk_crossings(estimate, shrinkage, self._known)
         side = inverse.side
-        v = inverse.step(u_d, slope, c_r, c_l)
+        v = inverse.step(u_d, self._slope, *crossings)
         crosses = inverse.taking_up or inverse.side is not side
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         if gains.integral:
             self._integrate(window.item(0), inputs.y, x[0], trusted, bounded or inverse.limited)
         return Command(u_d, v, 0.0)
 
-    def _with_handover(
-        self, u_d: float, slope: float, estimate: Estimate, inverse: BacklashInverse,
-    ) -> tuple[float, float]:
+    def _with_handover(self, u_d: float, inverse: BacklashInverse) -> tuple[float, float]:
         """u_d with what was handed over to this loop, which fades, and how much that is."""
         if self._resumes:
             self._resumes = False
-            crossings = shrunk_crossings(estimate, self._shrinkage, self._known)
-            together = inverse.resume(slope, *crossings)
+            together = inverse.resume(self._slope, *self._crossings)
             handed_over = together - u_d
             self._rest.stay(together)
         else:
@@ -269,7 +271,7 @@ class Tracking:
         ideal = -dot(self._k, x) - float(gains.preview.dot(window))
         if gains.integral:
             ideal -= gains.integral * self._q
-        return ideal, [dot(row, x) + b * ideal for row, b in zip(self._a, self._b, strict=True)]
+        return ideal, [dot(row, x) + b * ideal for row, b in self._transition]
 
     def _begin(self, inputs: ControlInput) -> None:
         start, noise = inputs.y, OFF * self._noise_std
@@ -325,7 +327,6 @@ class Tracking:
         Without deviations nobody knows how far it may be relied on, and feedback stays that of the
         acquisition.
         """
-        self._known = _is_known(estimate, self._known)
         if not (self._known and estimate.learned):
             self._trusted_for = self._in_use_for = 0
             return False
@@ -337,15 +338,14 @@ class Tracking:
             self._trusted_for += self._sharp_counts if sharp else 1
         return self._trusted_for >= TRUSTED_AFTER
 
-    def _slope_of(self, estimate: Estimate) -> float:
-        """The slope to invert.
-
-        On the way to its first agreement with the data the m of a law without deviations may be
-        anywhere within its bounds.
-        """
-        if self._slope is None or estimate.learned or estimate.status is Status.TRACKING:
+    def _note_estimate(self, estimate: Estimate) -> None:
+        self._estimate = estimate
+        self._known = _is_known(estimate, self._known)
+        self._crossings = shrunk_crossings(estimate, self._shrinkage, self._known)
+        # On the way to its first agreement with the data the m of a law without deviations may be
+        # anywhere within its bounds.
+        if isnan(self._slope) or estimate.learned or estimate.status is Status.TRACKING:
             self._slope = estimate.m
-        return self._slope
 
     def _note_covariance(self, x_cov: Array | None) -> None:
         self._x_cov = x_cov
