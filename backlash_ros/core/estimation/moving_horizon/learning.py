@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from math import inf
+from math import inf, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -203,7 +203,7 @@ class Learning:
         self.record.forget_before(first)
         # As long as the gap may be another one the search for it goes on.
         growth = SEARCH_GROWTH if result.fit.gap_spread > 0.0 else GROWTH
-        self.refit_at = min(growth * result.fit.length, LONGEST)
+        self.refit_at = _next_length(result.fit.length, growth)
         self.moved_at = result.fit.length + BLOCK[1]
         self.contradicted_from = self.changed = self.acquisition.rejected = None
         self.contradiction = None
@@ -223,3 +223,11 @@ class Learning:
         self.current = Fitted(fit, fit.solve())
         self.refit_at = FIRST_SEARCH
         self.contradicted_from = None
+
+
+def _next_length(length: int, growth: float) -> float:
+    """Length of the record at its next refit, in equal steps that end at the longest one."""
+    if length >= LONGEST:
+        return LONGEST
+    steps = max(round(log(LONGEST / length) / log(growth)), 1)
+    return float(length * (LONGEST / length) ** (1.0 / steps))
