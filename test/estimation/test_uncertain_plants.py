@@ -28,6 +28,9 @@ from accuracy.uncertain_cases import (
 from accuracy.uncertain_runs import NAMES, longest, run_job, swaps_of
 
 from backlash_ros.core.assembly import build_controller, build_model, build_true_model
+from backlash_ros.core.estimation.constants import BLOCK
+from backlash_ros.core.estimation.fit.relabelling import searched
+from backlash_ros.core.estimation.moving_horizon import acquisition
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash
@@ -185,3 +188,21 @@ def test_load_coasts_through_the_gap_until_friction_stops_it() -> None:
     for end in (weak[-1], strong[-1], dry[-1]):
         assert u - 0.02 < end < u + 0.1
     assert dry[-100:].std() == 0.0
+
+
+def test_what_was_found_twice_is_not_searched_again_before_v_has_turned(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searches: list[int] = []  # samples of each
+
+    def counted(v: np.ndarray, *others: object) -> object:
+        searches.append(len(v))
+        return searched(v, *others)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(acquisition, 'searched', counted)
+    p = load_config(SHIPPED / 'geared_motor.yaml')
+    record = build_closed_loop(Parameters({**p, 'structure': 'tracking'})).run(300)
+    [first, *_] = np.flatnonzero(record.column('status') == Status.TRACKING)
+    # It is not late for that: whether v has turned was looked at meanwhile.
+    assert searches[-1] <= first <= searches[-1] + 2
+    assert np.diff(searches)[-1] > 2 * BLOCK[0]

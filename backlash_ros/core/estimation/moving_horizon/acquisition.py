@@ -31,10 +31,15 @@ def acquire(learning: Learning) -> Task:
     """Look for the backlash in the newest samples."""
     record, search = learning.record, learning.acquisition
     end = record.end
-    search.next_at = end + max(int(len(record) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
     first = max(record.first, end - learning.searched)
-    record.forget_before(first)
     v, y = record.since(first)
+    waiting = search.one_sided if end < search.again_at and first == record.first else None
+    if waiting is not None and not learning.reversed_often(waiting.labels(v)):
+        search.next_at = end + BLOCK[0]
+        return False
+    search.next_at = search.again_at = end + max(int(len(record) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
+    search.one_sided = None
+    record.forget_before(first)
     around = learning.free._replace(walk=learning.told_walk)
     found = yield from searched(v, y, around, learning.widest, learning.pace)
     if search.inherited is not None:
@@ -56,8 +61,11 @@ def acquire(learning: Learning) -> Task:
     search.candidate = found.solution.of_theta
     search.next_at = end + BLOCK[0]
     again = before is not None and not contradicts(search.candidate, before)
-    if again and found.decided and found.fit.reversals > 0 and learning.reversed_often(found.fit):
+    often = learning.reversed_often(found.fit)
+    if again and found.decided and found.fit.reversals > 0 and often:
         return learning.go_on_from(found, first)
+    if again and not often and search.inherited is None:
+        search.one_sided = found.fit.start
     return False
 
 

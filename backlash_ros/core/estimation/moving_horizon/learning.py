@@ -34,7 +34,7 @@ from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.moving_horizon.acceptance import usable
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
-from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.estimation.regression.play import Labels, Start
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -49,12 +49,16 @@ class Acquisition:
 
     next_at: sample at which to search. inherited: what is believed unless the samples deny it.
     candidate: what the last search found. rejected: last fit of a search that gave no estimate.
+    one_sided: labels of what was found twice, whose side has not changed often enough: until it
+    has, or sample `again_at` has come, another search would find the same.
     """
 
     next_at: int = FIRST_SEARCH
     inherited: Estimate | None = None
     candidate: Prior | None = None
     rejected: Fitted | None = None
+    one_sided: Start | None = None
+    again_at: int = 0
 
 
 @dataclass
@@ -152,7 +156,7 @@ class Learning:
             return [around]
         return [around, around._replace(model=told.model, error=told.error, scale=0.0)]
 
-    def reversed_often(self, fit: WindowFit) -> bool:
+    def reversed_often(self, fit: WindowFit | Labels) -> bool:
         """Whether the engaged side has changed so often that no lag passes for a gap."""
         return self.around.error.count == 0 or fit.reversals >= REVERSALS
 
