@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from math import sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import Backlash, check_backlash
@@ -51,8 +50,7 @@ class SimulatedPlant:
         self._motor = None if actuator is None else Motor(actuator)
         self.sample = 0
         self._initial = (backlash.m, backlash.c_r, backlash.c_l)
-        self._a, self._b, _ = model.state_space()
-        self._x: NDArray[np.float64] = np.zeros(model.order)
+        self._model, self._x = model, [0.0] * model.order
         self._sample_period = sample_period
         self._rng = rng
         self._extra = imperfections or Imperfections()
@@ -64,14 +62,14 @@ class SimulatedPlant:
 
     def go_on_from(self, other: SimulatedPlant) -> None:
         """Take over the state, the time and the source of noise of a plant with the same G(z)."""
-        self.sample, self._x, self._rng = other.sample, other._x, other._rng
+        self.sample, self._x, self._rng = other.sample, list(other._x), other._rng
         self._walk, self._walk_rng = other._walk, other._walk_rng
         self.backlash.u, self.backlash.region = other.backlash.u, other.backlash.region
         self._motor, self.applied = other._motor, other.applied
 
     def measure(self) -> float:
         """y(k) as the sensor shows it; call it once per sample."""
-        y = float(self._x[0])
+        y = self._x[0]
         if self._extra.output_noise_std > 0.0:
             y += self._extra.output_noise_std * float(self._rng.standard_normal())
         if self._extra.output_quantum > 0.0:
@@ -91,7 +89,7 @@ class SimulatedPlant:
         if self._walk_step > 0.0:
             disturbance += self._walk
             self._walk += self._walk_step * float(self._walk_rng.standard_normal())
-        self._x = self._a @ self._x + self._b * (u + disturbance)
+        self._model.advance(self._x, u + disturbance)
         self.sample += 1
         return u
 

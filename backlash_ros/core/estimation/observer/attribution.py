@@ -37,11 +37,11 @@ class Attribution:
 
     def note(self, change: float) -> None:
         """Take in by how much u would be another in the interval that has just ended."""
-        observer = self._observer
+        model = self._observer.model.transfer_function
         for added in self._pending:
-            observer.advance(added, 0.0)
-        added = [0.0] * observer.model.order
-        observer.advance(added, change)
+            model.advance(added, 0.0)
+        added = [0.0] * model.order
+        model.advance(added, change)
         self._pending.append(added)
 
     def judge(self, innovation: float) -> tuple[float, list[int]]:

@@ -78,10 +78,7 @@ class Observer:
 
     def __init__(self, model: StateModel, noise_std: float) -> None:
         self.model = model
-        transfer = model.transfer_function
-        self._terms = tuple(zip(
-            (-transfer.denominator[1:]).tolist(), transfer.numerator[1:].tolist(), strict=True
-        ))
+        self._transfer = model.transfer_function
         self._n = model.order
         self._x = [0.0] * self._n
         self._noise_std = noise_std
@@ -116,19 +113,7 @@ class Observer:
 
     def predict(self, u: float) -> float:
         """Take u over one period and return the y that is expected after it."""
-        return self.advance(self._x, u)
-
-    def advance(self, x: list[float], u: float) -> float:
-        """Take a state in the observer form over one period, in place, and return its y."""
-        y = x[0]
-        terms = self._terms
-        last = self._n - 1
-        for i in range(last):
-            a, b = terms[i]
-            x[i] = x[i + 1] + a * y + b * u
-        a, b = terms[last]
-        x[last] = a * y + b * u
-        return x[0]
+        return self._transfer.advance(self._x, u)
 
     def correct(self, innovation: float) -> None:
         """Take in y minus what was expected."""
