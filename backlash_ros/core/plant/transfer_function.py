@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +44,7 @@ class TransferFunction:
         """Number of states n."""
         return len(self.denominator) - 1
 
-    @property
+    @cached_property
     def poles(self) -> NDArray[np.complex128]:
         """Roots of the denominator, shape (n,)."""
         return np.asarray(np.roots(self.denominator), dtype=np.complex128)

@@ -191,7 +191,8 @@ class WindowFit:
             step = (walk or self.around.walk) / sqrt(layout.ramps)
             triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
         posterior = self._posterior(triangle, spreads, leaking)
-        posterior = replace(posterior, evidence=posterior.evidence + offset)
+        if offset:
+            posterior = replace(posterior, evidence=posterior.evidence + offset)
         residual = self.residual(posterior)
         squares = float(residual @ residual)
         count = self._triangle.count

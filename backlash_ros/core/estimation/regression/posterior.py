@@ -157,19 +157,16 @@ class Triangle:
         mean = share @ means
         within = share @ (ratios * shrink * (left / (freedom * noise_var))[:, None])
         between = (means - mean) * np.sqrt(share / noise_var)[:, None]
-        back = weights[:, None] * vt.T
-        e = back @ mean
-        root = back @ np.concatenate([np.diag(np.sqrt(within)), between.T], axis=1)
-        through = inverse @ r[:base, base:size]
-        spread = through @ root
-        cov = np.empty((size, size))
-        cov[:base, :base] = inverse @ inverse.T + spread @ spread.T
-        cov[base:, base:] = root @ root.T
-        cov[:base, base:] = -spread @ root.T
-        cov[base:, :base] = cov[:base, base:].T
+        # All unknowns by e, and b besides by what the rows say of it for a given e.
+        by = np.concatenate([inverse @ -r[:base, base:size], np.eye(size - base)]) @ (
+            weights[:, None] * vt.T
+        )
+        root = by @ np.concatenate([np.diag(np.sqrt(within)), between.T], axis=1)
+        all_means, cov = by @ mean, root @ root.T
+        all_means[:base] += target
+        cov[:base, :base] += inverse @ inverse.T
         return Posterior(
-            np.concatenate([target - through @ e, e]), cov, sqrt(noise_var),
-            float(scales[best]), float(evidence[best]),
+            all_means, cov, sqrt(noise_var), float(scales[best]), float(evidence[best])
         )
 
 
