@@ -10,6 +10,9 @@ from backlash_ros.core.parameters.errors import ParameterError
 
 # Crest-friendly multisine: harmonics of the base frequency with Schroeder's phases.
 MULTISINE_HARMONICS = (1, 2, 3, 5)
+MULTISINE_TERMS = tuple(
+    (h, pi * i * (i + 1) / len(MULTISINE_HARMONICS)) for i, h in enumerate(MULTISINE_HARMONICS)
+)
 # Shapes of the phase alone, which go on where they are if the frequency changes.
 PERIODIC = ('sine', 'square', 'triangle', 'multisine')
 
@@ -60,12 +63,10 @@ def _triangle(r: ReferenceSignal, t: float) -> float:
 
 
 def _multisine(r: ReferenceSignal, t: float) -> float:
-    count = len(MULTISINE_HARMONICS)
-    total = sum(
-        sin(h * r.frequency * t - pi * i * (i + 1) / count)
-        for i, h in enumerate(MULTISINE_HARMONICS)
-    )
-    return total / count
+    total = 0.0
+    for harmonic, phase in MULTISINE_TERMS:
+        total += sin(harmonic * r.frequency * t - phase)
+    return total / len(MULTISINE_TERMS)
 
 
 def _chirp(r: ReferenceSignal, t: float) -> float:

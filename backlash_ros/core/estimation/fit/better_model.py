@@ -52,14 +52,18 @@ def refined_model(
         return present
     problem = _problem(v, y, fit, solution, pace)
     yield
-    better = yield from low_order(model, error, problem, solution.posterior.scale, shifts=(0,))
-    if better is None:
-        return present
-    gained = problem.misfit(present.transfer_function) - problem.misfit(better)
     # What as many coefficients bring by chance would only make the structure follow the noise, and
     # what no G explains is no better explained for that.
     chance = 2.0 * error.count * solution.inflation
-    return StateModel(better) if gained > chance and _allowed(better) else present
+    left = fit.residual(solution.posterior, len(v) - problem.samples)
+    least = float(left @ left) / solution.posterior.noise_std**2
+    misfit = problem.misfit(present.transfer_function)
+    if misfit <= least + chance:
+        return present  # no G of low order does what the fit with its error does not
+    better = yield from low_order(model, error, problem, solution.posterior.scale, shifts=(0,))
+    if better is None or misfit <= problem.misfit(better) + chance or not _allowed(better):
+        return present
+    return StateModel(better)
 
 
 def _problem(v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace) -> OutputError:

@@ -41,8 +41,8 @@ class OutputError:
     """The problem: u (N,), applied from k to k+1, and y (N,) after it, with its weights.
 
     weights: 0 where y was lost or is not to be compared. before: u of the samples before these, as
-    many as `memory_of` G: it acts on the first y through the numerator. noise_std: of y. integrate:
-    denominator of the integrators of G.
+    many as `memory_of` G: it acts on the first y through the numerator. noise_std: of y.
+    samples: N. integrate: denominator of the integrators of G.
     """
 
     def __init__(
@@ -54,6 +54,7 @@ class OutputError:
         self._root = np.sqrt(weights) / noise_std
         self._y = np.where(weights > 0.0, y, 0.0) * self._root
         self._u, self._first = np.concatenate([before, u]), len(before)
+        self.samples = len(y)
 
     def poles(self, a: Array) -> Array:
         """Denominator of G for that of its stable part."""

@@ -53,11 +53,12 @@ class WindowFit:
         self.around, self.start, self.slope, self.extent = around, start, slope, extent
         self.model = around.model
         ramp = max(-(-samples // RAMPS), SLOW) if around.walk > 0.0 else 0
-        past = start.past
-        self._begun = begun = start.after(past)
+        past = start.labels(start.past) if len(start.past) else None
+        self._before = None if past is None else past.p  # play outputs before the first sample
+        self._begun = begun = start if past is None else start.at_end(past)
         self._regressors = Regressors(around.model, around.error, begun.side == 0, ramp)
-        if len(past):
-            self._regressors.begin_after(np.diff(start.labels(past).p, prepend=start.p))
+        if past is not None:
+            self._regressors.begin_after(np.diff(past.p, prepend=start.p))
         self.layout = self._regressors.layout
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.length = 0  # samples
@@ -134,9 +135,7 @@ class WindowFit:
         changes = np.count_nonzero(np.diff(sides)) + int(sides[0] != before)
         # The first engagement is no reversal.
         self.reversals += changes - int(before == 0 and changes > 0)
-        self._play = Start(
-            self._play.gap, float(labels.p[-1]), int(sides[-1]), float(labels.v_a[-1])
-        )
+        self._play = self._play.at_end(labels)
 
     def play_output(self, gap: float, solution: Solution) -> float:
         """Play output after the newest sample for a gap close to that of the labels."""
@@ -300,8 +299,7 @@ class WindowFit:
 
     def input_before(self, solution: Solution, samples: int) -> Array:
         """u of so many samples before the first one: at rest, as far as none are remembered."""
-        past = self.start.past
-        p = self.start.labels(past).p if len(past) else np.array([solution.start])
+        p = np.array([solution.start]) if self._before is None else self._before
         m, right = solution.posterior.mean[self.layout.n + 1:self.layout.n + 3]
         return np.pad(m * p - right, (samples, 0), mode='edge')[-samples:]
 

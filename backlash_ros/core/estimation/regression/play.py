@@ -122,7 +122,10 @@ class Start(NamedTuple):
         """Where the play operator stands after v (N,)."""
         if not len(v):
             return self
-        labels = self.labels(v)
+        return self.at_end(self.labels(v))
+
+    def at_end(self, labels: Labels) -> Start:
+        """The same after these samples, at least one."""
         side = int(labels.right[-1] - labels.left[-1])
         return Start(self.gap, float(labels.p[-1]), side, float(labels.v_a[-1]))
 
