@@ -91,7 +91,7 @@ def gap_spread(
     places = gap + std * NEAR
     if prior is not None:
         places = np.append(places, prior[0] + prior[1] * FAR)
-    places = places[places > 0.0]
+    places = np.unique(places[places > 0.0])
     if len(places) < 2:
         return 0.0
     close = yield from comparison.best_per_gap(places, 2 * STARTS - 1, pace)
@@ -138,21 +138,25 @@ class Comparison:
         self, gaps: Array, starts: int, pace: Pace,
     ) -> Generator[None, None, list[Candidate]]:
         """The best start for each gap."""
-        v0 = float(self._v[0])
-        pairs = [
-            (float(gap), v0 + float(share) * float(gap))
-            for gap in gaps for share in np.linspace(0.0, 1.0, starts if gap > 0.0 else 1)
-        ]
-        best: dict[float, Candidate] = {}
-        while pairs:
+        counts = np.where(gaps > 0.0, starts, 1)
+        ends = np.cumsum(counts)
+        shares = np.concatenate([np.linspace(0.0, 1.0, count) for count in counts.tolist()])
+        of_pairs = np.repeat(gaps, counts)
+        begins = self._v[0] + shares * of_pairs
+        evidence, slopes = np.empty(len(begins)), np.empty(len(begins))
+        done = 0
+        while done < len(begins):
             count = pace.pieces(len(self._v) * max(self._error.count, 1))
-            part, pairs = np.array(pairs[:count]), pairs[count:]
-            evidence, slopes = self._compare(part[:, 0], part[:, 1])
-            for (gap, start), value, m in zip(part, evidence, slopes, strict=True):
-                if gap not in best or value > best[gap].evidence:
-                    best[gap] = Candidate(float(value), float(gap), float(start), float(m))
+            part = slice(done, done + count)
+            evidence[part], slopes[part] = self._compare(of_pairs[part], begins[part])
+            done += count
             yield
-        return list(best.values())
+        best = [
+            int(end - count + np.argmax(evidence[end - count:end]))
+            for end, count in zip(ends, counts, strict=True)
+        ]
+        table = np.column_stack([evidence, of_pairs, begins, slopes])[best]
+        return [Candidate(*row) for row in table.tolist()]
 
     def _compare(self, gaps: Array, starts: Array) -> tuple[Array, Array]:
         """Evidence and slope of each pair, shape (H,)."""
