@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from backlash_ros.core.estimation.constants import GROWTH, LONGEST, SEARCH_GROWTH
 from backlash_ros.core.estimation.fit.record import Record
+from backlash_ros.core.estimation.moving_horizon.learning import next_length
 
 CAPACITY = 7
 steps = st.lists(st.one_of(
@@ -85,3 +87,12 @@ def test_a_reading_in_doubt_that_a_fit_has_gone_on_without_stays_lost() -> None:
     record.decide_doubts(2)
     record.restore([0, 1, 2, 3])
     assert np.array_equal(record.since(0)[1], [nan, nan, 12.0, 13.0], equal_nan=True)
+
+
+@given(st.integers(20, LONGEST), st.sampled_from([SEARCH_GROWTH, GROWTH]))
+def test_equal_steps_of_growth_lead_to_the_longest_record(length: int, growth: float) -> None:
+    refits = [float(length)]
+    while refits[-1] < LONGEST - 1e-6:
+        refits.append(next_length(round(refits[-1]), growth))
+        assert refits[-1] <= refits[-2] * growth**1.6
+    assert refits[-1] == pytest.approx(LONGEST)

@@ -207,7 +207,7 @@ class Learning:
         self.record.forget_before(first)
         # As long as the gap may be another one the search for it goes on.
         growth = SEARCH_GROWTH if result.fit.gap_spread > 0.0 else GROWTH
-        self.refit_at = _next_length(result.fit.length, growth)
+        self.refit_at = next_length(result.fit.length, growth)
         self.moved_at = result.fit.length + BLOCK[1]
         self.contradicted_from = self.changed = self.acquisition.rejected = None
         self.contradiction = None
@@ -229,7 +229,7 @@ class Learning:
         self.contradicted_from = None
 
 
-def _next_length(length: int, growth: float) -> float:
+def next_length(length: int, growth: float) -> float:
     """Length of the record at its next refit, in equal steps that end at the longest one."""
     if length >= LONGEST:
         return LONGEST
