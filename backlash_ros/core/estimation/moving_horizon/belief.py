@@ -98,20 +98,22 @@ def denied_by_samples(learning: Learning, estimate: Estimate) -> bool:
     if denied or (not contradicted and is_precise(found, fit.swing, REPLACING)):
         learning.unconfirmed = False
     else:
-        learning.supported = (
-            not contradicted and is_precise(_furthest(estimate, found), fit.swing, LASTING)
-            and fit.unexplained(solution) <= MOST_UNEXPLAINED
-        )
+        unexplained = fit.unexplained(solution) * found.gap
+        furthest = _furthest(estimate, found, unexplained)
+        learning.supported = not contradicted and is_precise(furthest, fit.swing, LASTING)
     return denied
 
 
-def _furthest(estimate: Estimate, found: Crossings) -> Crossings:
-    """What was found, with how far an estimate is from the furthest that it makes likely."""
+def _furthest(estimate: Estimate, found: Crossings, doubt: float) -> Crossings:
+    """What was found, with how far an estimate is from the furthest that it makes likely.
+
+    doubt: of the gap, half of it of each crossing, beside the deviations.
+    """
     m, c_r, c_l = np.abs(difference(found, estimate)).tolist()
     gap = abs(found.gap - (estimate.c_r - estimate.c_l))
     return replace(
-        found, std_m=m + found.std_m, std_c_r=c_r + found.std_c_r, std_c_l=c_l + found.std_c_l,
-        std_gap=gap + found.std_gap,
+        found, std_m=m + found.std_m, std_c_r=c_r + found.std_c_r + 0.5 * doubt,
+        std_c_l=c_l + found.std_c_l + 0.5 * doubt, std_gap=gap + found.std_gap + doubt,
     )
 
 
