@@ -29,7 +29,7 @@ from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.config.configuration import effective_parameters
 from backlash_ros.tools.report.command import open_source
-from gears.gear_runs import FIRST, MOTIONS, PERIODS, PRESETS, oracle
+from gears.gear_runs import FIRST, MOTIONS, PERIODS, PRESETS, SLOWER, oracle
 
 DRIVER = ROOT / 'examples' / 'mujoco_gear.py'
 MOTION = 'sine'
@@ -72,24 +72,31 @@ class GearProcesses:
     def identify(self, seconds: float = DRIVE_S) -> dict[str, Any]:
         """Let `identify --drive` move the gear; return what it wrote to identified.json.
 
-        Where that is of no use, identify the record again with RETRIES. Raises RuntimeError where
-        a command did not get so far, TooBusyError where each motion lost too many samples.
+        Where that is of no use, identify the record again with RETRIES, then move more slowly.
+        Raises RuntimeError where a command did not get so far, TooBusyError where each motion lost
+        too many samples.
         """
+        record = self._folder / 'record.csv'
+        for share, longer in ((1.0, 1.0), *SLOWER):
+            self._move(longer * seconds, share)
+            (self._found / 'record.csv').replace(record)
+            pace = () if share == 1.0 else ('--rate', f'{share:.0%}')
+            for options in ((), *RETRIES):
+                self.options = (*pace, *options)
+                if options:
+                    self._identify([str(record), *options], 0)
+                if self._said()['usable']:
+                    return self._said()
+        return self._said()
+
+    def _move(self, seconds: float, share: float) -> None:
+        """Move at this share of the rate, once more where too many samples were lost."""
         for _ in range(DRIVES):
-            self._drive(seconds)
+            self._drive(seconds, share)
             found = self._said()
             if found['lost_samples'] <= MOST_LOST * found['samples']:
-                break
-        else:
-            raise TooBusyError(f'{found["lost_samples"]} of {found["samples"]} samples were lost')
-        record = self._folder / 'record.csv'
-        (self._found / 'record.csv').replace(record)
-        for options in RETRIES:
-            if self._said()['usable']:
-                break
-            self.options = options
-            self._identify([str(record), *options], 0)
-        return self._said()
+                return
+        raise TooBusyError(f'{found["lost_samples"]} of {found["samples"]} samples were lost')
 
     def follow(
         self, name: str, settings: Mapping[str, str] | None = None, periods: int = PERIODS,
@@ -130,14 +137,17 @@ class GearProcesses:
         """An error of y as it is, with the rounding of the encoder."""
         return hypot(error, self.gear.scale * self.gear.load_resolution / 12**0.5)
 
-    def _drive(self, seconds: float) -> None:
+    def _drive(self, seconds: float, share: float) -> None:
+        rate = share * self.gear.scale * self.gear.rate
         with free_domain() as domain:
             driver = subprocess.Popen(
                 self._driver, env=self._environment(domain), stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
             )
             try:
-                self._identify(['--drive', '--duration', f'{seconds:g}'], domain)
+                self._identify(
+                    ['--drive', '--duration', f'{seconds:g}', '--rate', f'{rate:.6g}'], domain
+                )
             finally:
                 driver.send_signal(signal.SIGINT)
                 driver.wait()
