@@ -104,8 +104,9 @@ class GearProcesses:
         """Let `bringup --driver` follow so many periods of the sine of the preset."""
         gear, out = self.gear, self._folder / name
         frequency = MOTIONS[MOTION][1] * gear.frequency
+        duration = gear.sample_period * round(periods / frequency / gear.sample_period)
         command = ['bringup', '--config', str(self._found / 'identified.yaml'), '--driver',
-                   shlex.join(self._driver), '--duration', f'{periods / frequency:g}',
+                   shlex.join(self._driver), '--duration', f'{duration:.9g}',
                    '--out', str(out)]
         for key, value in {
             'waveform': 'sine', 'amplitude': f'{gear.scale * gear.swing:g}',
