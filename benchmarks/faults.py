@@ -30,7 +30,8 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path.insert(1, str(Path(__file__).resolve().parents[1]))
 
 from fault_loop.causes import cause_of
-from fault_loop.fault_sequences import PERIOD_S, Findings, Sequence
+from fault_loop.fault_sequences import Findings, Sequence
+from fault_loop.random_loop import PERIOD_S
 from reporting import ROOT, markdown_table, processors, text_table
 
 DOCUMENT = ROOT / 'docs' / 'faults.md'

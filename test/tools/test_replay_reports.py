@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_bags import MULTI_ARRAY, TYPES, multi_array
 from rosbags.rosbag2 import StoragePlugin, Writer
-from test_report import MULTI_ARRAY, TYPES, multi_array
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_bags import MULTI_ARRAY, PARAMETERS, TYPES, rows_of
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
-from test_report import MULTI_ARRAY, PARAMETERS, TYPES, rows_of
 
 from backlash_ros import topics
 from backlash_ros.core.parameters import Parameters

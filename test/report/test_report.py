@@ -3,108 +3,33 @@
 from __future__ import annotations
 
 import base64
-import itertools
 import json
 import re
-from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from math import nan
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
+from made_bags import LATENCY_S, PARAMETERS, TYPES, believed, write_bag
 from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
-from backlash_ros import topics
 from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli.errors import InputError
 from backlash_ros.tools.config.configuration import write_config
-from backlash_ros.tools.report import analysis, figures
+from backlash_ros.tools.report import analysis
 from backlash_ros.tools.report import command as report
 from backlash_ros.tools.run_files.bag_reading import read_bag
 from backlash_ros.tools.run_files.bag_sections import Span
 from backlash_ros.tools.run_files.results import summarise, write_run, write_summary
 
-PARAMETERS = Parameters({'estimator.law': 'lms', 'output_noise_std': 1e-4})
-LATENCY_S = 0.0004
-TYPES = get_typestore(Stores.ROS2_JAZZY)
-MULTI_ARRAY = 'std_msgs/msg/Float64MultiArray'
-
 
 @pytest.fixture(scope='module')
 def run() -> RunRecord:
     return build_closed_loop(PARAMETERS).run(120)
-
-
-def multi_array(labels: tuple[str, ...], values: list[float]) -> bytes:
-    dimension = TYPES.types['std_msgs/msg/MultiArrayDimension']
-    layout = TYPES.types['std_msgs/msg/MultiArrayLayout'](
-        dim=[dimension(label=label, size=1, stride=0) for label in labels], data_offset=0
-    )
-    message = TYPES.types[MULTI_ARRAY](layout=layout, data=np.array(values, dtype=np.float64))
-    return bytes(TYPES.serialize_cdr(message, MULTI_ARRAY))
-
-
-def rows_of(
-    run: RunRecord, labels: tuple[str, ...], skipped: frozenset[int], prefix: str = '',
-    first: int = 1,
-) -> Iterator[tuple[int, bytes]]:
-    """Number and message of each row, whose samples are counted from `first`."""
-    for k in range(run.samples):
-        if k in skipped:
-            continue
-        known = dict(zip(COLUMNS, run.rows[k].tolist(), strict=True))
-        known |= {'sample': float(k + first), 'latency_s': LATENCY_S, 'std_f': nan}
-        values = [known.get(prefix + label, known.get(label, nan)) for label in labels]
-        yield k, multi_array(labels, values)
-
-
-def write_bag(
-    path: Path, run: RunRecord, storage: StoragePlugin = StoragePlugin.MCAP, *,
-    truth: bool = True, lost: frozenset[int] = frozenset(), namespace: str = '',
-    unpaired: frozenset[int] = frozenset(), models: Mapping[int, bytes] = MappingProxyType({}),
-) -> Path:
-    """Write a bag as the recorder does; the last sample has no truth, its v was never applied."""
-    period_ns = round(run.sample_period * 1e9)
-    with Writer(path, version=9, storage_plugin=storage) as writer:
-        sources = [
-            (topics.SIGNALS, topics.SIGNAL_LABELS, lost, ''),
-            (topics.ESTIMATES, topics.ESTIMATE_LABELS, lost | unpaired, ''),
-        ]
-        if truth:
-            never_applied = frozenset({run.samples - 1})
-            sources.append((topics.TRUTH, topics.TRUTH_LABELS, never_applied, 'true_'))
-        for topic, labels, skipped, prefix in sources:
-            connection = writer.add_connection(
-                f'/{namespace}{topic}', MULTI_ARRAY, typestore=TYPES)
-            for k, raw in rows_of(run, labels, skipped, prefix):
-                writer.write(connection, 10**18 + k * period_ns, raw)
-        if models:
-            connection = writer.add_connection(
-                f'/{namespace}{topics.MODEL}', MULTI_ARRAY, typestore=TYPES)
-            for k, raw in models.items():
-                writer.write(connection, 10**18 + k * period_ns, raw)
-    return path
-
-
-def believed(denominator: list[float], tail: int = 0) -> bytes:
-    """A message of controller/model; tail: numbers at its end that are missing."""
-    fields = LearnedModel((0.1,), tuple(denominator), 1, (0.1,) * 5, 1.2, 0.03).fields()
-    dimension = TYPES.types['std_msgs/msg/MultiArrayDimension']
-    layout = TYPES.types['std_msgs/msg/MultiArrayLayout'](dim=[
-        dimension(label=label, size=len(values), stride=0) for label, values in fields.items()
-    ], data_offset=0)
-    data = [value for values in fields.values() for value in values]
-    message = TYPES.types[MULTI_ARRAY](layout=layout, data=np.array(data[:len(data) - tail]))
-    return bytes(TYPES.serialize_cdr(message, MULTI_ARRAY))
 
 
 @pytest.fixture(scope='module')
@@ -346,80 +271,6 @@ def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
     assert (tmp_path / 'report.html').is_file()
 
 
-def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
-    other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
-    own, *others = analysis.compare_laws(run, other)
-    assert own.recorded
-    assert len(own.t) == run.samples
-    assert all('gone.csv' in trace.note for trace in others)
-    assert isinstance(figures.draw_laws([own, *others], analysis.Part('Begin', slice(10))), Figure)
-
-
-def texts_and_axes(figure: Figure) -> tuple[list[tuple[str, Bbox]], list[tuple[str, Bbox]]]:
-    """Boxes of all texts, and of the legends and data areas."""
-    renderer = FigureCanvasAgg(figure).get_renderer()
-    figure.draw_without_rendering()
-    texts, areas = [], []
-    for axes in figure.axes:
-        legend = axes.get_legend()
-        if legend is not None:
-            texts.append(('legend', legend.get_window_extent(renderer)))
-        if not axes.axison:
-            continue
-        areas.append((axes.get_title(loc='left'), axes.get_window_extent(renderer)))
-        for text in (axes.title, axes._left_title, axes.xaxis.label, axes.yaxis.label):
-            if text.get_text():
-                texts.append((text.get_text(), text.get_window_extent(renderer)))
-        for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-            for tick in axis.get_major_ticks():
-                # Ticks beyond the limits exist but are not drawn.
-                if low <= tick.get_loc() <= high and tick.label1.get_visible():
-                    name = f'tick {tick.label1.get_text()}'
-                    texts.append((name, tick.label1.get_window_extent(renderer)))
-    return texts, areas
-
-
-def overlap(first: Bbox, second: Bbox) -> bool:
-    """Whether two boxes share more than a rim of two pixels."""
-    return bool(
-        min(first.x1, second.x1) - max(first.x0, second.x0) > 2
-        and min(first.y1, second.y1) - max(first.y0, second.y0) > 2
-    )
-
-
-@pytest.mark.parametrize('truth', [True, False])
-def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None:
-    rows = run.rows.copy()
-    for name in ('std_m', 'std_c_r', 'std_c_l'):
-        rows[:, COLUMNS.index(name)] = 0.1
-    rows[40:60, COLUMNS.index('status')] = 2.0
-    if not truth:
-        for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):
-            rows[:, COLUMNS.index(name)] = nan
-    shown = replace(run, rows=rows)
-    parts = analysis.interesting_parts(shown, PARAMETERS)
-    late = shown.column('y_m')
-    references = [analysis.FollowedReference(late, 0.6, followed) for followed in (True, False)]
-    settling = {'m': 0.5, 'c_r': None, 'c_l': 0.9}
-    drawn = [
-        figures.draw_estimates(shown), figures.draw_innovation(shown, parts[0]),
-        figures.draw_hysteresis(shown, parts[1]), figures.draw_input(shown, parts),
-        *(figures.draw_output(shown, parts[1], reference) for reference in references),
-    ]
-    if truth:
-        traces = analysis.compare_laws(shown, PARAMETERS)
-        drawn += [
-            figures.draw_parameter_errors(shown, parts[0], settling),
-            figures.draw_control_error(shown, parts), figures.draw_laws(traces, parts[0]),
-        ]
-    for figure in drawn:
-        texts, areas = texts_and_axes(figure)
-        for (one, box), (other, second) in itertools.combinations(texts, 2):
-            assert not overlap(box, second), f'{one!r} and {other!r} overlap'
-        for (one, box), (title, area) in itertools.product(texts, areas):
-            assert not overlap(box, area), f'{one!r} covers data of {title!r}'
-
-
 def test_output_is_compared_with_the_reference_as_late_as_the_structure_makes_it() -> None:
     tracking = Parameters({'structure': 'tracking', 'amplitude': 0.2, 'tracking.preview': 60})
     run = build_closed_loop(tracking).run(300)
@@ -432,30 +283,8 @@ def test_output_is_compared_with_the_reference_as_late_as_the_structure_makes_it
     assert late < 0.5 < prompt
 
 
-def test_diverging_law_does_not_flatten_the_others(run: RunRecord) -> None:
-    t = run.column('t')
-    mild, wild = np.full(len(t), 2.0), np.geomspace(1.0, 1e150, len(t))
-    traces = [analysis.LawTrace('lms', t, mild, mild, True),
-              analysis.LawTrace('printed', t, wild, wild, False)]
-    figure = figures.draw_laws(traces, analysis.Part('Start', slice(20)))
-    low, high = figure.axes[-1].get_ylim()
-    assert low < 2.0 < high < 1e5
-
-
 def test_moving_rms_is_that_of_the_newest_samples() -> None:
     values = np.array([3.0, nan, 4.0, 1e-9, 0.0, 1e-9])
     small = 1e-9 / np.sqrt(2)
     expected = [3.0, 3.0, 4.0, np.sqrt(8.0), small, small]
     np.testing.assert_allclose(analysis.moving_rms(values, 2), expected, rtol=1e-9)
-
-
-def test_thinned_curve_keeps_every_extreme() -> None:
-    t = np.arange(100_000.0)
-    values = np.sin(t / 50.0)
-    values[[17, 40_000]] = [9.0, -9.0]
-    values[500:600] = nan
-    few_t, few = analysis.thinned(t, values, 1000)
-    assert len(few) <= 1000
-    assert np.all(np.diff(few_t) > 0.0)
-    assert (np.nanmax(few), np.nanmin(few)) == (9.0, -9.0)
-    np.testing.assert_array_equal(few, values[few_t.astype(int)])
