@@ -29,14 +29,22 @@ from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.config.configuration import effective_parameters
 from backlash_ros.tools.report.command import open_source
-from gears.gear_runs import FIRST, MOTIONS, PERIODS, PRESETS, SLOWER, oracle
+from gears.gear_runs import (
+    AT_FIRST,
+    ATTEMPTS,
+    FIRST,
+    MOTIONS,
+    PERIODS,
+    PRESETS,
+    SLOWER,
+    oracle,
+    told,
+)
 
 DRIVER = ROOT / 'examples' / 'mujoco_gear.py'
 MOTION = 'sine'
 DRIVE_S = 20.0  # of the motion for identification
 DRIVES, MOST_LOST = 2, 0.02  # motions; share of lost samples from which on there is another one
-# What identify proposes where a result is of no use, in its order, on the record that is there.
-RETRIES = (('--integrator', 'no'), ('--integrator', 'no', '--order', '1-2'))
 NONE = {
     'estimator.law': 'fixed', 'fixed.doubt': '0.5', 'estimator.initial.c_r': '0',
     'estimator.initial.c_l': '0', 'estimates.load': 'false',
@@ -52,12 +60,12 @@ class TooBusyError(RuntimeError):
 class GearProcesses:
     """One preset, with settings as `--set` takes them, and the folder of all that is written.
 
-    options: with which `identify` was told to look again, if it was.
+    told: what `identify` had to be told, if anything.
     """
 
     def __init__(self, preset: str, folder: Path, *settings: str) -> None:
         self.gear, self._folder = PRESETS[preset].with_settings(list(settings)), folder
-        self.options: tuple[str, ...] = ()
+        self.told = ''
         self._limits, self._found = folder / 'limits.yaml', folder / 'identified'
         self._driver = [sys.executable, str(DRIVER), '--preset', preset]
         for setting in settings:
@@ -72,22 +80,22 @@ class GearProcesses:
     def identify(self, seconds: float = DRIVE_S) -> dict[str, Any]:
         """Let `identify --drive` move the gear; return what it wrote to identified.json.
 
-        Where that is of no use, identify the record again with RETRIES, then move more slowly.
+        Where that is of no use, identify the record again with ATTEMPTS, then move more slowly.
         Raises RuntimeError where a command did not get so far, TooBusyError where each motion lost
         too many samples.
         """
         record = self._folder / 'record.csv'
-        for share, longer in ((1.0, 1.0), *SLOWER):
+        for share, longer in (AT_FIRST, *SLOWER):
             self._move(longer * seconds, share)
             (self._found / 'record.csv').replace(record)
-            pace = () if share == 1.0 else ('--rate', f'{share:.0%}')
-            for options in ((), *RETRIES):
-                self.options = (*pace, *options)
-                if options:
-                    self._identify([str(record), *options], 0)
-                if self._said()['usable']:
-                    return self._said()
-        return self._said()
+            for option in ATTEMPTS:
+                self.told = told(share, option)
+                if option:
+                    self._identify([str(record), *option.split()], 0)
+                found = self._said()
+                if found['usable']:
+                    return found
+        return found
 
     def _move(self, seconds: float, share: float) -> None:
         """Move at this share of the rate, once more where too many samples were lost."""
@@ -201,8 +209,8 @@ def process_row(preset: str) -> list[str]:
             found = processes.identify()
         except TooBusyError as error:
             return [preset, f'{1e3 * gear.sample_period:g} ms', *[''] * 6, str(error), '', '']
-        told = f' ({" ".join(processes.options)})' if processes.options else ''
-        row = [preset, f'{1e3 * gear.sample_period:g} ms', f'{found["gap"] / lost:.3f}{told}']
+        options = f' ({processes.told})' if processes.told else ''
+        row = [preset, f'{1e3 * gear.sample_period:g} ms', f'{found["gap"] / lost:.3f}{options}']
         if not found['usable']:
             return [*row, '', '', '', '', '', f'identify: {"; ".join(found["reasons"])}', '', '']
         learned, none = processes.follow('learned'), processes.follow('none', NONE)

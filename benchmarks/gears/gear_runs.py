@@ -43,9 +43,9 @@ ATTEMPTS = {
     '': Options(), '--integrator no': Options(integrators=(False,)),
     '--integrator no --order 1-2': Options(orders=(1, 2), integrators=(False,)),
 }
-# Share of the rate, and times the duration, of further motions where the messages say to move more
+# Share of the rate, and times the duration: of further motions where the messages say to move more
 # slowly, at lower frequencies, or for longer.
-SLOWER = ((0.5, 2.0), (0.25, 2.0))
+AT_FIRST, SLOWER = (1.0, 1.0), ((0.5, 2.0), (0.25, 2.0))
 STROKES_S = 20.0  # of the motion for identification, at most 4000 samples
 SETTLING_S = 0.5  # at rest before a record
 PERIODS, FIRST = 4, 2  # of a motion, and those of them that do not count
@@ -179,15 +179,20 @@ def identified(
     times the seconds, at which it moves again where no attempt is of use.
     """
     results: list[Identified] = []
-    for share, longer in ((1.0, 1.0), *slower):
+    for share, longer in (AT_FIRST, *slower):
         moved = record(replace(gear, rate=share * rate * gear.rate), longer * seconds)
         for option, choice in attempts.items():
             one = _identified(gear, moved, encoder, choice)
-            pace = '' if share == 1.0 else f'--rate {share:.0%}'
-            results.append(replace(one, option=f'{pace} {option}'.strip()))
+            results.append(replace(one, option=told(share, option)))
             if one.found.usable and not one.refused:
                 return results[-1]
     return next((one for one in results if one.parameters is not None), results[0])
+
+
+def told(share: float, option: str) -> str:
+    """What `identify` had to be told: a share of the rate, and one of ATTEMPTS."""
+    pace = '' if share == 1.0 else f'--rate {share:.0%}'
+    return f'{pace} {option}'.strip()
 
 
 def _identified(

@@ -37,6 +37,7 @@ BLOCK = (8, 64)  # samples, fewest and most, that are taken in between two solut
 BLOCK_SHARE = 32  # ... and in between: one block for so many samples of the record
 BEGINNING = 0.1  # share of the record that depends on where p began which is let go for good
 GROWTH = 1.4  # of the record, after which all of it is refitted
+STANDS = 0.02  # standard deviations by which a solution of Gauss-Newton steps may still move
 MOVED = 0.5  # standard deviations of the gap after which all of it is refitted
 FIRST_SEARCH = 20  # samples before the first search
 SEARCH_GROWTH = 1.25  # of the record between two searches, until there is an estimate

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from backlash_ros.core.estimation.constants import STANDS
 from backlash_ros.core.estimation.regression.error_model import MORE_TAPS, ErrorModel
 from backlash_ros.core.plant.model_check import ON_CIRCLE
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -26,7 +27,6 @@ Array = NDArray[np.float64]
 
 SHIFTS = (0, 1, 2, -1)  # samples of delay more than G has that are compared
 GAUSS_NEWTON_STEPS = 10  # Gauss-Newton steps, those that were too long included
-STANDS = 0.02  # standard deviations by which the coefficients may still move
 SHORTER = 0.3  # share of a step that is tried where the whole step leads uphill
 # --- guards
 NO_TAP = 1e-6  # share of the largest tap below which the last ones are none

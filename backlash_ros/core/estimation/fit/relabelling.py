@@ -20,6 +20,7 @@ from backlash_ros.core.estimation.constants import (
     FAR_CANDIDATES,
     GROWTH,
     NO_GAP,
+    STANDS,
     UNDECIDED_BY,
     WALKS,
     ZOOM,
@@ -44,7 +45,6 @@ from backlash_ros.core.estimation.regression.readings import weights_of
 Array = NDArray[np.float64]
 
 RELABELLINGS = 8  # of relabelling, at most
-STANDS = 0.02  # standard deviations by which the gap may still move
 NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
 SAME = 1.5  # ratio of deviations of the gap up to which they say the same
 MODELS = 6  # times that G may move in one fit
@@ -270,4 +270,3 @@ def with_walk(
         return result
     around = still._replace(walk=WALKS[best] * size)
     return (yield from fitted(v, y, around, walking.fit.start, solution.m, pace))
-
