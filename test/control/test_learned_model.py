@@ -245,6 +245,19 @@ def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> 
     assert softer.gains.preview == pytest.approx(nominal.gains.preview)
 
 
+def test_feedback_does_not_fade_from_one_redesign_to_the_next() -> None:
+    """Each has to be as safe as the one before: what it is safer by would be asked of the next."""
+    weights = Weights(1e-2, 1e-3, 60)
+    first = chosen = redesigned(motor(), motor(0.5), weights)
+    for k in range(20):
+        model = StateModel(motor(0.5 * (1.0 + 1e-3 * (-1) ** k)))
+        assert chosen is not None
+        chosen = finished(better_design_in_pieces(model, weights, chosen))
+    assert first is not None
+    assert chosen is not None
+    assert np.linalg.norm(chosen.feedback.gain) > 0.95 * np.linalg.norm(first.feedback.gain)
+
+
 def test_a_model_without_gains_is_refused() -> None:
     # The zero cancels the pole at 1.2, which no feedback can move then.
     unmoved = TransferFunction([1.0, -1.2], [1.0, -1.7, 0.6])

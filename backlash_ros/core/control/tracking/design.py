@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from dataclasses import dataclass
 from functools import lru_cache
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ SCHEDULE = (1e1, 1e2, 1e3, 1e4)
 # Times the input weight with which feedback around a better G is tried in turn until its loop is
 # as safe as the one it replaces. The trajectory keeps the weight that was asked for.
 SAFER = (1.0, 1.1, 1.4, 2.0, 4.0, 10.0, 30.0, 100.0)
+HALVINGS = 6  # of the ratio between the last weight that was not safe and the first one that is
 # Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
 # are led astray by any feedback that would help, and learn faster than they go astray without.
 WRONG_SLOPE = 1.35
@@ -103,6 +105,7 @@ def better_design_in_pieces(
     """
     needed = SAFE_MARGIN
     compared = False
+    unsafe = 0.0
     for weight_factor in SAFER:
         try:
             feedback = feedback_around(model, weights, weight_factor)
@@ -116,8 +119,21 @@ def better_design_in_pieces(
                 theirs = yield from margin_in_pieces(plant, present.feedback)
                 needed = min(needed, theirs)
         if margin > 0.0 and margin >= needed:
-            return (yield from design_in_pieces(model, weights, weight_factor))
-    return None
+            break
+        unsafe = weight_factor
+    else:
+        return None
+    # What is weaker than it has to be is the measure for the next G, and so lost for good.
+    for _ in range(HALVINGS if unsafe > 0.0 else 0):
+        between = sqrt(unsafe * weight_factor)
+        feedback = feedback_around(model, weights, between)
+        yield
+        margin = yield from margin_in_pieces(model, feedback)
+        if margin > 0.0 and margin >= needed:
+            weight_factor = between
+        else:
+            unsafe = between
+    return (yield from design_in_pieces(model, weights, weight_factor))
 
 
 def design(model: StateModel, weights: Weights) -> TrackingDesign:
