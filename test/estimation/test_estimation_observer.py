@@ -104,3 +104,19 @@ def test_a_larger_disturbance_makes_the_gain_and_the_covariance_larger() -> None
     follow(calm, 0.0, 2000)
     follow(rough, 100.0 * NOISE, 2000)
     assert np.trace(rough.noise_cov) > 10.0 * np.trace(calm.noise_cov)
+
+
+def followed_by_another_model(disturbance: float) -> float:
+    """Size of the state's covariance in that of an observer which knows nothing before."""
+    before, model = Observer(MODELS['resonance'], NOISE), MODELS['delayed']
+    follow(before, disturbance, 3000)
+    after = Observer(model, NOISE, before)
+    return float(np.trace(after.noise_cov) / np.trace(Observer(model, NOISE).noise_cov))
+
+
+def test_another_model_of_the_same_plant_begins_with_the_gain_that_has_settled() -> None:
+    assert followed_by_another_model(0.0) < 0.1
+
+
+def test_a_gain_that_a_wrong_model_has_raised_is_not_inherited() -> None:
+    assert followed_by_another_model(100.0) == pytest.approx(1.0)

@@ -74,15 +74,22 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
 
 
 class Observer:
-    """Follows the state of G. noise_std: of y."""
+    """Follows the state of G. noise_std: of y.
 
-    def __init__(self, model: StateModel, noise_std: float) -> None:
+    before: that of another G for the same plant: innovations are no larger with this one.
+    """
+
+    def __init__(
+        self, model: StateModel, noise_std: float, before: Observer | None = None,
+    ) -> None:
         self.model = model
         self._transfer = model.transfer_function
         self._n = model.order
         self._x = [0.0] * self._n
         self._noise_std = noise_std
         self._level = len(RATIOS) // 2
+        if before is not None:
+            self._level = min(before._level, self._level)
         self._gain = self._gain_at(self._level)
         self.variance = (self._gain.innovation * noise_std) ** 2  # of the innovation, measured
         self._to_state = tuple(map(tuple, model.to_state.tolist()))

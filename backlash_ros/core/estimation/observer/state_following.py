@@ -176,7 +176,7 @@ class StateFollowing:
             self._attribution = None
         observer = self._observer
         if observer is None or observer.model is not self.model:
-            observer = self._observer = Observer(self.model, noise)
+            observer = self._observer = Observer(self.model, noise, observer)
             self._attribution = None
             if exact is None:
                 exact = self._replayed(current, record)
@@ -199,7 +199,7 @@ class StateFollowing:
         v, y = record.since(record.first)
         v, y = v[:fit.length], y[:fit.length]
         u = fit.input(solution, v)
-        observer = Observer(self.model, solution.posterior.noise_std)
+        observer = Observer(self.model, solution.posterior.noise_std, self._observer)
         for value, measured in zip(u.tolist(), y.tolist(), strict=True):
             expected = observer.predict(value)
             if measured == measured:
