@@ -285,7 +285,7 @@ def _none(what: str, found: Sequence[object], of: Sequence[object]) -> Check:
 
 def _asked(result: Figures, ideal_result: Figures) -> float:
     """By how much the moves of v grow at the worst swap in the loop that is given everything."""
-    period_s = SECONDS / len(ideal_result.moves)
+    period_s = SECONDS / (len(ideal_result.moves) - 1)
     return max(1.0, larger_moves(
         ideal_result.moves, round(result.worst_swap_s / period_s), period_s
     ))
