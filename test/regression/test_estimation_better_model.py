@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from records import Truth, output, resonance, swing
 
-from backlash_ros.core.estimation.fit.better_model import refined_model
+from backlash_ros.core.estimation.fit.better_model import Refined, refined_model
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.solution import Around
@@ -49,8 +49,9 @@ def refined(
     fit = fit_of(true, first, told)
     y = output(true, V, TRUTH, NOISE)
     return drained(refined_model(
-        V[first:], y[first:], fit.fit, fit.solution, present or fit.fit.model, Pace()
-    ))
+        V[first:], y[first:], fit.fit, fit.solution, Refined(present or fit.fit.model, 0),
+        Pace(),
+    )).model
 
 
 def off(model: StateModel, true: TransferFunction) -> float:

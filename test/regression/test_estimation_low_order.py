@@ -7,7 +7,7 @@ import pytest
 from records import PERIOD_S, resonance, swing
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.fit.low_order import OutputError, low_order, memory_of
+from backlash_ros.core.estimation.fit.low_order import Family, OutputError, low_order, memory_of
 from backlash_ros.core.estimation.fit.pace import drained
 from backlash_ros.core.estimation.regression.error_model import ErrorModel, build_error_model
 from backlash_ros.core.plant.state_model import StateModel
@@ -32,7 +32,8 @@ def learned(
     problem = OutputError(told, u, y, weights, np.zeros(memory_of(told)), NOISE)
     model = told
     for _ in range(3):  # as the fit of a record does
-        better = drained(low_order(model, error.around(StateModel(model)), problem, 1.0))
+        family = Family(model, error.around(StateModel(model)), 1.0)
+        better = family.transfer_function(*drained(low_order(family, problem)), problem)
         if better is None:
             return None
         model = better

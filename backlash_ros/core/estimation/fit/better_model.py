@@ -7,12 +7,14 @@ A fit explains y by G (1 + Delta); a structure can only be designed for a G of l
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit.low_order import OutputError, low_order, memory_of
+from backlash_ros.core.estimation.fit.low_order import Family, OutputError, low_order, memory_of
 from backlash_ros.core.estimation.fit.pace import Pace
+from backlash_ros.core.estimation.fit.rounded_output import likelier
 from backlash_ros.core.estimation.fit.solution import Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.readings import weights_of
@@ -23,6 +25,7 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
+WORTH_A_DESIGN = 1.0  # log-likelihood by which another G has to be likelier at least
 FEWEST_ROWS = 300  # newest samples at least that G of low order is fitted to
 
 
@@ -35,42 +38,72 @@ def better_model(
     """
     problem = _problem(v, y, fit, solution, pace)
     yield
-    model, error = fit.model.transfer_function, fit.around.error
-    better = yield from low_order(model, error, problem, solution.posterior.scale)
+    family = Family(fit.model.transfer_function, fit.around.error, solution.posterior.scale)
+    xi, delay = yield from low_order(family, problem)
+    better = family.transfer_function(xi, delay, problem)
     return StateModel(better) if better is not None and _allowed(better) else None
 
 
+class Refined(NamedTuple):
+    """A G, and to how many samples it was fitted; 0 for one that was told."""
+
+    model: StateModel
+    samples: int
+
+
 def refined_model(
-    v: Array, y: Array, fit: WindowFit, solution: Solution, present: StateModel, pace: Pace,
-) -> Generator[None, None, StateModel]:
+    v: Array, y: Array, fit: WindowFit, solution: Solution, present: Refined, pace: Pace,
+) -> Generator[None, None, Refined]:
     """Return the G that explains y best, or the present one as long as that does it as well.
 
     The fit itself stays around the G that it has: it knows the rest of the error as well.
     """
-    model, error = fit.model.transfer_function, fit.around.error
+    error = fit.around.error
     if not solution.m > 0.0:
         return present
-    problem = _problem(v, y, fit, solution, pace)
+    begin, rounding = 0, fit.rounding
+    if rounding is not None:
+        # Intervals are too sharp for a u that depends on where the play began.
+        begin = fit.start.forgotten_after(v) if fit.layout.jump else 0
+        begin += memory_of(fit.model.transfer_function)
+        if begin > len(v) - FEWEST_ROWS:
+            return present
+    problem = _problem(v, y, fit, solution, pace, begin)
     yield
+    family = Family(fit.model.transfer_function, error, solution.posterior.scale)
+    if rounding is not None:
+        xi, delay = yield from low_order(family, problem, shifts=(0,))
+        # More samples tell more; as many have to say more than chance does.
+        by = WORTH_A_DESIGN if problem.samples > present.samples else float(error.count)
+        better = yield from likelier(
+            family, problem, y[len(y) - problem.samples:], rounding, xi, delay,
+            present.model.transfer_function, by, pace,
+        )
+        if better is None or not _allowed(better):
+            return present
+        return Refined(StateModel(better), problem.samples)
     # What as many coefficients bring by chance would only make the structure follow the noise, and
     # what no G explains is no better explained for that.
     chance = 2.0 * error.count * solution.inflation
     left = fit.residual(solution.posterior, len(v) - problem.samples)
     least = float(left @ left) / solution.posterior.noise_std**2
-    misfit = problem.misfit(present.transfer_function)
+    misfit = problem.misfit(present.model.transfer_function)
     if misfit <= least + chance:
         return present  # no G of low order does what the fit with its error does not
-    better = yield from low_order(model, error, problem, solution.posterior.scale, shifts=(0,))
+    xi, delay = yield from low_order(family, problem, shifts=(0,))
+    better = family.transfer_function(xi, delay, problem)
     if better is None or misfit <= problem.misfit(better) + chance or not _allowed(better):
         return present
-    return StateModel(better)
+    return Refined(StateModel(better), problem.samples)
 
 
-def _problem(v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace) -> OutputError:
+def _problem(
+    v: Array, y: Array, fit: WindowFit, solution: Solution, pace: Pace, begin: int = 0,
+) -> OutputError:
     model = fit.model.transfer_function
     memory, rows = memory_of(model), max(pace.pieces(fit.around.error.taps + 2), FEWEST_ROWS)
     u = np.concatenate([fit.input_before(solution, memory), fit.input(solution, v)])
-    first = max(len(v) - rows, 0)
+    first = max(len(v) - rows, begin)
     weights = np.where(np.isfinite(y), weights_of(y), 0.0)
     return OutputError(
         model, u[first + memory:], y[first:], weights[first:], u[first:first + memory],

@@ -62,22 +62,29 @@ class OutputError:
 
     def free_responses(self, poles: Array) -> Array:
         """Orthonormal basis of the weighted free responses of G, shape (N, ..)."""
+        return np.asarray(np.linalg.qr((self.free(poles) * self._root).T)[0])
+
+    def free(self, poles: Array) -> Array:
+        """Free responses of G, shape (n, N)."""
         order = len(poles) - 1
-        free = lfilter([1.0], poles, np.eye(max(order, 1), len(self._u)))[:order]
-        return np.asarray(np.linalg.qr(self._weighted(free).T)[0])
+        return np.asarray(lfilter([1.0], poles, np.eye(max(order, 1), self.samples))[:order])
 
     def response(self, b: Array, poles: Array, delay: int) -> Array:
-        """Response of G to u and what was before it."""
+        """Response of G to u and what was before it, from the first of these on."""
         return np.asarray(lfilter(np.append(np.zeros(delay - 1), b), poles, self._u))
+
+    def newest(self, answer: Array) -> Array:
+        """The part of a response that y is compared with, shape (N,)."""
+        return answer[self._first:]
 
     def residual(self, answer: Array, free: Array) -> Array:
         """Weighted residual of a response without the free responses, shape (N,)."""
-        return _without(free, self._y - self._weighted(answer))
+        return _without(free, self._y - self.newest(answer) * self._root)
 
     def misfit(self, model: TransferFunction) -> float:
         """Twice the negative log-likelihood of another G; its gain at rest is free."""
         poles = np.trim_zeros(model.denominator, 'b')
-        answer = self._weighted(self.response(model.numerator[1:], poles, 1))
+        answer = self.newest(self.response(model.numerator[1:], poles, 1)) * self._root
         # Where nothing but free responses is left of y or of u, there is nothing to compare.
         y, answer = _without(self.free_responses(poles), np.stack([self._y, answer]))
         power = float(answer @ answer)
@@ -87,6 +94,10 @@ class OutputError:
 
     def slopes(self, a: Array, answer: Array, delay: int, taps: int, free: Array) -> Array:
         """Derivatives of the weighted response by the taps and by a, shape (.., N)."""
+        return _without(free, self.unweighted_slopes(a, answer, delay, taps) * self._root)
+
+    def unweighted_slopes(self, a: Array, answer: Array, delay: int, taps: int) -> Array:
+        """The same without weights, and with the free responses, shape (.., N)."""
         n, count = len(a) - 1, len(self._u)
         by_input = lfilter([1.0], self.poles(a), self._u)
         by_output = lfilter([1.0], a, answer)
@@ -95,10 +106,7 @@ class OutputError:
             slopes[j, delay - 1 + j:] = by_input[:count - delay + 1 - j]
         for i in range(1, n + 1):
             slopes[taps + i - 1, i:] = -by_output[:-i]
-        return _without(free, self._weighted(slopes))
-
-    def _weighted(self, signals: Array) -> Array:
-        return np.asarray(signals[..., self._first:] * self._root)
+        return slopes[:, self._first:]
 
 
 def _without(basis: Array, signals: Array) -> Array:
@@ -106,59 +114,87 @@ def _without(basis: Array, signals: Array) -> Array:
     return np.asarray(signals - (signals @ basis) @ basis.T)
 
 
-def low_order(
-    model: TransferFunction, error: ErrorModel, problem: OutputError, scale: float,
-    shifts: Sequence[int] = SHIFTS,
-) -> Generator[None, None, TransferFunction | None]:
-    """Fit G, beginning with `model`. None where no stable G comes out.
+class Family:
+    """The G of low order around `model`, with the scale of its error. xi (k,): which one it is.
 
-    scale: of the error of `model`. shifts: samples of delay more than it has that are compared.
-
-    Yields between pieces.
+    Of all of them xi is standard normal. taps: of the numerator. prior: from xi to the taps and
+    the stable part of the denominator, shape (taps + n, k).
     """
-    n = error.taps
-    told: Array = np.zeros(n + MORE_TAPS)
-    given = model.numerator[model.delay:][:len(told)]
-    told[:len(given)] = given
-    gain = float(told.sum()) / error.gain
-    prior = scale * error.low_order_spread
-    cost, delay = np.inf, model.delay
-    b: Array = told
-    a: Array = error.stable
+
+    def __init__(self, model: TransferFunction, error: ErrorModel, scale: float) -> None:
+        self.model, self._error = model, error
+        self.taps = error.taps + MORE_TAPS
+        told: Array = np.zeros(self.taps)
+        given = model.numerator[model.delay:][:self.taps]
+        told[:len(given)] = given
+        self._gain = float(told.sum()) / error.gain
+        self._told = np.append(told, error.stable[1:])
+        self.prior = scale * error.low_order_spread
+
+    @property
+    def told(self) -> Array:
+        """The xi of `model`."""
+        return np.zeros(self.prior.shape[1])
+
+    def coefficients(self, xi: Array) -> tuple[Array, Array] | None:
+        """Taps and denominator of the stable part; None where that is not stable."""
+        value = self._told + self.prior @ xi
+        b, a = value[:self.taps], np.append(1.0, value[self.taps:])
+        stable = np.abs(np.roots(a)).max(initial=0.0) < 1.0 - ON_CIRCLE
+        return (b, a) if stable else None
+
+    def transfer_function(
+        self, xi: Array, delay: int, problem: OutputError,
+    ) -> TransferFunction | None:
+        """G with the gain at rest of `model`; None where it has none of this sign."""
+        coefficients = self.coefficients(xi)
+        if coefficients is None:
+            return None
+        b, a = coefficients
+        if b.sum() * self._gain <= 0.0:
+            return None
+        b = b * (self._gain * float(a.sum()) / float(b.sum()))
+        n = len(a) - 1
+        taps = int(np.flatnonzero(np.abs(b) > NO_TAP * np.abs(b).max())[-1]) + 1
+        order = max(n, delay + taps - 1 - problem.integrators)  # of the stable part
+        numerator: Array = np.zeros(order + problem.integrators + 1)
+        denominator: Array = np.append(a, np.zeros(order - n))
+        numerator[delay:delay + taps] = b[:taps]
+        whole = np.convolve(denominator, problem.integrate)
+        return TransferFunction(numerator.tolist(), whole.tolist())
+
+
+def low_order(
+    family: Family, problem: OutputError, shifts: Sequence[int] = SHIFTS,
+) -> Generator[None, None, tuple[Array, int]]:
+    """Fit G, beginning with the told one; its xi, and its delay in samples.
+
+    shifts: samples of delay more than the told one has that are compared. Yields between pieces.
+    """
+    cost, delay = np.inf, family.model.delay
+    best = family.told
     for shift in shifts:
-        if model.delay + shift >= 1:
-            fit = yield from _fit(told, error.stable, model.delay + shift, problem, prior)
+        if family.model.delay + shift >= 1:
+            fit = yield from _fit(family, family.model.delay + shift, problem)
             if fit[0] < cost:
-                cost, b, a = fit
-                delay = model.delay + shift
-    if not np.isfinite(cost) or b.sum() * gain <= 0.0:
-        return None
-    b = b * (gain * float(a.sum()) / float(b.sum()))
-    taps = int(np.flatnonzero(np.abs(b) > NO_TAP * np.abs(b).max())[-1]) + 1
-    order = max(n, delay + taps - 1 - problem.integrators)  # of the stable part
-    numerator: Array = np.zeros(order + problem.integrators + 1)
-    denominator: Array = np.append(a, np.zeros(order - n))
-    numerator[delay:delay + taps] = b[:taps]
-    whole = np.convolve(denominator, problem.integrate)
-    return TransferFunction(numerator.tolist(), whole.tolist())
+                cost, best = fit
+                delay = family.model.delay + shift
+    return best, delay
 
 
 def _fit(
-    b: Array, a: Array, delay: int, problem: OutputError, prior: Array,
-) -> Generator[None, None, tuple[float, Array, Array]]:
-    """Cost, numerator taps and denominator near b and a."""
-    taps = len(b)
-    start = np.append(b, a[1:])
-    best: tuple[float, Array, Array] = (np.inf, b, a)
-    xi: Array = np.zeros(prior.shape[1])
-    step: Array = xi
+    family: Family, delay: int, problem: OutputError,
+) -> Generator[None, None, tuple[float, Array]]:
+    """Cost and xi."""
+    xi = step = family.told
+    best = (np.inf, xi)
     length = 1.0
     for _ in range(GAUSS_NEWTON_STEPS):
         trial = xi + length * step
-        value = start + prior @ trial
-        b, a = value[:taps], np.append(1.0, value[taps:])
         cost = np.inf
-        if np.abs(np.roots(a)).max(initial=0.0) < 1.0 - ON_CIRCLE:
+        coefficients = family.coefficients(trial)
+        if coefficients is not None:
+            b, a = coefficients
             poles = problem.poles(a)
             free, answer = problem.free_responses(poles), problem.response(b, poles, delay)
             residual = problem.residual(answer, free)
@@ -166,9 +202,9 @@ def _fit(
         if not cost < best[0]:
             length *= SHORTER
             continue
-        xi, length, best = trial, 1.0, (cost, b, a)
-        slopes = problem.slopes(a, answer, delay, taps, free)
-        rows = np.concatenate([slopes.T @ prior, np.eye(len(xi))])
+        xi, length, best = trial, 1.0, (cost, trial)
+        slopes = problem.slopes(a, answer, delay, family.taps, free)
+        rows = np.concatenate([slopes.T @ family.prior, np.eye(len(xi))])
         step = np.linalg.lstsq(rows, np.append(residual, -xi), rcond=None)[0]
         if np.linalg.norm(rows @ step) <= STANDS:
             break

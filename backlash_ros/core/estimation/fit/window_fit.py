@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 from math import inf, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from backlash_ros.core.estimation.regression.posterior import (
     with_zero,
 )
 from backlash_ros.core.estimation.regression.regressors import RAMPS, Regressors
+from backlash_ros.core.estimation.regression.resolution import cells, information_of
 from backlash_ros.core.estimation.regression.whiteness import largest_correlation
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -37,6 +39,19 @@ STEP_SAMPLES = 64  # samples over which the size of a column is told
 # --- guards
 ANY_STATE = 1e3  # prior of x0, in units of the largest output and of the noise
 NO_RESIDUAL = 1e-10  # share of the largest y below which a residual is rounding
+
+
+class Rounding(NamedTuple):
+    """Of readings: their step, the noise beside it, and the deviation that both count as."""
+
+    resolution: float
+    noise_std: float
+    together: float
+
+    @property
+    def information(self) -> float:
+        """Of a reading."""
+        return information_of(self.resolution, self.noise_std)
 
 
 class WindowFit:
@@ -51,7 +66,7 @@ class WindowFit:
         samples: int = 0,
     ) -> None:
         self.around, self.start, self.slope, self.extent = around, start, slope, extent
-        self.model = around.model
+        self.model, self._expected = around.model, samples
         ramp = max(-(-samples // RAMPS), SLOW) if around.walk > 0.0 else 0
         past = start.labels(start.past) if len(start.past) else None
         self._before = None if past is None else past.p  # play outputs before the first sample
@@ -60,6 +75,7 @@ class WindowFit:
         if past is not None:
             self._regressors.begin_after(np.diff(past.p, prepend=start.p))
         self.layout = self._regressors.layout
+        self.rounding: Rounding | None = None  # of the readings, where they tell intervals
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.length = 0  # samples
         self.reversals = 0
@@ -98,17 +114,47 @@ class WindowFit:
         self._lowest = min(self._lowest, float(v.min()))
         return self._regressors.rows(labels, y)
 
+    @property
+    def rows(self) -> Array:
+        """Weighted columns of the samples so far, shape (N, p)."""
+        return self._rows[:self.length]
+
     def take(self, rows: Array, y: Array, weights: Array) -> None:
         """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
-        first, last = self.length, self.length + len(y)
         weight = np.where(np.isfinite(y), weights, 0.0)
         root = np.sqrt(weight)
-        rows = rows * root[:, None]
+        self._append(rows * root[:, None], np.where(weight > 0.0, y, 0.0) * root, weight.sum())
+
+    def begin_rounded(self, rounding: Rounding) -> None:
+        """Begin again with all samples, to be taken in for the intervals that they tell."""
+        self.rounding, self.length = rounding, 0
+        self._triangle = Triangle(self._vague(*self.extent))
+
+    def take_rounded(self, rows: Array, y: Array, near: Posterior, likeliest: bool = False) -> None:
+        """Take in y (N,), nan where lost, as the intervals that they tell, for outputs near these.
+
+        likeliest: whether these are the likeliest outputs, as they are to remain. Otherwise a
+        reading far outside of its interval counts as if it were exact.
+        """
+        rounding = self.rounding
+        assert rounding is not None
+        known, expected = np.isfinite(y), rows @ near.mean
+        said = cells(
+            np.where(known, y - expected, 0.0), rounding.resolution, rounding.noise_std
+        )
+        information = rounding.information if likeliest else said.information
+        # In units in which the noise is that of all readings, each tells as much as on average.
+        root = sqrt(rounding.information) * rounding.together
+        target = np.where(known, expected + said.score / information, 0.0)
+        self._append(rows * (root * known)[:, None], target * root, np.count_nonzero(known))
+        self._triangle.hold_noise(rounding.together)
+
+    def _append(self, rows: Array, y: Array, count: float) -> None:
+        first, last = self.length, self.length + len(y)
         if last > len(self._y):
             self._grow(last)
-        self._rows[first:last] = rows
-        self._y[first:last] = np.where(weight > 0.0, y, 0.0) * root
-        self._triangle.append(rows, self._y[first:last], float(weight.sum()))
+        self._rows[first:last], self._y[first:last] = rows, y
+        self._triangle.append(rows, y, float(count))
         self.length = last
 
     def _grow(self, least: int) -> None:
@@ -153,6 +199,10 @@ class WindowFit:
         gone = max(len(history) - PAST * self.model.memory, 0)
         begin = self.start._replace(past=NO_PAST).after(history[:gone])
         return begin._replace(past=history[gone:])
+
+    def relabelled(self, start: Start, slope: float) -> WindowFit:
+        """A fit of the same samples around the same, with the labels for another start."""
+        return WindowFit(self.around, start, slope, self.extent, self._expected)
 
     def restarted(self, around: Around, start: Start) -> WindowFit:
         """A fit of samples yet to come, with the prior of `around`, after a break."""
@@ -200,6 +250,11 @@ class WindowFit:
             # A sensor with a resolution repeats its error over some lags as well.
             lags = LAGS if self.around.inherited else NEXT
             correlation = max(0.0, largest_correlation(residual, lags) - BY_CHANCE / sqrt(count))
+        if self.rounding is not None:
+            # What is within the intervals is no motion of its own.
+            noise_squares = count * self.rounding.together**2
+            correlation *= min(squares / noise_squares, 1.0)
+            squares = max(squares, noise_squares)
         inflation = own.inflation if own else 1.0 - correlation + count * correlation
         posterior = self._with_other_labels(posterior, inflation)
         now = self._theta_now()

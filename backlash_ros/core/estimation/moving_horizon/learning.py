@@ -25,6 +25,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
+from backlash_ros.core.estimation.fit.better_model import Refined
 from backlash_ros.core.estimation.fit.crossings import Crossings
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, drifted
@@ -100,7 +101,7 @@ class Learning:
     supported: bool = False
     contradiction: Fitted | None = None
     held: Array | None = None
-    refined: StateModel | None = None
+    refined: Refined | None = None
 
     @property
     def expects_changes(self) -> bool:
@@ -144,7 +145,7 @@ class Learning:
     @property
     def learned_model(self) -> StateModel:
         """The G that explains y best."""
-        return self.refined or self.around.model
+        return self.refined.model if self.refined is not None else self.around.model
 
     def beginnings(self, around: Around) -> list[Around]:
         """This one, and that of the G that was told where it is another one.
@@ -193,7 +194,7 @@ class Learning:
             self.contradiction = None
 
     def go_on_from(
-        self, result: Fitted, first: int, changed: bool = False, refined: StateModel | None = None,
+        self, result: Fitted, first: int, changed: bool = False, refined: Refined | None = None,
     ) -> bool:
         """Go on from this fit of the record from sample `first` on; it is to be published.
 

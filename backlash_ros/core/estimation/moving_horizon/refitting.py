@@ -17,7 +17,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.better_model import refined_model
+from backlash_ros.core.estimation.fit.better_model import Refined, refined_model
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
@@ -28,6 +28,7 @@ from backlash_ros.core.estimation.fit.relabelling import (
     with_other_gaps,
     with_walk,
 )
+from backlash_ros.core.estimation.fit.rounding import with_rounding
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import PAST
 from backlash_ros.core.estimation.moving_horizon.change_detection import change, note_block
@@ -36,7 +37,6 @@ from backlash_ros.core.estimation.observer.attribution import attributed
 from backlash_ros.core.estimation.observer.observer import Observer
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.estimation.regression.readings import weights_of
-from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,11 @@ def take_block(learning: Learning) -> Task:
         record.lose(number + np.flatnonzero(outliers))
     misfit = float(squares[valid].mean()) if valid.any() else 0.0
     fits = misfit <= MISFIT
-    fit.take(rows, np.where(valid & fits, y, nan), weights_of(y))
+    taken = np.where(valid & fits, y, nan)
+    if fit.rounding is not None:
+        fit.take_rounded(rows, taken, solution.posterior)
+    else:
+        fit.take(rows, taken, weights_of(y))
     yield
     note_block(learning, fits, number, len(v), number + change(squares))
     learning.current = Fitted(fit, fit.solve())
@@ -91,10 +95,13 @@ def refit(learning: Learning) -> Task:
     result = yield from with_walk(v, y, result, learning.pace)
     if len(v) <= SEARCHED:
         result = yield from _beside_other_gaps(learning, v, y, result)
-    refined: StateModel | None = None
+    if not around.inherited:
+        result = yield from with_rounding(v, y, result, learning.pace)
+    refined: Refined | None = None
     if around.error.count and not around.inherited:
         refined = yield from refined_model(
-            v, y, result.fit, result.solution, learning.learned_model, learning.pace
+            v, y, result.fit, result.solution, learning.refined or Refined(around.model, 0),
+            learning.pace,
         )
     return learning.go_on_from(result, first, refined=refined)
 

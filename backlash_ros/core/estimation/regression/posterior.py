@@ -74,6 +74,11 @@ class Triangle:
         rows[:, where] = root
         return self._with_rows(rows, root @ mean)
 
+    def hold_noise(self, noise_std: float) -> None:
+        """Let the residual so far be that of noise of this deviation."""
+        size = len(self.r) - 1
+        self.r[size, size] = noise_std * sqrt(max(self.count - size, 0.0))
+
     def without(self, column: int) -> Triangle:
         """The same where this unknown is 0."""
         size = len(self.r) - 1
