@@ -60,6 +60,16 @@ def test_a_triangle_read_by_an_encoder_is_learned_from(amplitude: float) -> None
         assert np.abs(record.column(name)[later] / true - 1.0).max() < 0.01
 
 
+def test_where_the_play_began_does_not_contradict_readings_that_were_rounded() -> None:
+    # Labels before the first engagement are the least sure ones, and intervals the sharpest data.
+    p = Parameters({
+        **load_config(SHIPPED / 'geared_motor.yaml'), 'structure': 'proportional',
+        'truth.scale_frequency': 0.8,
+    })
+    record = build_closed_loop(p).run(900)
+    assert (record.column('status')[200:] == Status.TRACKING).all()
+
+
 def test_cases_are_single_differences_and_pairs_of_different_kinds() -> None:
     cases = near_cases()
     assert sum(', ' not in name for name in cases) == 11

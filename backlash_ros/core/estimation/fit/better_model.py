@@ -64,8 +64,7 @@ def refined_model(
     begin, rounding = 0, fit.rounding
     if rounding is not None:
         # Intervals are too sharp for a u that depends on where the play began.
-        begin = fit.start.forgotten_after(v) if fit.layout.jump else 0
-        begin += memory_of(fit.model.transfer_function)
+        begin = fit.forgotten_after(v) + memory_of(fit.model.transfer_function)
         if begin > len(v) - FEWEST_ROWS:
             return present
     problem = _problem(v, y, fit, solution, pace, begin)

@@ -6,7 +6,7 @@ gap (relabelling.py).
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -30,15 +30,19 @@ MOST_NOISE, LEAST_NOISE = 1.0 / 4.0, 1.0 / 16.0
 
 
 class _Unknowns:
-    """All unknowns of a fit, given readings y (N,) with this resolution, nan where lost.
+    """All unknowns of a fit, given those of its readings y (N,) that are intervals.
 
     In coordinates z in which the posterior of the least-squares fit is standard normal: x = mean +
-    root z. What that fit knows besides its samples is the prior. rows: unweighted, shape (N, p).
+    root z. What that fit knows besides, its prior and the values before `first`, is the prior here.
+    y: nan where lost. rows: of all samples, unweighted, shape (N, p).
     """
 
-    def __init__(self, fit: WindowFit, y: Array, known: Posterior, resolution: float) -> None:
-        self._known, self._resolution = np.isfinite(y), resolution
-        self._y = np.where(self._known, y, 0.0)
+    def __init__(
+        self, fit: WindowFit, y: Array, first: int, known: Posterior, resolution: float,
+    ) -> None:
+        self._first, self._resolution = first, resolution
+        self._known = np.isfinite(y[first:])
+        self._y = np.where(self._known, y[first:], 0.0)
         weights = weights_of(y)
         self.rows = fit.rows / np.sqrt(weights)[:, None]
         self._mean = known.mean
@@ -47,10 +51,10 @@ class _Unknowns:
         units = np.where(std > 0.0, std, 1.0)
         shares, axes = np.linalg.eigh(known.cov / np.outer(units, units))
         self._root = units[:, None] * axes * (np.sqrt(np.maximum(shares, 0.0)) * known.noise_std)
-        by = fit.rows @ self._root / known.noise_std
+        by = fit.rows[first:] @ self._root / known.noise_std
         shares, axes = np.linalg.eigh(np.eye(by.shape[1]) - by.T @ by)
         self._prior = (axes * np.maximum(shares, 0.0)) @ axes.T
-        left = (self._y - self.rows @ self._mean) * np.sqrt(weights) * self._known
+        left = (self._y - self.rows[first:] @ self._mean) * np.sqrt(weights[first:]) * self._known
         self._pull = by.T @ left / -known.noise_std
 
     @property
@@ -68,10 +72,9 @@ class _Unknowns:
         value = float(self._pull @ z - 0.5 * z @ prior)
         gradient, precision = self._pull - prior, self._prior.copy()
         x = self.unknowns(z)
-        step = pace.pieces(len(z))
-        for first in range(0, len(self._y), step):
-            part = slice(first, first + step)
-            rows, known = self.rows[part], self._known[part]
+        intervals = self.rows[self._first:]
+        for part in _pieces(0, len(intervals), len(z), pace):
+            rows, known = intervals[part], self._known[part]
             said = cells(self._y[part] - rows @ x, self._resolution, noise_std)
             by = rows @ self._root
             value += float(said.likelihood @ known)
@@ -89,8 +92,13 @@ def with_rounding(
     resolution = resolution_of(y)
     if resolution == 0.0 or not solution.m > 0.0 or fit.gap_spread > 0.0:
         return result
+    # Intervals are too sharp for a u that depends on where the play began.
+    first = fit.forgotten_after(v)
+    first += fit.model.memory if first else 0
+    if first >= len(v):
+        return result
     known = solution.posterior
-    problem = _Unknowns(fit, y, known, resolution)
+    problem = _Unknowns(fit, y, first, known, resolution)
     most = MOST_NOISE * resolution
     z, _, noise_std = yield from climbed(
         problem, problem.start, most, LEAST_NOISE * resolution, pace
@@ -99,7 +107,8 @@ def with_rounding(
         return result
     rounding = Rounding(resolution, noise_std, known.noise_std)
     for _ in range(RELABELLINGS):
-        yield from _read(fit, problem, y, rounding, replace(known, mean=problem.unknowns(z)), pace)
+        most_likely = replace(known, mean=problem.unknowns(z))
+        yield from _read(fit, problem, y, first, rounding, most_likely, pace)
         result = Fitted(fit, fit.solve(), result.decided)
         solution = result.solution
         # Labels that are closer than this would not be made again either.
@@ -114,14 +123,17 @@ def with_rounding(
 
 
 def _read(
-    fit: WindowFit, problem: _Unknowns, y: Array, rounding: Rounding, most: Posterior, pace: Pace,
+    fit: WindowFit, problem: _Unknowns, y: Array, first: int, rounding: Rounding, most: Posterior,
+    pace: Pace,
 ) -> Generator[None, None, None]:
-    """Let a fit take in all readings with the likeliest unknowns, in pieces."""
+    """Let a fit take in all readings with the likeliest unknowns: values before `first`."""
+    rows, weights = problem.rows, weights_of(y)
     fit.begin_rounded(rounding)
-    step = pace.pieces(problem.rows.shape[1])
-    for first in range(0, len(y), step):
-        part = slice(first, first + step)
-        fit.take_rounded(problem.rows[part], y[part], most, likeliest=True)
+    for part in _pieces(0, first, fit.layout.unknowns, pace):
+        fit.take(rows[part], y[part], weights[part])
+        yield
+    for part in _pieces(first, len(y), fit.layout.unknowns, pace):
+        fit.take_rounded(rows[part], y[part], most, likeliest=True)
         yield
 
 
@@ -129,10 +141,14 @@ def _columns(
     fit: WindowFit, v: Array, y: Array, pace: Pace,
 ) -> Generator[None, None, Array]:
     """Columns of a fit for all samples, shape (N, p), made in pieces."""
-    step = pace.pieces(fit.layout.unknowns)
     columns = []
-    for first in range(0, len(v), step):
-        part = slice(first, first + step)
+    for part in _pieces(0, len(v), fit.layout.unknowns, pace):
         columns.append(fit.columns(v[part], y[part]))
         yield
     return np.concatenate(columns)
+
+
+def _pieces(first: int, last: int, unknowns: int, pace: Pace) -> Iterator[slice]:
+    """Samples from `first` to before `last`, in pieces."""
+    step = pace.pieces(unknowns)
+    return (slice(k, min(k + step, last)) for k in range(first, last, step))

@@ -200,6 +200,10 @@ class WindowFit:
         begin = self.start._replace(past=NO_PAST).after(history[:gone])
         return begin._replace(past=history[gone:])
 
+    def forgotten_after(self, v: Array) -> int:
+        """Samples of v (N,) after which u no longer depends on where the play began."""
+        return self._begun.forgotten_after(v) if self._begun.side == 0 else 0
+
     def relabelled(self, start: Start, slope: float) -> WindowFit:
         """A fit of the same samples around the same, with the labels for another start."""
         return WindowFit(self.around, start, slope, self.extent, self._expected)
