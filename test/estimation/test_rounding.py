@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from records import Truth, output, resonance, swing
 
-from backlash_ros.core.estimation.fit.better_model import Refined, refined_model
+from backlash_ros.core.estimation.fit.low_order.better_model import Refined, refined_model
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted_with_model
-from backlash_ros.core.estimation.fit.rounding import with_rounding
+from backlash_ros.core.estimation.fit.rounding.rounding import with_rounding
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
@@ -63,7 +63,7 @@ def errors(fits: list[Fitted]) -> tuple[float, float]:
 
 def test_intervals_tell_more_than_values_and_their_deviations_are_honest() -> None:
     values, intervals = zip(*motions(), strict=True)
-    assert all(fit.fit.rounding is not None for fit in intervals)
+    assert all(fit.fit.samples.rounding is not None for fit in intervals)
     as_values, _ = errors(list(values))
     as_intervals, in_deviations = errors(list(intervals))
     assert as_intervals < 0.75 * as_values
@@ -102,12 +102,12 @@ def test_what_no_backlash_explains_still_widens_the_deviations() -> None:
 @pytest.mark.parametrize('noise_std', [0.5 * STEP, 2.0 * STEP])
 def test_with_as_much_noise_as_rounding_readings_remain_values(noise_std: float) -> None:
     v = swing(SAMPLES)
-    assert both(v, rounded(v, noise_std=noise_std))[1].fit.rounding is None
+    assert both(v, rounded(v, noise_std=noise_std))[1].fit.samples.rounding is None
 
 
 def test_readings_without_steps_remain_values() -> None:
     v = swing(SAMPLES)
-    assert both(v, output(resonance(), v, TRUTH, 1e-3))[1].fit.rounding is None
+    assert both(v, output(resonance(), v, TRUTH, 1e-3))[1].fit.samples.rounding is None
 
 
 def test_lost_readings_tell_nothing() -> None:
@@ -116,7 +116,7 @@ def test_lost_readings_tell_nothing() -> None:
     whole = both(v, y)[1]
     y[400:600:3] = np.nan
     values, intervals = both(v, y)
-    assert intervals.fit.rounding is not None
+    assert intervals.fit.samples.rounding is not None
     assert whole.solution.count - intervals.solution.count == np.isnan(y).sum()
     assert intervals.solution.std_gap < values.solution.std_gap
     assert abs(intervals.solution.gap - TRUTH.gap) < 4.0 * intervals.solution.std_gap
@@ -129,7 +129,7 @@ def test_more_samples_are_taken_in_as_intervals_too() -> None:
     first = drained(with_rounding(v[:half], y[:half], by_values(v[:half], y[:half]), Pace()))
     fit = first.fit
     rows = fit.columns(v[half:], y[half:])
-    fit.take_rounded(rows, y[half:], first.solution.posterior)
+    fit.samples.take_rounded(rows, y[half:], first.solution.posterior)
     solution = fit.solve()
     assert fit.length == SAMPLES
     assert solution.std_gap < first.solution.std_gap
@@ -144,7 +144,7 @@ def test_a_reading_far_off_does_not_lead_astray() -> None:
     rows = fit.columns(more, np.zeros(8))
     read = rows @ solution.posterior.mean
     read[3] += 20.0 * STEP
-    fit.take_rounded(rows, read, solution.posterior)
+    fit.samples.take_rounded(rows, read, solution.posterior)
     # It counts as one that was read exactly, and so as no more than its weight.
     assert abs(fit.solve().gap - solution.gap) < 25.0 * solution.std_gap
 

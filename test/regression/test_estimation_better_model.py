@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from records import Truth, output, resonance, swing
 
-from backlash_ros.core.estimation.fit.better_model import Refined, refined_model
+from backlash_ros.core.estimation.fit.low_order.better_model import Refined, refined_model
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.solution import Around

@@ -7,7 +7,9 @@ import pytest
 from records import PERIOD_S, resonance, swing
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.fit.low_order import Family, OutputError, low_order, memory_of
+from backlash_ros.core.estimation.fit.low_order.family import Family, memory_of
+from backlash_ros.core.estimation.fit.low_order.low_order import low_order
+from backlash_ros.core.estimation.fit.low_order.output_error import OutputError
 from backlash_ros.core.estimation.fit.pace import drained
 from backlash_ros.core.estimation.regression.error_model import ErrorModel, build_error_model
 from backlash_ros.core.plant.state_model import StateModel

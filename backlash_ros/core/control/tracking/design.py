@@ -108,11 +108,9 @@ def better_design_in_pieces(
     unsafe = 0.0
     for weight_factor in SAFER:
         try:
-            feedback = feedback_around(model, weights, weight_factor)
+            margin = yield from _margin_with(model, weights, weight_factor)
         except ParameterError:
             return None
-        yield
-        margin = yield from margin_in_pieces(model, feedback)
         if margin < needed and not compared:
             compared = True
             for plant in (present.model, model):
@@ -126,14 +124,21 @@ def better_design_in_pieces(
     # What is weaker than it has to be is the measure for the next G, and so lost for good.
     for _ in range(HALVINGS if unsafe > 0.0 else 0):
         between = sqrt(unsafe * weight_factor)
-        feedback = feedback_around(model, weights, between)
-        yield
-        margin = yield from margin_in_pieces(model, feedback)
+        margin = yield from _margin_with(model, weights, between)
         if margin > 0.0 and margin >= needed:
             weight_factor = between
         else:
             unsafe = between
     return (yield from design_in_pieces(model, weights, weight_factor))
+
+
+def _margin_with(
+    model: StateModel, weights: Weights, weight_factor: float,
+) -> Generator[None, None, float]:
+    """Modulus margin of the loop around G with this weight; raises ParameterError."""
+    feedback = feedback_around(model, weights, weight_factor)
+    yield
+    return (yield from margin_in_pieces(model, feedback))
 
 
 def design(model: StateModel, weights: Weights) -> TrackingDesign:

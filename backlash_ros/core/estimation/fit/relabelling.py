@@ -25,9 +25,9 @@ from backlash_ros.core.estimation.constants import (
     WALKS,
     ZOOM,
 )
-from backlash_ros.core.estimation.fit.better_model import better_model
 from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.learned_error import wants_another_model
+from backlash_ros.core.estimation.fit.low_order.better_model import better_model
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance, contradicts
 from backlash_ros.core.estimation.fit.search import (
@@ -107,7 +107,7 @@ def fitted(
         fit = WindowFit(around, start, slope, extent, int(GROWTH * len(v)))
         while fit.length < len(v):
             part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
-            fit.take(fit.columns(v[part], y[part]), y[part], weights[part])
+            fit.samples.take(fit.columns(v[part], y[part]), y[part], weights[part])
             yield
         solution = fit.solve()
         result = Fitted(fit, solution)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 from math import inf, sqrt
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.constants import BY_CHANCE, GATE, LAGS, SLOW
 from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.solution import Around, Solution
+from backlash_ros.core.estimation.fit.weighted_samples import WeightedSamples
 from backlash_ros.core.estimation.regression.play import NO_PAST, Labels, Start
 from backlash_ros.core.estimation.regression.posterior import (
     VAGUE,
@@ -27,7 +27,6 @@ from backlash_ros.core.estimation.regression.posterior import (
     with_zero,
 )
 from backlash_ros.core.estimation.regression.regressors import RAMPS, Regressors
-from backlash_ros.core.estimation.regression.resolution import cells, information_of
 from backlash_ros.core.estimation.regression.whiteness import largest_correlation
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -39,19 +38,6 @@ STEP_SAMPLES = 64  # samples over which the size of a column is told
 # --- guards
 ANY_STATE = 1e3  # prior of x0, in units of the largest output and of the noise
 NO_RESIDUAL = 1e-10  # share of the largest y below which a residual is rounding
-
-
-class Rounding(NamedTuple):
-    """Of readings: their step, the noise beside it, and the deviation that both count as."""
-
-    resolution: float
-    noise_std: float
-    together: float
-
-    @property
-    def information(self) -> float:
-        """Of a reading."""
-        return information_of(self.resolution, self.noise_std)
 
 
 class WindowFit:
@@ -75,15 +61,16 @@ class WindowFit:
         if past is not None:
             self._regressors.begin_after(np.diff(past.p, prepend=start.p))
         self.layout = self._regressors.layout
-        self.rounding: Rounding | None = None  # of the readings, where they tell intervals
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
-        self.length = 0  # samples
         self.reversals = 0
         self._play = begun
         self._highest, self._lowest = -inf, inf
-        self._rows: Array = np.empty((0, self.layout.unknowns))
-        self._y: Array = np.empty(0)
-        self._triangle = Triangle(self._vague(*extent))
+        self.samples = WeightedSamples(self._vague(*extent))
+
+    @property
+    def length(self) -> int:
+        """How many samples."""
+        return self.samples.length
 
     @property
     def swing(self) -> float:
@@ -105,7 +92,7 @@ class WindowFit:
     def columns(self, v: Array, y: Array) -> Array:
         """Columns for the next v (N,), applied one after the other, and y (N,) after each.
 
-        `take` is to follow.
+        The samples are to take them in next.
         """
         play = self._play
         labels = play.labels(v)
@@ -113,55 +100,6 @@ class WindowFit:
         self._highest = max(self._highest, float(v.max()))
         self._lowest = min(self._lowest, float(v.min()))
         return self._regressors.rows(labels, y)
-
-    @property
-    def rows(self) -> Array:
-        """Weighted columns of the samples so far, shape (N, p)."""
-        return self._rows[:self.length]
-
-    def take(self, rows: Array, y: Array, weights: Array) -> None:
-        """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
-        weight = np.where(np.isfinite(y), weights, 0.0)
-        root = np.sqrt(weight)
-        self._append(rows * root[:, None], np.where(weight > 0.0, y, 0.0) * root, weight.sum())
-
-    def begin_rounded(self, rounding: Rounding) -> None:
-        """Begin again with all samples, to be taken in for the intervals that they tell."""
-        self.rounding, self.length = rounding, 0
-        self._triangle = Triangle(self._vague(*self.extent))
-
-    def take_rounded(self, rows: Array, y: Array, near: Posterior, likeliest: bool = False) -> None:
-        """Take in y (N,), nan where lost, as the intervals that they tell, for outputs near these.
-
-        likeliest: whether these are the likeliest outputs, as they are to remain. Otherwise a
-        reading far outside of its interval counts as if it were exact.
-        """
-        rounding = self.rounding
-        assert rounding is not None
-        known, expected = np.isfinite(y), rows @ near.mean
-        said = cells(
-            np.where(known, y - expected, 0.0), rounding.resolution, rounding.noise_std
-        )
-        information = rounding.information if likeliest else said.information
-        # In units in which the noise is that of all readings, each tells as much as on average.
-        root = sqrt(rounding.information) * rounding.together
-        target = np.where(known, expected + said.score / information, 0.0)
-        self._append(rows * (root * known)[:, None], target * root, np.count_nonzero(known))
-        self._triangle.hold_noise(rounding.together)
-
-    def _append(self, rows: Array, y: Array, count: float) -> None:
-        first, last = self.length, self.length + len(y)
-        if last > len(self._y):
-            self._grow(last)
-        self._rows[first:last], self._y[first:last] = rows, y
-        self._triangle.append(rows, y, float(count))
-        self.length = last
-
-    def _grow(self, least: int) -> None:
-        """Make room for more samples than now, twice as many as there are."""
-        more = max(2 * len(self._y), least) - len(self._y)
-        self._rows = np.concatenate([self._rows, np.empty((more, self.layout.unknowns))])
-        self._y = np.concatenate([self._y, np.empty(more)])
 
     def contradiction(
         self, rows: Array, y: Array, solution: Solution,
@@ -232,7 +170,7 @@ class WindowFit:
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
-        triangle, offset, prior = self._triangle, 0.0, self.around.prior
+        triangle, offset, prior = self.samples.triangle, 0.0, self.around.prior
         own: Solution | None = None
         if prior is not None and not alone:
             if self.around.inherited and triangle.count > layout.unknowns:
@@ -246,17 +184,18 @@ class WindowFit:
         posterior = self._posterior(triangle, spreads, leaking)
         if offset:
             posterior = replace(posterior, evidence=posterior.evidence + offset)
-        residual = self.residual(posterior)
+        residual = self.samples.residual(posterior)
         squares = float(residual @ residual)
-        count = self._triangle.count
+        count = self.samples.triangle.count
         correlation = 0.0
         if squares > count * (NO_RESIDUAL * self.extent[0]) ** 2 and count > 1.0:
             # A sensor with a resolution repeats its error over some lags as well.
             lags = LAGS if self.around.inherited else NEXT
             correlation = max(0.0, largest_correlation(residual, lags) - BY_CHANCE / sqrt(count))
-        if self.rounding is not None:
+        rounding = self.samples.rounding
+        if rounding is not None:
             # What is within the intervals is no motion of its own.
-            noise_squares = count * self.rounding.together**2
+            noise_squares = count * rounding.together**2
             correlation *= min(squares / noise_squares, 1.0)
             squares = max(squares, noise_squares)
         inflation = own.inflation if own else 1.0 - correlation + count * correlation
@@ -323,14 +262,9 @@ class WindowFit:
         now[1:, layout.walk] = -self._regressors.heights
         return now
 
-    def residual(self, posterior: Posterior, since: int = 0) -> Array:
-        """Weighted y minus its fit from sample `since` on; 0 where y was lost."""
-        rows, y = self._rows[since:self.length], self._y[since:self.length]
-        return np.asarray(y - rows @ posterior.mean)
-
     def misfit(self, solution: Solution, since: int) -> float:
         """Mean square of the residual from sample `since` on, over that of all samples."""
-        newest = self.residual(solution.posterior, since)
+        newest = self.samples.residual(solution.posterior, since)
         known = np.count_nonzero(newest)
         if not known or solution.rms == 0.0:
             return 0.0

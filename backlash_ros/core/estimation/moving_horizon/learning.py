@@ -25,8 +25,8 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.better_model import Refined
 from backlash_ros.core.estimation.fit.crossings import Crossings
+from backlash_ros.core.estimation.fit.low_order.better_model import Refined
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, drifted
 from backlash_ros.core.estimation.fit.record import Record

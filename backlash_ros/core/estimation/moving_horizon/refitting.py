@@ -17,7 +17,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.better_model import Refined, refined_model
+from backlash_ros.core.estimation.fit.low_order.better_model import Refined, refined_model
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
@@ -28,7 +28,7 @@ from backlash_ros.core.estimation.fit.relabelling import (
     with_other_gaps,
     with_walk,
 )
-from backlash_ros.core.estimation.fit.rounding import with_rounding
+from backlash_ros.core.estimation.fit.rounding.rounding import with_rounding
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import PAST
 from backlash_ros.core.estimation.moving_horizon.change_detection import change, note_block
@@ -65,10 +65,10 @@ def take_block(learning: Learning) -> Task:
     misfit = float(squares[valid].mean()) if valid.any() else 0.0
     fits = misfit <= MISFIT
     taken = np.where(valid & fits, y, nan)
-    if fit.rounding is not None:
-        fit.take_rounded(rows, taken, solution.posterior)
+    if fit.samples.rounding is not None:
+        fit.samples.take_rounded(rows, taken, solution.posterior)
     else:
-        fit.take(rows, taken, weights_of(y))
+        fit.samples.take(rows, taken, weights_of(y))
     yield
     note_block(learning, fits, number, len(v), number + change(squares))
     learning.current = Fitted(fit, fit.solve())

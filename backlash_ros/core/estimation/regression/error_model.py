@@ -54,7 +54,7 @@ class ErrorModel:
         self.integrates = bool(np.any(np.abs(poles - 1.0) < ON_CIRCLE))
         self.leak = LEAK * uncertainty if self.integrates else 0.0
         self.spread: Array = np.zeros((0, 0))
-        # The same as a G of low order: spread of its taps and denominator (low_order.py).
+        # The same as a G of low order: spread of its taps and denominator (family.py).
         self.low_order_spread: Array = np.zeros((0, 0))
         if self.count:
             self.spread, self.low_order_spread = _prior(model, self, moving, uncertainty)

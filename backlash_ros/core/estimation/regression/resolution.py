@@ -31,6 +31,19 @@ EVEN = 1e-3  # share of a step by which a distance of two readings may be off a 
 FEWEST_READINGS = 30  # different ones that tell a resolution
 
 
+class Rounding(NamedTuple):
+    """Of readings: their step, the noise beside it, and the deviation that both count as."""
+
+    resolution: float
+    noise_std: float
+    together: float
+
+    @property
+    def information(self) -> float:
+        """Of a reading."""
+        return information_of(self.resolution, self.noise_std)
+
+
 class Cells(NamedTuple):
     """Of each reading: its log-likelihood, its derivative by the output, and its information.
 

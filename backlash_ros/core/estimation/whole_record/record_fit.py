@@ -143,6 +143,6 @@ def _negated(around: Around) -> Around:
 
 
 def _outliers(result: Fitted) -> NDArray[np.bool_]:
-    residual = result.fit.residual(result.solution.posterior)
+    residual = result.fit.samples.residual(result.solution.posterior)
     # It is 0 where y was lost.
     return outliers(np.where(residual == 0.0, nan, residual), result.around.told_std)

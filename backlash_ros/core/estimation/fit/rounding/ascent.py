@@ -12,8 +12,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit.pace import Pace
-
 Array = NDArray[np.float64]
 
 QUIETER = 0.25  # ratio of one size of the noise that is tried to the one before
@@ -33,12 +31,12 @@ class Place(NamedTuple):
 class LogPosterior(Protocol):
     """Of unknowns x (p,), given readings that were rounded."""
 
-    def at(self, x: Array, noise_std: float, pace: Pace) -> Generator[None, None, Place]:
+    def at(self, x: Array, noise_std: float) -> Generator[None, None, Place]:
         """What it is at x with noise of this deviation beside the rounding, in pieces."""
 
 
 def climbed(
-    posterior: LogPosterior, x: Array, noise_std: float, least: float, pace: Pace,
+    posterior: LogPosterior, x: Array, noise_std: float, least: float,
 ) -> Generator[None, None, tuple[Array, float, float]]:
     """The most likely x (p,), beginning with this one, its log-posterior, and the likeliest noise.
 
@@ -46,7 +44,7 @@ def climbed(
     """
     best = (x, -np.inf, noise_std)
     while noise_std >= least:
-        x, value = yield from climbed_at(posterior, x, noise_std, pace)
+        x, value = yield from climbed_at(posterior, x, noise_std)
         if not value > best[1]:
             break
         best = (x, value, noise_std)
@@ -55,19 +53,19 @@ def climbed(
 
 
 def climbed_at(
-    posterior: LogPosterior, x: Array, noise_std: float, pace: Pace,
+    posterior: LogPosterior, x: Array, noise_std: float,
 ) -> Generator[None, None, tuple[Array, float]]:
     """The most likely x (p,) for this noise, beginning with this one, and its log-posterior."""
-    here = yield from posterior.at(x, noise_std, pace)
+    here = yield from posterior.at(x, noise_std)
     for _ in range(NEWTON_STEPS):
         step = np.linalg.solve(here.precision, here.gradient)
         if not here.gradient @ step > GAIN:
             break
         length = 1.0
-        there = yield from posterior.at(x + step, noise_std, pace)
+        there = yield from posterior.at(x + step, noise_std)
         while not there.value > here.value and length > SHORTEST:
             length *= SHORTER
-            there = yield from posterior.at(x + length * step, noise_std, pace)
+            there = yield from posterior.at(x + length * step, noise_std)
         if not there.value > here.value:
             break
         x, here = x + length * step, there

@@ -12,9 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit.low_order import Family, OutputError, low_order, memory_of
+from backlash_ros.core.estimation.fit.low_order.family import Family, memory_of
+from backlash_ros.core.estimation.fit.low_order.low_order import likelier_by_values, low_order
+from backlash_ros.core.estimation.fit.low_order.output_error import OutputError
 from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.fit.rounded_output import likelier
+from backlash_ros.core.estimation.fit.rounding.rounded_output import likelier_by_intervals
 from backlash_ros.core.estimation.fit.solution import Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.readings import weights_of
@@ -61,7 +63,7 @@ def refined_model(
     error = fit.around.error
     if not solution.m > 0.0:
         return present
-    begin, rounding = 0, fit.rounding
+    begin, rounding = 0, fit.samples.rounding
     if rounding is not None:
         # Intervals are too sharp for a u that depends on where the play began.
         begin = fit.forgotten_after(v) + memory_of(fit.model.transfer_function)
@@ -70,28 +72,19 @@ def refined_model(
     problem = _problem(v, y, fit, solution, pace, begin)
     yield
     family = Family(fit.model.transfer_function, error, solution.posterior.scale)
+    told = present.model.transfer_function
     if rounding is not None:
-        xi, delay = yield from low_order(family, problem, shifts=(0,))
         # More samples tell more; as many have to say more than chance does.
         by = WORTH_A_DESIGN if problem.samples > present.samples else float(error.count)
-        better = yield from likelier(
-            family, problem, y[len(y) - problem.samples:], rounding, xi, delay,
-            present.model.transfer_function, by, pace,
-        )
-        if better is None or not _allowed(better):
-            return present
-        return Refined(StateModel(better), problem.samples)
-    # What as many coefficients bring by chance would only make the structure follow the noise, and
-    # what no G explains is no better explained for that.
-    chance = 2.0 * error.count * solution.inflation
-    left = fit.residual(solution.posterior, len(v) - problem.samples)
-    least = float(left @ left) / solution.posterior.noise_std**2
-    misfit = problem.misfit(present.model.transfer_function)
-    if misfit <= least + chance:
-        return present  # no G of low order does what the fit with its error does not
-    xi, delay = yield from low_order(family, problem, shifts=(0,))
-    better = family.transfer_function(xi, delay, problem)
-    if better is None or misfit <= problem.misfit(better) + chance or not _allowed(better):
+        read = y[len(y) - problem.samples:]
+        better = yield from likelier_by_intervals(family, problem, told, read, rounding, by)
+    else:
+        # What no G explains is no better explained for as many coefficients.
+        by = error.count * solution.inflation
+        left = fit.samples.residual(solution.posterior, len(v) - problem.samples)
+        least = float(left @ left) / solution.posterior.noise_std**2
+        better = yield from likelier_by_values(family, problem, told, least, by)
+    if better is None or not _allowed(better):
         return present
     return Refined(StateModel(better), problem.samples)
 

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import MOVED
-from backlash_ros.core.estimation.fit.ascent import Place, climbed, climbed_at
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.relabelling import RELABELLINGS, Fitted
-from backlash_ros.core.estimation.fit.window_fit import Rounding, WindowFit
+from backlash_ros.core.estimation.fit.rounding.ascent import Place, climbed, climbed_at
+from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.posterior import Posterior
 from backlash_ros.core.estimation.regression.readings import weights_of
-from backlash_ros.core.estimation.regression.resolution import cells, resolution_of
+from backlash_ros.core.estimation.regression.resolution import Rounding, cells, resolution_of
 
 Array = NDArray[np.float64]
 
@@ -39,19 +39,20 @@ class _Unknowns:
 
     def __init__(
         self, fit: WindowFit, y: Array, first: int, known: Posterior, resolution: float,
+        pace: Pace,
     ) -> None:
-        self._first, self._resolution = first, resolution
+        self._first, self._resolution, self._pace = first, resolution, pace
         self._known = np.isfinite(y[first:])
         self._y = np.where(self._known, y[first:], 0.0)
         weights = weights_of(y)
-        self.rows = fit.rows / np.sqrt(weights)[:, None]
+        self.rows = fit.samples.rows / np.sqrt(weights)[:, None]
         self._mean = known.mean
         # Of the correlations: the units of the unknowns differ by many orders of magnitude.
         std = np.sqrt(np.diag(known.cov))
         units = np.where(std > 0.0, std, 1.0)
         shares, axes = np.linalg.eigh(known.cov / np.outer(units, units))
         self._root = units[:, None] * axes * (np.sqrt(np.maximum(shares, 0.0)) * known.noise_std)
-        by = fit.rows[first:] @ self._root / known.noise_std
+        by = fit.samples.rows[first:] @ self._root / known.noise_std
         shares, axes = np.linalg.eigh(np.eye(by.shape[1]) - by.T @ by)
         self._prior = (axes * np.maximum(shares, 0.0)) @ axes.T
         left = (self._y - self.rows[first:] @ self._mean) * np.sqrt(weights[first:]) * self._known
@@ -66,14 +67,14 @@ class _Unknowns:
         """x (p,)."""
         return np.asarray(self._mean + self._root @ z)
 
-    def at(self, z: Array, noise_std: float, pace: Pace) -> Generator[None, None, Place]:
+    def at(self, z: Array, noise_std: float) -> Generator[None, None, Place]:
         """The log-posterior at z (p,)."""
         prior = self._prior @ z
         value = float(self._pull @ z - 0.5 * z @ prior)
         gradient, precision = self._pull - prior, self._prior.copy()
         x = self.unknowns(z)
         intervals = self.rows[self._first:]
-        for part in _pieces(0, len(intervals), len(z), pace):
+        for part in _pieces(0, len(intervals), len(z), self._pace):
             rows, known = intervals[part], self._known[part]
             said = cells(self._y[part] - rows @ x, self._resolution, noise_std)
             by = rows @ self._root
@@ -98,11 +99,9 @@ def with_rounding(
     if first >= len(v):
         return result
     known = solution.posterior
-    problem = _Unknowns(fit, y, first, known, resolution)
+    problem = _Unknowns(fit, y, first, known, resolution, pace)
     most = MOST_NOISE * resolution
-    z, _, noise_std = yield from climbed(
-        problem, problem.start, most, LEAST_NOISE * resolution, pace
-    )
+    z, _, noise_std = yield from climbed(problem, problem.start, most, LEAST_NOISE * resolution)
     if noise_std == most:
         return result
     rounding = Rounding(resolution, noise_std, known.noise_std)
@@ -118,7 +117,7 @@ def with_rounding(
             break
         fit = fit.relabelled(result.beginning(v), solution.m)
         problem.rows = yield from _columns(fit, v, y, pace)
-        z, _ = yield from climbed_at(problem, z, noise_std, pace)
+        z, _ = yield from climbed_at(problem, z, noise_std)
     return result
 
 
@@ -128,12 +127,12 @@ def _read(
 ) -> Generator[None, None, None]:
     """Let a fit take in all readings with the likeliest unknowns: values before `first`."""
     rows, weights = problem.rows, weights_of(y)
-    fit.begin_rounded(rounding)
+    fit.samples.begin_rounded(rounding)
     for part in _pieces(0, first, fit.layout.unknowns, pace):
-        fit.take(rows[part], y[part], weights[part])
+        fit.samples.take(rows[part], y[part], weights[part])
         yield
     for part in _pieces(first, len(y), fit.layout.unknowns, pace):
-        fit.take_rounded(rows[part], y[part], most, likeliest=True)
+        fit.samples.take_rounded(rows[part], y[part], most, likeliest=True)
         yield
 
 

@@ -1,4 +1,4 @@
-"""The G of low order that readings which were rounded speak for, given u (low_order.py)."""
+"""The G of low order that readings which were rounded speak for, given u (family.py)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Generator
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit.ascent import Place, climbed, climbed_at
-from backlash_ros.core.estimation.fit.low_order import Family, OutputError
-from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.fit.window_fit import Rounding
-from backlash_ros.core.estimation.regression.resolution import cells
+from backlash_ros.core.estimation.fit.low_order.family import Family
+from backlash_ros.core.estimation.fit.low_order.low_order import low_order
+from backlash_ros.core.estimation.fit.low_order.output_error import OutputError
+from backlash_ros.core.estimation.fit.rounding.ascent import Place, climbed, climbed_at
+from backlash_ros.core.estimation.regression.resolution import Rounding, cells
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -62,7 +62,7 @@ class _LowOrder:
         _, answer, free = parts
         return np.append(xi, self._readings.projected(free, self._problem.newest(answer)))
 
-    def at(self, x: Array, noise_std: float, pace: Pace) -> Generator[None, None, Place]:
+    def at(self, x: Array, noise_std: float) -> Generator[None, None, Place]:
         """The log-posterior at x (k + n,)."""
         xi, held = x[:self.size], x[self.size:]
         parts = self._parts(xi)
@@ -100,30 +100,31 @@ class _Given:
         """Gain and coefficients that come closest."""
         return self._readings.projected(self._signals, np.zeros(self._signals.shape[1]))
 
-    def at(self, x: Array, noise_std: float, pace: Pace) -> Generator[None, None, Place]:
+    def at(self, x: Array, noise_std: float) -> Generator[None, None, Place]:
         """The log-posterior at x (1 + n,)."""
         prior = np.append(0.0, np.full(len(x) - 1, self._readings.vague))
         yield
         return self._readings.place(x, prior, x @ self._signals, self._signals, noise_std)
 
 
-def likelier(
-    family: Family, problem: OutputError, y: Array, rounding: Rounding, xi: Array, delay: int,
-    present: TransferFunction, by: float, pace: Pace,
+def likelier_by_intervals(
+    family: Family, problem: OutputError, present: TransferFunction, y: Array, rounding: Rounding,
+    by: float,
 ) -> Generator[None, None, TransferFunction | None]:
-    """The likeliest G of the family near xi, None unless it is likelier than the present one.
+    """The likeliest G of the family, None unless it is likelier than the present one.
 
     y: of the problem, shape (N,), nan where lost. by: log-likelihood by which it has to be.
     """
+    xi, delay = yield from low_order(family, problem, shifts=(0,))
     readings = _Readings(y, rounding.resolution)
     unknown = _LowOrder(family, problem, delay, readings)
     x, value, noise_std = yield from climbed(
         unknown, unknown.with_free_responses(xi), rounding.noise_std,
-        LEAST_NOISE * rounding.resolution, pace,
+        LEAST_NOISE * rounding.resolution,
     )
     xi = x[:unknown.size]
     given = _Given(present, problem, readings)
-    _, of_present = yield from climbed_at(given, given.start, noise_std, pace)
+    _, of_present = yield from climbed_at(given, given.start, noise_std)
     # Both without a prior of what G is.
     if value + 0.5 * float(xi @ xi) <= of_present + by:
         return None

@@ -1,0 +1,83 @@
+"""The samples of a fit, each counting as much as it tells: as a value or as an interval."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.regression.posterior import Posterior, Triangle
+from backlash_ros.core.estimation.regression.resolution import Rounding, cells
+
+Array = NDArray[np.float64]
+
+
+class WeightedSamples:
+    """Rows of the regression and y, weighted, and the triangle of all of them.
+
+    vague: weights of priors of the unknowns (p,) that are no information. rounding: of readings
+    that are intervals, None while all are values. length: how many samples.
+    """
+
+    def __init__(self, vague: Array) -> None:
+        self._vague = vague
+        self.triangle = Triangle(vague)
+        self.rounding: Rounding | None = None
+        self.length = 0
+        self._rows: Array = np.empty((0, len(vague)))
+        self._y: Array = np.empty(0)
+
+    @property
+    def rows(self) -> Array:
+        """Weighted rows of the samples so far, shape (N, p)."""
+        return self._rows[:self.length]
+
+    def take(self, rows: Array, y: Array, weights: Array) -> None:
+        """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
+        weight = np.where(np.isfinite(y), weights, 0.0)
+        root = np.sqrt(weight)
+        self._append(rows * root[:, None], np.where(weight > 0.0, y, 0.0) * root, weight.sum())
+
+    def begin_rounded(self, rounding: Rounding) -> None:
+        """Begin again with all samples, to be taken in for the intervals that they tell."""
+        self.rounding, self.length = rounding, 0
+        self.triangle = Triangle(self._vague)
+
+    def take_rounded(self, rows: Array, y: Array, near: Posterior, likeliest: bool = False) -> None:
+        """Take in y (N,), nan where lost, as the intervals that they tell, for outputs near these.
+
+        likeliest: whether these are the likeliest outputs, as they are to remain. Otherwise a
+        reading far outside of its interval counts as if it were exact.
+        """
+        rounding = self.rounding
+        assert rounding is not None
+        known, expected = np.isfinite(y), rows @ near.mean
+        said = cells(
+            np.where(known, y - expected, 0.0), rounding.resolution, rounding.noise_std
+        )
+        information = rounding.information if likeliest else said.information
+        # In units in which the noise is that of all readings, each tells as much as on average.
+        root = sqrt(rounding.information) * rounding.together
+        target = np.where(known, expected + said.score / information, 0.0)
+        self._append(rows * (root * known)[:, None], target * root, np.count_nonzero(known))
+        self.triangle.hold_noise(rounding.together)
+
+    def _append(self, rows: Array, y: Array, count: float) -> None:
+        first, last = self.length, self.length + len(y)
+        if last > len(self._y):
+            self._grow(last)
+        self._rows[first:last], self._y[first:last] = rows, y
+        self.triangle.append(rows, y, float(count))
+        self.length = last
+
+    def _grow(self, least: int) -> None:
+        """Make room for more samples than now, twice as many as there are."""
+        more = max(2 * len(self._y), least) - len(self._y)
+        self._rows = np.concatenate([self._rows, np.empty((more, len(self._vague)))])
+        self._y = np.concatenate([self._y, np.empty(more)])
+
+    def residual(self, posterior: Posterior, since: int = 0) -> Array:
+        """Weighted y minus its fit from sample `since` on; 0 where y was lost."""
+        rows, y = self._rows[since:self.length], self._y[since:self.length]
+        return np.asarray(y - rows @ posterior.mean)
