@@ -64,7 +64,6 @@ class WindowFit:
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.reversals = 0
         self._play = begun
-        self._first_v = 0.0
         self._highest, self._lowest = -inf, inf
         self.samples = WeightedSamples(self._vague(*extent))
 
@@ -97,8 +96,6 @@ class WindowFit:
         """
         play = self._play
         labels = play.labels(v)
-        if not self.length:
-            self._first_v = float(v[0])
         self._advance(labels)
         self._highest = max(self._highest, float(v.max()))
         self._lowest = min(self._lowest, float(v.min()))
@@ -173,7 +170,7 @@ class WindowFit:
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
-        triangle, offset, prior = self._with_start(self.samples.triangle), 0.0, self.around.prior
+        triangle, offset, prior = self.samples.triangle, 0.0, self.around.prior
         own: Solution | None = None
         if prior is not None and not alone:
             if self.around.inherited and triangle.count > layout.unknowns:
@@ -217,20 +214,6 @@ class WindowFit:
             inflation, sqrt(squares / max(count, 1.0)),
             own,
         )
-
-    def _with_start(self, triangle: Triangle) -> Triangle:
-        """The same where p began anywhere within the gap.
-
-        Its labels may leave few samples to tell, and u before them would be anything.
-        """
-        gap, n = self.start.gap, self.layout.n
-        if self._begun.side != 0 or not gap > 0.0:
-            return triangle
-        # m p = held + m c_r, and m times what p is on average.
-        row = np.zeros(self.layout.unknowns)
-        row[n], row[n + 1], row[n + 2] = 1.0, -(self._first_v + 0.5 * gap), 1.0
-        std = abs(self.slope) * gap / sqrt(12.0)  # of what is anywhere in between
-        return triangle.with_combination(row, std, self.around.told_std)
 
     def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:
         """Of all unknowns; where G integrates, it may leak or not.
