@@ -57,8 +57,8 @@ def test_sensor_that_comes_back_ends_the_freeze() -> None:
     assert errors(record, -1).max() < 0.01
 
 
-@pytest.mark.parametrize('seed', [3, 16])
-def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate(seed: int) -> None:
+def run_with_lost_commands(seed: int) -> RunRecord:
+    """Of the paper's plant, where three commands in ten never act from sample 300 on."""
     loop = build_closed_loop(Parameters({
         'plant.uncertainty': 0.0, 'output_noise_std': NOISE, 'seed': seed,
     }))
@@ -71,16 +71,24 @@ def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate(seed: 
         return step(acting)
 
     loop.plant.step = loses_commands  # type: ignore[method-assign]
-    record = loop.run(1500)
-    tracking = record.column('status') == Status.TRACKING
-    off = np.max([
-        np.abs(record.column(name) - record.column(f'true_{name}')) / record.column(f'std_{name}')
-        for name in NAMES
-    ], axis=0)
-    assert np.mean((tracking & (off > 5.0))[400:]) < 0.02
-    assert np.mean(record.column('status')[400:] == Status.INCONSISTENT) > 0.2
-    # A v that is held now and then looks like a wider gap for a while.
-    assert max(errors(record, k).max() for k in range(300, 1500)) < 0.2
+    return loop.run(1500)
+
+
+def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate() -> None:
+    wrong = []
+    for seed in range(3, 11):
+        record = run_with_lost_commands(seed)
+        tracking = record.column('status') == Status.TRACKING
+        off = np.max([
+            np.abs(record.column(name) - record.column(f'true_{name}'))
+            / record.column(f'std_{name}') for name in NAMES
+        ], axis=0)
+        wrong.append(np.mean((tracking & (off > 5.0))[400:]))
+        assert np.mean(record.column('status')[400:] == Status.INCONSISTENT) > 0.2
+        # A v that is held now and then looks like a wider gap for a while.
+        assert max(errors(record, k).max() for k in range(300, 1500)) < 0.2
+    assert np.mean(wrong) < 0.03
+    assert max(wrong) < 0.1
 
 
 @pytest.mark.parametrize('seed', [303, 305])

@@ -116,9 +116,14 @@ def fitted(
         if fit.layout.leak:
             # Without a leak an offset of u explains one as long as the labels are wrong.
             solution = fit.solve(leaking=True)
-        if abs(solution.gap - start.gap) <= STANDS * solution.std_gap or solution.m == 0.0:
+        after = Fitted(fit, solution).beginning(v)
+        stands = (
+            abs(solution.gap - start.gap) <= STANDS * solution.std_gap
+            and abs(after.p - start.p) <= STANDS * after.gap
+        )
+        if stands or solution.m == 0.0:
             break
-        slope, start = solution.m, Fitted(fit, solution).beginning(v)
+        slope, start = solution.m, after
         yield
     assert best is not None
     return best

@@ -64,6 +64,7 @@ class WindowFit:
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.reversals = 0
         self._play = begun
+        self._first_v = 0.0
         self._highest, self._lowest = -inf, inf
         self.samples = WeightedSamples(self._vague(*extent))
 
@@ -96,6 +97,8 @@ class WindowFit:
         """
         play = self._play
         labels = play.labels(v)
+        if not self.length:
+            self._first_v = float(v[0])
         self._advance(labels)
         self._highest = max(self._highest, float(v.max()))
         self._lowest = min(self._lowest, float(v.min()))
@@ -170,7 +173,7 @@ class WindowFit:
         if layout.jump:
             # The first jump of p is known no better than the gap.
             spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
-        triangle, offset, prior = self.samples.triangle, 0.0, self.around.prior
+        triangle, offset, prior = self._with_start(self.samples.triangle), 0.0, self.around.prior
         own: Solution | None = None
         if prior is not None and not alone:
             if self.around.inherited and triangle.count > layout.unknowns:
@@ -214,6 +217,22 @@ class WindowFit:
             inflation, sqrt(squares / max(count, 1.0)),
             own,
         )
+
+    def _with_start(self, triangle: Triangle) -> Triangle:
+        """The same where p began anywhere within the gap.
+
+        The labels may leave few samples to tell, and u before them would be anything. Where the
+        first v moved p, the labels tell u themselves; where v never engaged, u is all there is.
+        """
+        gap, p, n = self.start.gap, self._begun.p, self.layout.n
+        held = self._begun.side == 0 and self._first_v < p < self._first_v + gap
+        if not held or self._play.side == 0:
+            return triangle
+        # u0 = m (p - c_r), and p = v(0) + g/2 on average.
+        row = np.zeros(self.layout.unknowns)
+        row[n:n + 4] = 1.0, -self._first_v, 0.5, 0.5
+        std = abs(self.slope) * gap / sqrt(12.0)  # of what is anywhere in between
+        return triangle.with_combination(row, std, self.around.told_std)
 
     def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:
         """Of all unknowns; where G integrates, it may leak or not.

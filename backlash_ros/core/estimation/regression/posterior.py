@@ -74,6 +74,10 @@ class Triangle:
         rows[:, where] = root
         return self._with_rows(rows, root @ mean)
 
+    def with_combination(self, row: Array, std: float, told_std: float) -> Triangle:
+        """The same where this combination (p,) of the unknowns is 0 but for this deviation."""
+        return self._with_rows((row * (self._noise(told_std) / std))[None], np.zeros(1))
+
     def hold_noise(self, noise_std: float) -> None:
         """Let the residual so far be that of noise of this deviation."""
         size = len(self.r) - 1

@@ -30,20 +30,17 @@ MOST_NOISE, LEAST_NOISE = 1.0 / 4.0, 1.0 / 16.0
 
 
 class _Unknowns:
-    """All unknowns of a fit, given those of its readings y (N,) that are intervals.
+    """All unknowns of a fit, given readings y (N,) with this resolution, nan where lost.
 
     In coordinates z in which the posterior of the least-squares fit is standard normal: x = mean +
-    root z. What that fit knows besides, its prior and the values before `first`, is the prior here.
-    y: nan where lost. rows: of all samples, unweighted, shape (N, p).
+    root z. What that fit knows besides its samples is the prior. rows: unweighted, shape (N, p).
     """
 
     def __init__(
-        self, fit: WindowFit, y: Array, first: int, known: Posterior, resolution: float,
-        pace: Pace,
+        self, fit: WindowFit, y: Array, known: Posterior, resolution: float, pace: Pace,
     ) -> None:
-        self._first, self._resolution, self._pace = first, resolution, pace
-        self._known = np.isfinite(y[first:])
-        self._y = np.where(self._known, y[first:], 0.0)
+        self._known, self._resolution, self._pace = np.isfinite(y), resolution, pace
+        self._y = np.where(self._known, y, 0.0)
         weights = weights_of(y)
         self.rows = fit.samples.rows / np.sqrt(weights)[:, None]
         self._mean = known.mean
@@ -52,10 +49,10 @@ class _Unknowns:
         units = np.where(std > 0.0, std, 1.0)
         shares, axes = np.linalg.eigh(known.cov / np.outer(units, units))
         self._root = units[:, None] * axes * (np.sqrt(np.maximum(shares, 0.0)) * known.noise_std)
-        by = fit.samples.rows[first:] @ self._root / known.noise_std
+        by = fit.samples.rows @ self._root / known.noise_std
         shares, axes = np.linalg.eigh(np.eye(by.shape[1]) - by.T @ by)
         self._prior = (axes * np.maximum(shares, 0.0)) @ axes.T
-        left = (self._y - self.rows[first:] @ self._mean) * np.sqrt(weights[first:]) * self._known
+        left = (self._y - self.rows @ self._mean) * np.sqrt(weights) * self._known
         self._pull = by.T @ left / -known.noise_std
 
     @property
@@ -73,9 +70,8 @@ class _Unknowns:
         value = float(self._pull @ z - 0.5 * z @ prior)
         gradient, precision = self._pull - prior, self._prior.copy()
         x = self.unknowns(z)
-        intervals = self.rows[self._first:]
-        for part in _pieces(0, len(intervals), len(z), self._pace):
-            rows, known = intervals[part], self._known[part]
+        for part in _pieces(len(self._y), len(z), self._pace):
+            rows, known = self.rows[part], self._known[part]
             said = cells(self._y[part] - rows @ x, self._resolution, noise_std)
             by = rows @ self._root
             value += float(said.likelihood @ known)
@@ -93,13 +89,8 @@ def with_rounding(
     resolution = resolution_of(y)
     if resolution == 0.0 or not solution.m > 0.0 or fit.gap_spread > 0.0:
         return result
-    # Intervals are too sharp for a u that depends on where the play began.
-    first = fit.forgotten_after(v)
-    first += fit.model.memory if first else 0
-    if first >= len(v):
-        return result
     known = solution.posterior
-    problem = _Unknowns(fit, y, first, known, resolution, pace)
+    problem = _Unknowns(fit, y, known, resolution, pace)
     most = MOST_NOISE * resolution
     z, _, noise_std = yield from climbed(problem, problem.start, most, LEAST_NOISE * resolution)
     if noise_std == most:
@@ -107,7 +98,7 @@ def with_rounding(
     rounding = Rounding(resolution, noise_std, known.noise_std)
     for _ in range(RELABELLINGS):
         most_likely = replace(known, mean=problem.unknowns(z))
-        yield from _read(fit, problem, y, first, rounding, most_likely, pace)
+        yield from _read(fit, problem, y, rounding, most_likely, pace)
         result = Fitted(fit, fit.solve(), result.decided)
         solution = result.solution
         # Labels that are closer than this would not be made again either.
@@ -122,17 +113,12 @@ def with_rounding(
 
 
 def _read(
-    fit: WindowFit, problem: _Unknowns, y: Array, first: int, rounding: Rounding, most: Posterior,
-    pace: Pace,
+    fit: WindowFit, problem: _Unknowns, y: Array, rounding: Rounding, most: Posterior, pace: Pace,
 ) -> Generator[None, None, None]:
-    """Let a fit take in all readings with the likeliest unknowns: values before `first`."""
-    rows, weights = problem.rows, weights_of(y)
+    """Let a fit take in all readings with the likeliest unknowns."""
     fit.samples.begin_rounded(rounding)
-    for part in _pieces(0, first, fit.layout.unknowns, pace):
-        fit.samples.take(rows[part], y[part], weights[part])
-        yield
-    for part in _pieces(first, len(y), fit.layout.unknowns, pace):
-        fit.samples.take_rounded(rows[part], y[part], most, likeliest=True)
+    for part in _pieces(len(y), fit.layout.unknowns, pace):
+        fit.samples.take_rounded(problem.rows[part], y[part], most, likeliest=True)
         yield
 
 
@@ -141,13 +127,13 @@ def _columns(
 ) -> Generator[None, None, Array]:
     """Columns of a fit for all samples, shape (N, p), made in pieces."""
     columns = []
-    for part in _pieces(0, len(v), fit.layout.unknowns, pace):
+    for part in _pieces(len(v), fit.layout.unknowns, pace):
         columns.append(fit.columns(v[part], y[part]))
         yield
     return np.concatenate(columns)
 
 
-def _pieces(first: int, last: int, unknowns: int, pace: Pace) -> Iterator[slice]:
-    """Samples from `first` to before `last`, in pieces."""
+def _pieces(samples: int, unknowns: int, pace: Pace) -> Iterator[slice]:
+    """All samples, in pieces."""
     step = pace.pieces(unknowns)
-    return (slice(k, min(k + step, last)) for k in range(first, last, step))
+    return (slice(first, first + step) for first in range(0, samples, step))
