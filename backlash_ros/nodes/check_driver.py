@@ -11,6 +11,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Float64
@@ -29,6 +30,7 @@ from backlash_ros.core.driver_check.gentle_drive import Drive, GentleDrive, Rang
 from backlash_ros.core.driver_check.motion import record_of
 from backlash_ros.core.driver_check.verdict import all_fit, judge, table
 from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.nodes.control.last_command_sender import CONFIRMED_WITHIN_S
 from backlash_ros.nodes.diagnostics.presence import Presence
 from backlash_ros.nodes.diagnostics.rivals import identity_made_by
 from backlash_ros.nodes.driver_check.driver_graph import DriverGraph
@@ -42,6 +44,8 @@ from backlash_ros.shipped import find_config
 
 LOOK_S = 0.1  # between two looks at the graph
 SETTLE_S = 1.0  # after which everybody should have found everybody
+LAST_SENT = 10  # times that the last v is sent at most, until it is confirmed
+CONFIRMED_WITHIN = Duration(nanoseconds=int(CONFIRMED_WITHIN_S * 1e9))
 REMIND_S = 3.0  # between two lines that say what is missing
 UNSEEN = 'a controller of this machine'  # that discovery has not found yet
 
@@ -84,7 +88,7 @@ class CheckDriverNode(ProcessNode):
             try:
                 self._follow(executor)
             finally:
-                self._come_to_rest(executor)
+                self._come_to_rest()
         if self._rivals:
             print(
                 f'{self.program}: {self._names[topics.CONTROL]} is published by {self._rivals}: '
@@ -202,7 +206,7 @@ class CheckDriverNode(ProcessNode):
             and self._control.get_subscription_count() > 0
         )
 
-    def _come_to_rest(self, executor: NodeExecutor) -> None:
+    def _come_to_rest(self) -> None:
         drive = self._drive
         if drive is None:
             return
@@ -217,10 +221,13 @@ class CheckDriverNode(ProcessNode):
                     else 'another signal came'
                 print(f'{self.program}: v is held at {drive.v:.6g}: {why}', file=sys.stderr)
                 break
-        else:
+        # A busy machine may lose a message, and this one is to be heard before the node leaves.
+        for _ in range(LAST_SENT):
             self._control.publish(Float64(data=drive.v))
-        # The last command must leave before the node does.
-        executor.spin_once(timeout_sec=LOOK_S)
+            if self._control.wait_for_all_acked(CONFIRMED_WITHIN):
+                return
+        print(f'{self.program}: the driver has not confirmed the last v={drive.v:.6g}',
+              file=sys.stderr)
 
     def _look_at_graph(self) -> None:
         if self._limits is not None:
