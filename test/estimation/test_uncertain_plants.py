@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -201,6 +202,12 @@ def test_load_coasts_through_the_gap_until_friction_stops_it() -> None:
     for end in (weak[-1], strong[-1], dry[-1]):
         assert u - 0.02 < end < u + 0.1
     assert dry[-100:].std() == 0.0
+
+
+@pytest.mark.parametrize('seed', [6, 7])
+def test_load_that_coasts_is_not_tracked_with_more_error_than_stated(seed: int) -> None:
+    [job] = motor_jobs({'coasts': {}}, [seed], 10.0)
+    assert run_job(replace(job, coasts={'damping': 0.5})).wrong_s <= 1.0
 
 
 def test_what_was_found_twice_is_not_searched_again_before_v_has_turned(

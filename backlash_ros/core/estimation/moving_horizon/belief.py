@@ -20,9 +20,10 @@ MOST_UNEXPLAINED = PRECISE_GAP * LASTING
 
 
 class Belief(Enum):
-    """Whether a fit is believed: it takes the place of the estimate, adds nothing to it, or not."""
+    """What a fit does: it replaces the estimate or only its deviations, nothing, or is refused."""
 
     REPLACES = auto()
+    WIDENS = auto()
     AGREES = auto()
     REFUSED = auto()
 
@@ -66,10 +67,14 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
         # Samples that agree with what was known before do not make it less certain.
         sure = not learning.unconfirmed and not wider
         return Belief.REPLACES if sure else Belief.AGREES
-    if otherwise and not learning.expects_changes:
-        sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
-    else:
+    if not otherwise or learning.expects_changes:
         sure = proven or not wider
+    else:
+        sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
+        if proven and not sure and around.error.count:
+            # With an error of G the deviations hold what moves y otherwise: what held knew of less.
+            moved = beyond_chance(difference(found, estimate), held)
+            return Belief.REPLACES if moved else Belief.WIDENS
     if sure:
         return Belief.REPLACES
     return Belief.AGREES if proven else Belief.REFUSED

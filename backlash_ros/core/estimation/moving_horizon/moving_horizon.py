@@ -327,8 +327,11 @@ class MovingHorizon:
                 learning.held = None
             return
         found = believable(learning)
-        belief = judged(learning, found, self.estimate)
-        if belief is Belief.REPLACES and found is not None:
+        held = self.estimate
+        belief = judged(learning, found, held)
+        if belief is Belief.WIDENS and found is not None:
+            found = replace(found, m=held.m, c_r=held.c_r, c_l=held.c_l)
+        if belief in (Belief.REPLACES, Belief.WIDENS) and found is not None:
             self._take_over(found)
         if belief is Belief.REFUSED:
             learning.reason = Status.INCONSISTENT
