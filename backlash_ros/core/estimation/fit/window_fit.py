@@ -64,7 +64,7 @@ class WindowFit:
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.reversals = 0
         self._play = begun
-        self._first_v = 0.0
+        self._first_v: float | None = None
         self._highest, self._lowest = -inf, inf
         self.samples = WeightedSamples(self._vague(*extent))
 
@@ -97,7 +97,7 @@ class WindowFit:
         """
         play = self._play
         labels = play.labels(v)
-        if not self.length:
+        if self._first_v is None:
             self._first_v = float(v[0])
         self._advance(labels)
         self._highest = max(self._highest, float(v.max()))
@@ -225,12 +225,14 @@ class WindowFit:
         first v moved p, the labels tell u themselves; where v never engaged, u is all there is.
         """
         gap, p, n = self.start.gap, self._begun.p, self.layout.n
-        held = self._begun.side == 0 and self._first_v < p < self._first_v + gap
-        if not held or self._play.side == 0:
+        first = self._first_v
+        if first is None or self._begun.side != 0 or self._play.side == 0:
+            return triangle
+        if not first < p < first + gap:
             return triangle
         # u0 = m (p - c_r), and p = v(0) + g/2 on average.
         row = np.zeros(self.layout.unknowns)
-        row[n:n + 4] = 1.0, -self._first_v, 0.5, 0.5
+        row[n:n + 4] = 1.0, -first, 0.5, 0.5
         std = abs(self.slope) * gap / sqrt(12.0)  # of what is anywhere in between
         return triangle.with_combination(row, std, self.around.told_std)
 

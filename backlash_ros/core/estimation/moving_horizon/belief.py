@@ -68,15 +68,14 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
         sure = not learning.unconfirmed and not wider
         return Belief.REPLACES if sure else Belief.AGREES
     if not otherwise or learning.expects_changes:
-        sure = proven or not wider
-    else:
-        sure = bool(np.linalg.eigvalsh(held - found.cov).max() > 0.0)
-        if proven and not sure and around.error.count:
-            # With an error of G the deviations hold what moves y otherwise: what held knew of less.
-            moved = beyond_chance(difference(found, estimate), held)
-            return Belief.REPLACES if moved else Belief.WIDENS
-    if sure:
+        if proven or not wider:
+            return Belief.REPLACES
+    elif np.linalg.eigvalsh(held - found.cov).max() > 0.0:
         return Belief.REPLACES
+    elif proven and around.error.count:
+        # With an error of G the deviations hold what moves y otherwise: what held knew of less.
+        moved = beyond_chance(difference(found, estimate), held)
+        return Belief.REPLACES if moved else Belief.WIDENS
     return Belief.AGREES if proven else Belief.REFUSED
 
 

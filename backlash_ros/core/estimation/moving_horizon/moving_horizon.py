@@ -327,12 +327,12 @@ class MovingHorizon:
                 learning.held = None
             return
         found = believable(learning)
-        held = self.estimate
-        belief = judged(learning, found, held)
-        if belief is Belief.WIDENS and found is not None:
-            found = replace(found, m=held.m, c_r=held.c_r, c_l=held.c_l)
-        if belief in (Belief.REPLACES, Belief.WIDENS) and found is not None:
+        belief = judged(learning, found, self.estimate)
+        if belief is Belief.REPLACES and found is not None:
             self._take_over(found)
+        if belief is Belief.WIDENS and found is not None:
+            e = self.estimate
+            self._take_over(replace(found, m=e.m, c_r=e.c_r, c_l=e.c_l))
         if belief is Belief.REFUSED:
             learning.reason = Status.INCONSISTENT
         elif learning.contradicted_from is None:
