@@ -10,7 +10,7 @@ import inspect
 import time
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
@@ -62,6 +62,20 @@ def make_executor(node: Node, warn: Callable[[str], object]) -> NodeExecutor:
     return NodeExecutor(node)
 
 
+class _Served(NamedTuple):
+    """A subscription with all that is needed between the arrival of a message and its callback.
+
+    After a pause every attribute of rclpy that is looked up there costs microseconds.
+    """
+
+    pointer: int
+    take: Callable[[Any, bool], tuple[Any, dict[str, Any]] | None]
+    message_type: Any
+    raw: bool
+    callback: Callable[..., None]
+    with_info: bool  # whether the callback wants to know time stamp and number as well
+
+
 class PromptExecutor(NodeExecutor):
     """Serves the subscriptions and guard conditions of one node at once, all else after them.
 
@@ -72,8 +86,8 @@ class PromptExecutor(NodeExecutor):
 
     def __init__(self, node: Node) -> None:
         super().__init__(node)
-        # Whether the callback wants to know time stamp and number as well.
-        self._subscriptions: dict[Subscription, bool] = {}
+        self._subscriptions: list[Subscription] = []  # without the polled ones
+        self._served: list[_Served] = []  # the same
         self._known: list[Subscription] = []  # the polled ones included
         self._guards: list[GuardCondition] = []
         self._wait_set: Any = None
@@ -123,16 +137,17 @@ class PromptExecutor(NodeExecutor):
         for guard in self._guards:
             wait_set.add_guard_condition(guard.handle)
         wait_set.wait(wait_ns)
+        ready = wait_set.get_ready_entities('subscription')
+        for pointer, take, message_type, raw, callback, with_info in self._served:
+            if pointer in ready and (taken := take(message_type, raw)) is not None:
+                if with_info:
+                    callback(*taken)
+                else:
+                    callback(taken[0])
         ready = wait_set.get_ready_entities('guard_condition')
         for guard in self._guards:
             if guard.handle.pointer in ready:
                 guard.callback()
-        ready = wait_set.get_ready_entities('subscription')
-        for subscription, with_info in self._subscriptions.items():
-            if subscription.handle.pointer in ready:
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-                if taken is not None:
-                    subscription.callback(*(taken if with_info else taken[:1]))
 
     def _prepare(self) -> None:
         """Make a wait set for what the node has now."""
@@ -140,10 +155,15 @@ class PromptExecutor(NodeExecutor):
         guards = list(self._served_node.guards)
         if subscriptions == self._known and guards == self._guards:
             return
-        self._subscriptions = {
-            each: _wants_info(each.callback) for each in subscriptions
-            if not isinstance(each.callback_group, Polled)
-        }
+        self._subscriptions = [
+            each for each in subscriptions if not isinstance(each.callback_group, Polled)
+        ]
+        self._served = [
+            _Served(
+                each.handle.pointer, each.handle.take_message, each.msg_type, each.raw,
+                each.callback, _wants_info(each.callback),
+            ) for each in self._subscriptions
+        ]
         self._known, self._guards = subscriptions, guards
         self._wait_set = rclpy_implementation.WaitSet(
             len(self._subscriptions), len(guards), 0, 0, 0, 0, self._served_node.context.handle
