@@ -18,6 +18,7 @@ from backlash_ros import topics
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.runtime.messages import DEPTH
+from backlash_ros.nodes.runtime.number_message import message_with, number_of
 from backlash_ros.nodes.runtime.spin import ProcessNode
 
 
@@ -46,6 +47,11 @@ def output_qos(p: Parameters, depth: int) -> QoSProfile:
     ))
 
 
+def message_with_one(v: float) -> Float64MultiArray:
+    """A message with this number as the only one of several."""
+    return Float64MultiArray(data=array('d', (v,)))
+
+
 class DriverIo:
     """What a node says to the driver and hears from it, in the messages that io.style names.
 
@@ -61,6 +67,8 @@ class DriverIo:
         # On simulated time the stamps of the middleware, which are real time, say nothing.
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._publisher: Publisher | None = None
+        several = self.topics.control_type is Float64MultiArray
+        self._message_with = message_with_one if several else message_with
 
     @property
     def publisher(self) -> Publisher:
@@ -90,10 +98,11 @@ class DriverIo:
 
     def listen(self, hear: Callable[[Output], None], depth: int) -> Subscription:
         """Call hear with every y."""
-        def hear_number(message: Float64, info: dict[str, Any]) -> None:
+        def hear_number(message: bytes, info: dict[str, Any]) -> None:
             sent_ns = info['source_timestamp']
+            stamp_ns = self.now_ns() if self.simulated_time else sent_ns
             hear(Output(
-                message.data, self.stamp_ns(info), sent_ns, info['received_timestamp'],
+                number_of(message), stamp_ns, sent_ns, info['received_timestamp'],
                 info['publication_sequence_number'],
             ))
 
@@ -111,16 +120,16 @@ class DriverIo:
                 info['received_timestamp'], UNNUMBERED,
             ))
 
-        hear_message = hear_joint if self.topics.output_type is JointState else hear_number
+        of_joints = self.topics.output_type is JointState
         return self._node.listen(
-            self.topics.output_type, self.topics.output, hear_message, output_qos(self._p, depth)
+            self.topics.output_type, self.topics.output, hear_joint if of_joints else hear_number,
+            output_qos(self._p, depth), raw=not of_joints,
         )
 
     def advertise(self) -> Publisher:
         """Make the publisher of v."""
         to = self.topics
         publisher: Publisher = self._node.create_publisher(to.control_type, to.control, DEPTH)
-        self._message = to.control_type()
         self._publisher = publisher
         return publisher
 
@@ -142,9 +151,7 @@ class DriverIo:
     def publish(self, v: float) -> None:
         """Send v to the driver."""
         assert self._publisher is not None
-        several = self.topics.control_type is Float64MultiArray
-        self._message.data = array('d', (v,)) if several else v
-        self._publisher.publish(self._message)
+        self._publisher.publish(self._message_with(v))
 
     def wait_until_received(self, timeout_s: float) -> None:
         """Wait until the driver has confirmed the newest v, or the timeout is over."""
