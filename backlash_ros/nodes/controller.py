@@ -258,10 +258,11 @@ class ControllerNode(ManagedNode):
             self.loop.take_applied(message.data, self._io.stamp_ns(info))
 
     def _on_output(self, output: Output) -> None:
-        if self._reports is not None:
-            for report in self._reports.take_all():
-                self._on_applied_control(*report)
         loop = self.loop
+        # v has precedence over whatever it need not wait for.
+        first = loop is not None and loop.answers_first and self.active
+        if not first:
+            self._take_reports()
         if loop is None or not self.active:
             return
         if self._lockstep:
@@ -274,19 +275,28 @@ class ControllerNode(ManagedNode):
         ):
             return
         was_silent = loop.silent
-        step = loop.answer(output)
+        step = loop.command(output)
+        # Where the next output is waiting already, there is no time for what may be put off.
+        behind = 0 < output.received_ns < time.time_ns() - self._period_ns
+        if step is not None and not behind:
+            time.sleep(self._post_command_sleep_s)
+        if first:
+            self._take_reports()
+        loop.note()
         if was_silent and not loop.silent:
             self._last_commands.end()
         if step is None:
             return
-        # Where the next output is waiting already, there is no time for what may be put off.
-        behind = 0 < output.received_ns < time.time_ns() - self._period_ns
         self._behind = self._behind + 1 if behind else 0
-        if not behind:
-            time.sleep(self._post_command_sleep_s)
         if self._behind % PUT_OFF == 0:
             loop.core.refine(self._refine_budget_s)
         self._follow_up(loop, step, was_silent)
+
+    def _take_reports(self) -> None:
+        """Take in what the driver reports to have applied."""
+        if self._reports is not None:
+            for report in self._reports.take_all():
+                self._on_applied_control(*report)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""

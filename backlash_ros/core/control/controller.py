@@ -98,7 +98,8 @@ class AdaptiveController:
     """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
 
     Call `step` once per received y, and `refine` when v is on its way. Learning from y(k) comes
-    before v(k) only where the structure feeds y back; else v(k) need not wait for it.
+    before v(k) only where the structure feeds y back; else v(k) need not wait for it. Who is in a
+    hurry there calls `command` and, when v is on its way, `take_in`.
 
     compensating: False inverts the slope alone, as if there were no gap.
     learner: who proposes better models of G, for the structure to be redesigned; None where
@@ -121,7 +122,7 @@ class AdaptiveController:
         self._design: Iterator[Adoption | None] = iter(())
         self._adoption: Adoption | None = None  # of the finished design, until it may take over
         self._waited = 0  # samples for which it could not
-        self._interval: Interval | None = None
+        self.interval: Interval | None = None  # that which began with the newest command
         # The measurement that is still to be learned from: y(k), the interval before it, samples
         # lost before it, what was applied and what was commanded.
         self._pending: (
@@ -140,21 +141,40 @@ class AdaptiveController:
         that acted in them, if it is not the last one. alternatives: commands that may have acted
         instead, nan where none may.
         """
-        if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST):
-            raise ValueError(f'y={y!r} and y_m={y_m!r} must be finite and no larger than '
-                             f'{LARGEST:g}')
+        _check_sample(y, y_m)
+        if self._pending is not None:
+            self._learn()
+        self.take_in(y, self.interval, lost, applied, alternatives, commands)
+        if self.structure.needs_output and self._pending is not None:
+            self._learn()
+        return self._command(y, y_m)
+
+    def command(self, y: float, y_m: float) -> ControlStep:
+        """Return the command for sample k before `take_in`: no structure that needs y bears it."""
+        _check_sample(y, y_m)
+        if self._pending is not None:
+            self._learn()
+        return self._command(y, y_m)
+
+    def take_in(
+        self, y: float, interval: Interval | None, lost: int = 0, applied: Sequence[float] = (),
+        alternatives: Sequence[float] = (), commands: Sequence[float] = (),
+    ) -> None:
+        """Keep y(k) until it is learned from, at the next step or by `refine`.
+
+        interval: that which ended with it, None where no command had acted. The others as in
+        `step`.
+        """
         if lost < 0:
             raise ValueError(f'lost={lost!r} must be >= 0')
         if applied or alternatives or commands:
             _check_intervals(lost + 1, applied, alternatives, commands)
-        if self._pending is not None:
-            self._learn()
-        if self._interval is not None:
-            self._pending = y, self._interval, lost, applied, alternatives, commands
-            if self.structure.needs_output:
-                self._learn()
-        estimator, inverse = self.estimator, self.inverse
-        used = estimate = estimator.estimate
+        if interval is not None:
+            self._pending = y, interval, lost, applied, alternatives, commands
+
+    def _command(self, y: float, y_m: float) -> ControlStep:
+        inverse, estimate = self.inverse, self.estimator.estimate
+        used = estimate
         if not self.compensating:
             used = replace(estimate, c_r=0.0, c_l=0.0)
         elif self._serial is not None:
@@ -163,7 +183,7 @@ class AdaptiveController:
         u_d, v, f = self.structure.control(ControlInput(y_m, y, used, self._source), inverse)
         v = self.limits.apply(v, v_before)
         inverse.applied(v)
-        self._interval = Interval(v, y_m, u_d, f)
+        self.interval = Interval(v, y_m, u_d, f)
         return ControlStep(y_m, y, u_d, v, estimate)
 
     @property
@@ -258,6 +278,12 @@ class AdaptiveController:
                 serial.update(measured, command, v, estimator.estimate)
             estimator.update(measured, Interval(v, y_m, u_d, f, other))
         self.lost_samples += lost
+
+
+def _check_sample(y: float, y_m: float) -> None:
+    if not (-LARGEST <= y <= LARGEST and -LARGEST <= y_m <= LARGEST):
+        raise ValueError(f'y={y!r} and y_m={y_m!r} must be finite and no larger than '
+                         f'{LARGEST:g}')
 
 
 def _check_intervals(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from math import isfinite, nan
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep, plaus
 from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.estimation.baselines.lms import NormalisedLms
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimation.protocol import Estimate, Interval
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.report_use import report_use
@@ -31,6 +32,19 @@ OF_THE_STRUCTURE = (
     'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution',
     'estimator.output_noise_std',
 )
+
+
+class _Sent(NamedTuple):
+    """A command that has left before anything else was done about its output.
+
+    ended: the interval that ended with the output. stamp_ns: when the command left. latency_ns:
+    how long after the output that was.
+    """
+
+    output: Output
+    ended: Interval | None
+    stamp_ns: int
+    latency_ns: int
 
 
 class ControlLoop:
@@ -62,6 +76,8 @@ class ControlLoop:
         self._unsent = 0  # those of them that were never published
         self._restarted = False  # whether sender or clock restarted since then
         self._begun = False  # whether the present core has taken a step
+        self._unnoted: tuple[Output, bool] | None = None  # the newest one, whether it is a sample
+        self._sent: _Sent | None = None  # the newest command, until it is noted
         self._other_ns = 0  # when another controller was last heard to command
         self.core = build_controller(p, inherited)
         self.told = build_model(p)
@@ -135,22 +151,52 @@ class ControlLoop:
             self._go_on_from(self.core.command_of(reported))
         return self.knows_v
 
+    @property
+    def answers_first(self) -> bool:
+        """Whether the next command needs neither what the driver reports nor what y teaches."""
+        return self._begun and not (
+            self.silent or self.standing_down or self._lockstep or self.core.structure.needs_output
+        )
+
     def answer(self, output: Output) -> ControlStep | None:
         """Send v(k) for y(k); None where the message brings no command."""
-        arrival = self.counter.count(output.stamp_ns, output.sequence)
-        return self.step(output, arrival, self.y_m)
+        step = self.command(output)
+        self.note()
+        return step
+
+    def command(self, output: Output) -> ControlStep | None:
+        """The same, but what v(k) need not wait for is left to `note`, which has to follow."""
+        return self._answer(
+            output, self.counter.count(output.stamp_ns, output.sequence), self.y_m
+        )
 
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
-        """The same for a sample that was counted already, with the reference that belongs to it."""
+        """Like `answer`, for a sample that was counted already, with its own reference."""
+        step = self._answer(output, arrival, y_m)
+        self.note()
+        return step
+
+    def note(self) -> None:
+        """Take in what the newest command did not have to wait for."""
+        self._note_arrival()
+        sent, self._sent = self._sent, None
+        if sent is None:
+            return
+        lost, *acted = self._acted(sent.output.stamp_ns)
+        self.core.take_in(sent.output.y, sent.ended, lost, *acted)
+        self.commands.publish(self.v, sent.stamp_ns)
+        self._count(sent.output, sent.latency_ns)
+
+    def _answer(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
+        self._unnoted = output, arrival.is_sample
         statistics = self.statistics
-        statistics.note_arrival(output.stamp_ns, output.received_ns)
         if self.standing_down:
             return None
         if not arrival.is_sample:
             statistics.extra += 1
             return None
-        self.commands.note_transit(output.received_ns - output.sent_ns)
-        self._note_missing(arrival)
+        if arrival.missing or arrival.restarted:
+            self._note_missing(arrival)
         if not plausible(output.y):
             # A sensor that has nothing to say is as good as silent.
             statistics.note_bad_output()
@@ -161,22 +207,26 @@ class ControlLoop:
             statistics.without_reference += 1
             self._missing += 1
             return None
-        self._interrupt_if_long()
-        step = self._step_core(output.y, y_m, output.stamp_ns)
-        self.send(step.v)
-        statistics.note(
-            output.y, step.v, self.core.inverse.limited, (time.time_ns() - output.sent_ns) * 1e-9
-        )
+        if self._missing or self._restarted or self.silent:
+            self._interrupt_if_long()
+        if self.answers_first:
+            core = self.core
+            ended, step = core.interval, core.command(output.y, y_m)
+            self._put_out(step.v)
+            self._sent = _Sent(output, ended, self._now_ns(), time.time_ns() - output.sent_ns)
+        else:
+            self._note_arrival()
+            step = self._step_core(output.y, y_m, output.stamp_ns)
+            self.send(step.v)
+            self._count(output, time.time_ns() - output.sent_ns)
         self.last = step
         return step
 
     def send(self, v: float) -> None:
         """Send a command and note when it left; nothing while another controller commands."""
-        if self.standing_down:
-            return
-        self.v, self.knows_v = v, True
-        self._send(v)
-        self.commands.publish(v, self._now_ns())
+        if not self.standing_down:
+            self._put_out(v)
+            self.commands.publish(v, self._now_ns())
 
     @property
     def zero(self) -> float:
@@ -233,6 +283,24 @@ class ControlLoop:
             structure.go_on_from(core.structure)
             core.structure = structure
 
+    def _put_out(self, v: float) -> None:
+        self.v, self.knows_v = v, True
+        self._send(v)
+
+    def _count(self, output: Output, latency_ns: int) -> None:
+        """Count an output that has brought the present v, so long after it was sent."""
+        self.statistics.note(output.y, self.v, self.core.inverse.limited, latency_ns * 1e-9)
+
+    def _note_arrival(self) -> None:
+        """Note what the newest message tells of its way, unless that is done."""
+        unnoted, self._unnoted = self._unnoted, None
+        if unnoted is None:
+            return
+        output, is_sample = unnoted
+        self.statistics.note_arrival(output.stamp_ns, output.received_ns)
+        if is_sample and not self.standing_down:
+            self.commands.note_transit(output.received_ns - output.sent_ns)
+
     def _go_on_from(self, told: float) -> None:
         known = self.v if self.knows_v else None
         self.v, self.knows_v = self.core.limits.go_on_from(told, known), True
@@ -260,21 +328,28 @@ class ControlLoop:
 
     def _step_core(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
         """Step the core over the missing outputs to y, with the v that was really applied."""
-        core, commands = self.core, self.commands
-        lost, self._missing = self._missing, 0
-        unsent, self._unsent = self._unsent, 0
+        core = self.core
         if not self._begun:
             self._begun = True
+            self._missing = self._unsent = 0
             if not self._lockstep:
                 self.learn_v(stamp_ns)
             core.start_from(self.v)
-            commands.begin(stamp_ns)
+            self.commands.begin(stamp_ns)
             return core.step(y, y_m)
         if self._lockstep:
+            lost, self._missing, self._unsent = self._missing, 0, 0
             return core.step(y, y_m, lost)
-        # Late commands are counted even where the driver says which ones it applied.
-        supposed = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
-        reported = commands.reported_over(lost + 1, stamp_ns, unsent)
-        acted, others = supposed
-        return core.step(y, y_m, lost, reported, others, acted)
+        return core.step(y, y_m, *self._acted(stamp_ns))
 
+    def _acted(self, stamp_ns: int) -> tuple[int, list[float], list[float], list[float]]:
+        """Outputs missing since the last one that was used, and what acted up to this one.
+
+        Per interval: v as the driver reports it, commands that may have acted instead, those that
+        should have.
+        """
+        commands, lost, unsent = self.commands, self._missing, self._unsent
+        self._missing = self._unsent = 0
+        # Late commands are counted even where the driver says which ones it applied.
+        acted, others = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
+        return lost, commands.reported_over(lost + 1, stamp_ns, unsent), others, acted

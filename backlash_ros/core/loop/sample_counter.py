@@ -52,7 +52,7 @@ class Arrival(NamedTuple):
     unsent: int = 0
 
 
-NO_SAMPLE = Arrival(is_sample=False)
+NO_SAMPLE, NEXT_SAMPLE = Arrival(is_sample=False), Arrival(is_sample=True)
 
 
 class SampleCounter:
@@ -123,6 +123,8 @@ class SampleCounter:
         self._stamp_ns, self._strange = stamp_ns, 0
         self.due_ns = min(due + period * (missing + CLOCK_SLACK), float(stamp_ns))
         self.index += 1 + missing
+        if not missing:
+            return NEXT_SAMPLE
         unsent = missing - by_number if numbered else 0
         return Arrival(is_sample=True, missing=missing, unsent=unsent)
 
