@@ -17,7 +17,6 @@ os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 import numpy as np
 import rclpy
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from reporting import Check
 from std_msgs.msg import Float64
@@ -27,6 +26,7 @@ from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.nodes.runtime.prompt_executor import make_executor
 from real_time.node_processes import (
     DEADLINE_S,
     check_running,
@@ -82,8 +82,9 @@ class Driver:
         prefer_loopback(os.environ)
         rclpy.init(args=[], context=self._context, domain_id=domain)
         self._node = Node('driver', context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self._node)
+        # The executor of rclpy would begin to wait after the answer has come: the times would
+        # be those of the driver.
+        self._executor = make_executor(self._node, print)
         self._plant, self._reference = build_plant(parameters), build_reference(parameters)
         self._period = parameters.get_float('sample_period')
         self._v = self._v_before = 0.0
@@ -127,7 +128,7 @@ class Driver:
         start = time.perf_counter()
         publisher.publish(message)
         while self._answered_at is None:
-            self._executor.spin_once(timeout_sec=PATIENCE_S)
+            self._executor.serve_urgent(int(1e9 * PATIENCE_S))
             if self._answered_at is None and time.perf_counter() - start > PATIENCE_S:
                 return None
         return self._answered_at - start
