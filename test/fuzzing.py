@@ -140,8 +140,7 @@ class Fuzzer:
             # Where a command must not move further than the rate allows, the driver is honest
             # about v: whoever restarts goes on from what it says.
             honest = isfinite(self._move)
-            report = Float64(data=loop.v if honest else self._number_of_any_kind())
-            self._untyped._on_applied_control(report, {'source_timestamp': self._stamp})
+            loop.take_applied(loop.v if honest else self._number_of_any_kind(), self._stamp)
         elif kind == 3:
             jump = int(rng.choice([-10**15, -5 * PERIOD_NS, 0, 1, 50 * PERIOD_NS, 10**15]))
             self._output(self._sound_y(), jump, int(rng.choice([-1000, 0, 1, 2, 1000])))

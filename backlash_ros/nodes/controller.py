@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from typing import Any
 
@@ -148,7 +148,7 @@ class ControllerNode(ManagedNode):
         inherited = load_estimate(p)
         self.loop = ControlLoop(
             p, self._io.publish, self._io.now_ns, inherited, self._counter,
-            self._first_command.v_at_start(p),
+            self._first_command.v_at_start(p), self._new_reports,
         )
         self._model.publish(self.loop)
         if inherited is not None:
@@ -253,17 +253,15 @@ class ControllerNode(ManagedNode):
         self._ticks.append(stamp_ns_of(message))
         self._pair()
 
-    def _on_applied_control(self, message: Float64, info: dict[str, Any]) -> None:
-        if self.loop is not None:
-            self.loop.take_applied(message.data, self._io.stamp_ns(info))
-
     def _on_output(self, output: Output) -> None:
         loop = self.loop
-        # v has precedence over whatever it need not wait for.
-        first = loop is not None and loop.answers_first and self.active
-        if not first:
-            self._take_reports()
-        if loop is None or not self.active:
+        if loop is None:
+            for _ in self._new_reports():  # which are of no use to a loop that begins later
+                pass
+            return
+        if loop.begins or not self.active:
+            loop.hear_reports()
+        if not self.active:
             return
         if self._lockstep:
             self._outputs.append(output)
@@ -280,8 +278,6 @@ class ControllerNode(ManagedNode):
         behind = 0 < output.received_ns < time.time_ns() - self._period_ns
         if step is not None and not behind:
             time.sleep(self._post_command_sleep_s)
-        if first:
-            self._take_reports()
         loop.note()
         if was_silent and not loop.silent:
             self._last_commands.end()
@@ -292,11 +288,11 @@ class ControllerNode(ManagedNode):
             loop.core.refine(self._refine_budget_s)
         self._follow_up(loop, step, was_silent)
 
-    def _take_reports(self) -> None:
-        """Take in what the driver reports to have applied."""
+    def _new_reports(self) -> Iterator[tuple[float, int]]:
+        """What the driver has reported to have applied since the last look: v, stamp [ns]."""
         if self._reports is not None:
-            for report in self._reports.take_all():
-                self._on_applied_control(*report)
+            for message, info in self._reports.take_all():
+                yield message.data, self._io.stamp_ns(info)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""

@@ -18,7 +18,7 @@ GIVEN = {
 
 
 class Run:
-    """Some samples of a loop. late_reports: they come after the command, as in the node."""
+    """Some samples of a loop. late_reports: the loop asks for them when it has time."""
 
     def __init__(self, late_reports: bool, **given: object) -> None:
         p = Parameters({**GIVEN, **{name.replace('__', '.'): v for name, v in given.items()}})
@@ -26,8 +26,10 @@ class Run:
         self.first = 0  # commands that left before their output was taken in
         self._late_reports = late_reports
         self._now_ns = 0
+        self._waiting: list[tuple[float, int]] = []  # reports that the loop has not heard
         self.loop = ControlLoop(
-            p, self.sent.append, lambda: self._now_ns, None, SampleCounter(0.01)
+            p, self.sent.append, lambda: self._now_ns, None, SampleCounter(0.01),
+            reports=self._new_reports,
         )
         self._run(p)
 
@@ -48,16 +50,18 @@ class Run:
     def _answer(self, output: Output, applied: float) -> None:
         loop = self.loop
         report = applied, output.stamp_ns - 1000
-        first = loop.answers_first
-        self.first += first
-        if first and self._late_reports:
-            loop.command(output)
-            loop.take_applied(*report)
-            loop.note()
+        self.first += loop.answers_first
+        if self._late_reports:
+            self._waiting.append(report)
         else:
             loop.take_applied(*report)
-            loop.answer(output)
+        loop.answer(output)
+        assert not self._waiting
         loop.core.refine()
+
+    def _new_reports(self) -> list[tuple[float, int]]:
+        waiting, self._waiting = self._waiting, []
+        return waiting
 
 
 @pytest.mark.parametrize('law', ['moving_horizon', 'lms'])
@@ -68,6 +72,26 @@ def test_reports_that_are_taken_after_the_command_teach_the_same(law: str) -> No
     assert before.loop.estimate == after.loop.estimate
     assert before.loop.commands.late == after.loop.commands.late > 0
     assert before.loop.commands.unreported == after.loop.commands.unreported
+
+
+def test_reports_are_heard_first_where_a_gap_makes_the_loop_begin_again() -> None:
+    stamp_ns, back = 0, 40
+    loop = ControlLoop(
+        Parameters({
+            **GIVEN, 'timeout.plant_output': 0.05, 'control.min': -10.0, 'control.max': 10.0,
+            'control.rate_max': 10.0,
+        }),
+        lambda v: None, lambda: stamp_ns, None, SampleCounter(0.01), 0.0,
+        reports=lambda: [(2.5, stamp_ns - 1000)] if stamp_ns == back * PERIOD_NS else [],
+    )
+    loop.take_reference(0.0)
+    for k in (1, 2, 3, back):
+        stamp_ns = k * PERIOD_NS
+        assert abs(loop.v) <= 0.1 * k  # the driver tells of another v in the gap alone
+        loop.command(Output(0.0, stamp_ns, stamp_ns, stamp_ns, k))
+        loop.note()
+    assert loop.statistics.interruptions == 1
+    assert abs(loop.v - 2.5) <= 0.1 + 1e-9
 
 
 def test_a_structure_that_needs_y_learns_from_it_first() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from math import isfinite, nan
 from typing import NamedTuple
 
@@ -52,7 +52,8 @@ class ControlLoop:
 
     send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
     learned before. counter: goes on counting where another loop has ended. v: the newest command,
-    0 as long as nobody knows (knows_v) which one acts. told: G(z) as the parameters have it.
+    0 as long as nobody knows (knows_v) which one acts. reports: v and stamp [ns] of what the driver
+    has reported since the last call. told: G(z) as the parameters have it.
     silent: the driver was given up for the time being. standing_down: another controller commands
     the actuator, so nothing is sent.
     """
@@ -60,6 +61,7 @@ class ControlLoop:
     def __init__(
         self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
         inherited: Estimate | None, counter: SampleCounter, v: float | None = None,
+        reports: Callable[[], Iterable[tuple[float, int]]] = tuple,
     ) -> None:
         self.statistics = LoopStatistics()
         self.counter = counter
@@ -70,7 +72,7 @@ class ControlLoop:
         self.adapting = self.compensating = True
         self.last: ControlStep | None = None
         self.heard_at: float | None = None  # on the steady clock [s]
-        self._p, self._send, self._now_ns = p, send, now_ns
+        self._p, self._send, self._now_ns, self._reports = p, send, now_ns, reports
         self._lockstep = p.get_bool('lockstep')
         self._missing = 0  # outputs since the newest one that was used
         self._unsent = 0  # those of them that were never published
@@ -124,6 +126,11 @@ class ControlLoop:
             return False
         self.y_m = y_m
         return True
+
+    def hear_reports(self) -> None:
+        """Take in what the driver has reported meanwhile."""
+        for v, stamp_ns in self._reports():
+            self.take_applied(v, stamp_ns)
 
     def take_applied(self, v: float, stamp_ns: int) -> None:
         """Take in a v that the driver reports to have applied."""
@@ -179,6 +186,7 @@ class ControlLoop:
     def note(self) -> None:
         """Take in what the newest command did not have to wait for."""
         self._note_arrival()
+        self.hear_reports()
         sent, self._sent = self._sent, None
         if sent is None:
             return
@@ -216,6 +224,7 @@ class ControlLoop:
             self._sent = _Sent(output, ended, self._now_ns(), time.time_ns() - output.sent_ns)
         else:
             self._note_arrival()
+            self.hear_reports()
             step = self._step_core(output.y, y_m, output.stamp_ns)
             self.send(step.v)
             self._count(output, time.time_ns() - output.sent_ns)
