@@ -12,9 +12,10 @@ Bayesian interpolation, Neural Computation 4 (1992) 415-447.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import exp, log, log1p, sqrt
+from math import exp, inf, isfinite, log, log1p, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,16 +87,15 @@ class Triangle:
     def without(self, column: int) -> Triangle:
         """The same where this unknown is 0."""
         size = len(self.r) - 1
-        other = Triangle(np.zeros(size - 1))
-        other.count = self.count
         kept = np.empty((size + 1, size), order='F')
         kept[:, :column], kept[:, column:] = self.r[:, :column], self.r[:, column + 1:]
+        other = copy(self)
         other.r = np.where(_upper(size), lapack.dgeqrf(kept, overwrite_a=1)[0][:size], 0.0)
         return other
 
     def log_precision(self, first: int, last: int) -> float:
         """Of these unknowns given all before them: how sharply the rows tell them."""
-        return float(np.log(np.abs(np.diag(self.r)[first:last])).sum())
+        return float(np.log(np.abs(self.r.diagonal()[first:last])).sum())
 
     def with_prior(self, where: slice, std: float, told_std: float) -> tuple[Triangle, float]:
         """The same with independent priors of these unknowns, and what that adds to the evidence.
@@ -103,8 +103,7 @@ class Triangle:
         std: their deviation, around 0.
         """
         sigma, count = self._noise(told_std), where.stop - where.start
-        rows = np.zeros((count, len(self.r) - 1))
-        rows[:, where] = np.eye(count) * (sigma / std)
+        rows = np.eye(count, len(self.r) - 1, where.start) * (sigma / std)
         other = self._with_rows(rows, np.zeros(count))
         return other, count * log(sigma / std) - other.log_precision(where.start, where.stop)
 
@@ -116,8 +115,7 @@ class Triangle:
 
     def _with_rows(self, rows: Array, y: Array) -> Triangle:
         """The same with rows that count for no sample."""
-        other = Triangle(np.zeros(len(self.r) - 1))
-        other.r, other.count = self.r, self.count
+        other = copy(self)
         other.append(rows, y, 0.0)
         return other
 
@@ -135,47 +133,54 @@ class Triangle:
         weight = self.count + NOISE_WEIGHT
         freedom = max(self.count - base, 0.0) + NOISE_WEIGHT
         squares = float(r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2
-        inverse = lapack.dtrtri(np.asfortranarray(r[:base, :base]))[0]
+        inverse = lapack.dtrtri(r[:base, :base])[0]
         target = inverse @ r[:base, size]
         if size == base:
             evidence = -0.5 * weight * log(squares / weight)
             return Posterior(target, inverse @ inverse.T, sqrt(squares / freedom), 0.0, evidence)
         weights = abs(slope) * spreads
-        u, s, vt = np.linalg.svd(r[base:size, base:size] * weights)
-        z = u.T @ r[base:size, size]
+        u, s, vt, failed = lapack.dgesdd(r[base:size, base:size] * weights)
+        if failed:
+            raise np.linalg.LinAlgError('the samples leave no singular values')
+        z = r[base:size, size] @ u
         # Grid of (s / sigma)^2, the form in which sigma can be integrated out.
-        ratios = (RATIOS * (freedom / squares))[:, None]
-        shrink = 1.0 / (1.0 + ratios * (s * s))
+        ratios = RATIOS * (freedom / squares)
+        shrink = 1.0 / (1.0 + np.outer(ratios, s * s))
         left = squares + shrink @ (z * z)
-        evidence = 0.5 * np.log(shrink).sum(axis=1) - 0.5 * weight * np.log(left / weight)
-        scales = np.sqrt(ratios[:, 0] * left / freedom)
+        scales = np.sqrt(ratios * left / freedom)
         # The uncertainty that was told is the deviation of what s = 1 stands for.
-        evidence -= 0.5 * scales**2
+        evidence = 0.5 * (np.log(shrink).sum(axis=1) - weight * np.log(left / weight) - scales**2)
         # Half a step of the grid beyond is the same. None at all, and the largest one, remain.
-        evidence[:-1][scales[:-1] < least_scale * SAME] = -np.inf
-        evidence[1:][scales[1:] > max(most_scale, least_scale) / SAME] = -np.inf
-        best = int(np.argmax(evidence))
-        if not np.isfinite(evidence[best]):
+        if least_scale > 0.0:
+            evidence[:-1][scales[:-1] < least_scale * SAME] = -inf
+        if most_scale < inf:
+            evidence[1:][scales[1:] > max(most_scale, least_scale) / SAME] = -inf
+        best = int(evidence.argmax())
+        highest = float(evidence[best])
+        if not isfinite(highest):
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
         # The grid is one of the logarithm of s: each scale stands for as much of s as it is large.
-        share = STEPS * np.exp(evidence - evidence[best])
+        share = STEPS * np.exp(evidence - highest)
         share /= share.sum()
         noise_var = float(share @ left) / freedom
         # The mixture over all scales: its mean, its mean covariance, and that of its means.
-        means = ratios * s * shrink * z
+        gains = ratios[:, None] * shrink
+        means = gains * (s * z)
         mean = share @ means
-        within = share @ (ratios * shrink * (left / (freedom * noise_var))[:, None])
+        within = (share * left / (freedom * noise_var)) @ gains
         between = (means - mean) * np.sqrt(share / noise_var)[:, None]
         # All unknowns by e, and b besides by what the rows say of it for a given e.
-        by = np.concatenate([inverse @ -r[:base, base:size], np.eye(size - base)]) @ (
-            weights[:, None] * vt.T
-        )
-        root = by @ np.concatenate([np.diag(np.sqrt(within)), between.T], axis=1)
-        all_means, cov = by @ mean, root @ root.T
+        by = np.empty((size, size - base))
+        np.multiply(weights[:, None], vt.T, out=by[base:])
+        by[:base] = inverse @ (-r[:base, base:size] @ by[base:])
+        root = np.zeros((size, size + len(between)))
+        root[:base, :base] = inverse
+        root[:, base:size] = by * np.sqrt(within)
+        root[:, size:] = by @ between.T
+        all_means = by @ mean
         all_means[:base] += target
-        cov[:base, :base] += inverse @ inverse.T
         return Posterior(
-            all_means, cov, sqrt(noise_var), float(scales[best]), float(evidence[best])
+            all_means, root @ root.T, sqrt(noise_var), float(scales[best]), highest
         )
 
 
@@ -203,11 +208,10 @@ def mixture(one: Posterior, other: Posterior, bonus: float) -> Posterior:
     bonus += other.evidence - one.evidence
     share = 1.0 / (1.0 + exp(-bonus)) if bonus > -LARGEST_EXPONENT else 0.0
     noise_var = (1.0 - share) * one.noise_std**2 + share * other.noise_std**2
-    mean = (1.0 - share) * one.mean + share * other.mean
-    cov = np.zeros_like(one.cov)
-    for part, weight in ((one, 1.0 - share), (other, share)):
-        off = part.mean - mean
-        cov += (weight / noise_var) * (part.noise_std**2 * part.cov + np.outer(off, off))
+    mean, apart = (1.0 - share) * one.mean + share * other.mean, other.mean - one.mean
+    cov: Array = ((1.0 - share) * one.noise_std**2 / noise_var) * one.cov
+    cov += (share * other.noise_std**2 / noise_var) * other.cov
+    cov += np.outer((share * (1.0 - share) / noise_var) * apart, apart)
     return Posterior(
         mean, cov, sqrt(noise_var), (one if share < 0.5 else other).scale,
         one.evidence + max(bonus, 0.0) + log1p(exp(-abs(bonus))),
