@@ -54,7 +54,8 @@ class Solution:
     solution, start: p of the solution at the start. count: samples that count, repeated readings
     once. correlation: of the residual with itself, beyond chance. inflation: 1 - rho + N rho, by
     which the covariance is widened; beside a prior, that of the samples alone. rms: of the
-    residual. alone: of the samples without their prior, None where that was not asked for.
+    residual. alone: of the samples without their prior, None where that was not asked for. leaky:
+    posterior where an integrator of G leaks for sure.
     """
 
     posterior: Posterior
@@ -68,6 +69,7 @@ class Solution:
     inflation: float
     rms: float
     alone: Solution | None
+    leaky: Posterior
 
     @property
     def m(self) -> float:

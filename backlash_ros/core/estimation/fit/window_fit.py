@@ -168,11 +168,7 @@ class WindowFit:
         walk: instead of that of `around`. leaking: where G integrates, it leaks for sure. alone:
         without the prior of theta.
         """
-        layout, gap = self.layout, self.start.gap
-        spreads: Array = np.ones(layout.errors)
-        if layout.jump:
-            # The first jump of p is known no better than the gap.
-            spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
+        layout = self.layout
         triangle, offset, prior = self._with_start(self.samples.triangle), 0.0, self.around.prior
         own: Solution | None = None
         if prior is not None and not alone:
@@ -184,9 +180,19 @@ class WindowFit:
         if layout.ramps:
             step = (walk or self.around.walk) / sqrt(layout.ramps)
             triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
-        posterior = self._posterior(triangle, spreads, leaking)
+        posterior, leaky = self._posteriors(triangle)
         if offset:
             posterior = replace(posterior, evidence=posterior.evidence + offset)
+        return self._solution(leaky if leaking else posterior, leaky, own)
+
+    def leaking(self, solution: Solution) -> Solution:
+        """The same where an integrator of G leaks for sure."""
+        if solution.alone is not None:
+            return self.solve(leaking=True)  # the samples alone, beside their prior, leak as well
+        return self._solution(solution.leaky, solution.leaky, None)
+
+    def _solution(self, posterior: Posterior, leaky: Posterior, own: Solution | None) -> Solution:
+        layout = self.layout
         residual = self.samples.residual(posterior)
         squares = float(residual @ residual)
         count = self.samples.triangle.count
@@ -203,9 +209,8 @@ class WindowFit:
             squares = max(squares, noise_squares)
         inflation = own.inflation if own else 1.0 - correlation + count * correlation
         posterior = self._with_other_labels(posterior, inflation)
-        now = self._theta_now()
-        theta = now @ posterior.mean
-        cov = now @ posterior.cov @ now.T * (posterior.noise_std**2 * inflation)
+        theta, cov = self._theta_now(posterior)
+        cov = cov * (posterior.noise_std**2 * inflation)
         m = float(theta[0])
         held = float(posterior.mean[layout.n])
         start = self.start.p
@@ -213,9 +218,8 @@ class WindowFit:
             start = (held + float(posterior.mean[layout.n + 2])) / m
         return Solution(
             posterior, theta, cov, crossings_of(theta, cov),
-            float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
-            inflation, sqrt(squares / max(count, 1.0)),
-            own,
+            float(theta[1] - theta[2]) / m if m != 0.0 else self.start.gap, start, count,
+            correlation, inflation, sqrt(squares / max(count, 1.0)), own, leaky,
         )
 
     def _with_start(self, triangle: Triangle) -> Triangle:
@@ -236,30 +240,31 @@ class WindowFit:
         std = abs(self.slope) * gap / sqrt(12.0)  # of what is anywhere in between
         return triangle.with_combination(row, std, self.around.told_std)
 
-    def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:
-        """Of all unknowns; where G integrates, it may leak or not.
+    def _posteriors(self, triangle: Triangle) -> tuple[Posterior, Posterior]:
+        """Of all unknowns, and where an integrator of G leaks for sure; it may or may not.
 
         One is as likely as the other before the data speak.
         """
         layout, around = self.layout, self.around
+        spreads: Array = np.ones(layout.unknowns - layout.base)
+        # The first jump of p is known no better than the gap.
+        spreads[layout.errors:] = max(self.start.gap, 1e-12)
 
         def of(part: Triangle, base: int) -> Posterior:
             return part.posterior(
                 base, self.slope, spreads, around.told_std, around.scale, around.most
             )
 
-        if not layout.leak:
-            return of(triangle, layout.base)
         where, base = layout.driven, layout.base
+        if not layout.leak:
+            posterior = of(triangle, base)
+            return posterior, posterior
         leaky, offset = triangle.with_prior(
             slice(where, where + 1), around.error.leak, around.told_std
         )
-        other = of(leaky, base)
-        if leaking:
-            return other
-        tight = triangle.without(where)
+        tight, other = triangle.without(where), of(leaky, base)
         offset += tight.log_precision(where, base - 1) - leaky.log_precision(where + 1, base)
-        return mixture(with_zero(of(tight, base - 1), where), other, offset)
+        return mixture(with_zero(of(tight, base - 1), where), other, offset), other
 
     def _with_other_labels(self, posterior: Posterior, inflation: float) -> Posterior:
         """The same with a gap, and all that goes with it, no better known than over all labels."""
@@ -276,12 +281,14 @@ class WindowFit:
         along = by / var  # by which all unknowns move with the gap
         return replace(posterior, cov=posterior.cov + (wanted - var) * np.outer(along, along))
 
-    def _theta_now(self) -> Array:
-        """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""
-        layout = self.layout
-        now = np.eye(3, layout.unknowns, layout.theta.start)
+    def _theta_now(self, posterior: Posterior) -> tuple[Array, Array]:
+        """Theta (3,) after what a walk has moved it by, and its covariance (3, 3) per sigma^2."""
+        layout, where = self.layout, self.layout.theta
+        if not layout.ramps:
+            return posterior.mean[where], posterior.cov[where, where]
+        now = np.eye(3, layout.unknowns, where.start)
         now[1:, layout.walk] = -self._regressors.heights
-        return now
+        return now @ posterior.mean, now @ posterior.cov @ now.T
 
     def misfit(self, solution: Solution, since: int) -> float:
         """Mean square of the residual from sample `since` on, over that of all samples."""
