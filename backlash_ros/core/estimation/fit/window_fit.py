@@ -119,7 +119,7 @@ class WindowFit:
     def _advance(self, labels: Labels) -> None:
         sides = labels.right - labels.left
         before = self._play.side
-        changes = np.count_nonzero(np.diff(sides)) + int(sides[0] != before)
+        changes = np.count_nonzero(sides[1:] != sides[:-1]) + int(sides[0] != before)
         # The first engagement is no reversal.
         self.reversals += changes - int(before == 0 and changes > 0)
         self._play = self._play.at_end(labels)

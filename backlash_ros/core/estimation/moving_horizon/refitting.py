@@ -31,7 +31,7 @@ from backlash_ros.core.estimation.fit.relabelling import (
 from backlash_ros.core.estimation.fit.rounding.rounding import with_rounding
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import PAST
-from backlash_ros.core.estimation.moving_horizon.change_detection import change, note_block
+from backlash_ros.core.estimation.moving_horizon.change_detection import note_block
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.observer.attribution import attributed
 from backlash_ros.core.estimation.observer.observer import Observer
@@ -70,7 +70,7 @@ def take_block(learning: Learning) -> Task:
     else:
         fit.samples.take(rows, taken, weights_of(y))
     yield
-    note_block(learning, fits, number, len(v), number + change(squares))
+    note_block(learning, fits, number, squares)
     learning.current = Fitted(fit, fit.solve())
     return fits
 
