@@ -7,6 +7,7 @@ gap, so that labels made once more with it are a Gauss-Newton step (relabelling.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from math import inf, sqrt
@@ -183,15 +184,17 @@ class WindowFit:
         posterior, leaky = self._posteriors(triangle)
         if offset:
             posterior = replace(posterior, evidence=posterior.evidence + offset)
-        return self._solution(leaky if leaking else posterior, leaky, own)
+        return self._solution(leaky() if leaking else posterior, leaky, own)
 
     def leaking(self, solution: Solution) -> Solution:
         """The same where an integrator of G leaks for sure."""
         if solution.alone is not None:
             return self.solve(leaking=True)  # the samples alone, beside their prior, leak as well
-        return self._solution(solution.leaky, solution.leaky, None)
+        return self._solution(solution.leaky(), solution.leaky, None)
 
-    def _solution(self, posterior: Posterior, leaky: Posterior, own: Solution | None) -> Solution:
+    def _solution(
+        self, posterior: Posterior, leaky: Callable[[], Posterior], own: Solution | None,
+    ) -> Solution:
         layout = self.layout
         residual = self.samples.residual(posterior)
         squares = float(residual @ residual)
@@ -240,7 +243,7 @@ class WindowFit:
         std = abs(self.slope) * gap / sqrt(12.0)  # of what is anywhere in between
         return triangle.with_combination(row, std, self.around.told_std)
 
-    def _posteriors(self, triangle: Triangle) -> tuple[Posterior, Posterior]:
+    def _posteriors(self, triangle: Triangle) -> tuple[Posterior, Callable[[], Posterior]]:
         """Of all unknowns, and where an integrator of G leaks for sure; it may or may not.
 
         One is as likely as the other before the data speak.
@@ -255,16 +258,15 @@ class WindowFit:
                 base, self.slope, spreads, around.told_std, around.scale, around.most
             )
 
-        where, base = layout.driven, layout.base
         if not layout.leak:
-            posterior = of(triangle, base)
-            return posterior, posterior
-        leaky, offset = triangle.with_prior(
-            slice(where, where + 1), around.error.leak, around.told_std
-        )
-        tight, other = triangle.without(where), of(leaky, base)
-        offset += tight.log_precision(where, base - 1) - leaky.log_precision(where + 1, base)
-        return mixture(with_zero(of(tight, base - 1), where), other, offset), other
+            posterior = of(triangle, layout.base)
+            return posterior, lambda: posterior
+        rest, base = triangle.after(layout.driven), layout.base - layout.driven
+        leaky, offset = rest.with_prior(slice(0, 1), around.error.leak, around.told_std)
+        tight, other = rest.without_first(), of(leaky, base)
+        offset += tight.log_precision(0, base - 1) - leaky.log_precision(1, base)
+        both = mixture(with_zero(of(tight, base - 1)), other, offset)
+        return triangle.with_first(both), lambda: triangle.with_first(other)
 
     def _with_other_labels(self, posterior: Posterior, inflation: float) -> Posterior:
         """The same with a gap, and all that goes with it, no better known than over all labels."""
@@ -273,22 +275,24 @@ class WindowFit:
         if self.gap_spread == 0.0 or not m > 0.0 or noise_var == 0.0:
             return posterior
         gradient = np.array([(product_l - product_r) / m, 1.0, -1.0]) / m
-        by = posterior.cov[:, where] @ gradient
+        by = posterior.root @ (posterior.root[where].T @ gradient)
         var = float(gradient @ by[where])
         wanted = self.gap_spread**2 / noise_var
         if not 0.0 < var < wanted:
             return posterior
         along = by / var  # by which all unknowns move with the gap
-        return replace(posterior, cov=posterior.cov + (wanted - var) * np.outer(along, along))
+        further = sqrt(wanted - var) * along
+        return replace(posterior, root=np.column_stack([posterior.root, further]))
 
     def _theta_now(self, posterior: Posterior) -> tuple[Array, Array]:
         """Theta (3,) after what a walk has moved it by, and its covariance (3, 3) per sigma^2."""
         layout, where = self.layout, self.layout.theta
-        if not layout.ramps:
-            return posterior.mean[where], posterior.cov[where, where]
-        now = np.eye(3, layout.unknowns, where.start)
-        now[1:, layout.walk] = -self._regressors.heights
-        return now @ posterior.mean, now @ posterior.cov @ now.T
+        theta, root = posterior.mean[where], posterior.root[where]
+        if layout.ramps:
+            now = np.eye(3, layout.unknowns, where.start)
+            now[1:, layout.walk] = -self._regressors.heights
+            theta, root = now @ posterior.mean, now @ posterior.root
+        return theta, root @ root.T
 
     def misfit(self, solution: Solution, since: int) -> float:
         """Mean square of the residual from sample `since` on, over that of all samples."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from math import exp, inf, isfinite, log, log1p, sqrt
 
 import numpy as np
@@ -36,27 +36,33 @@ VAGUE = 1e-9  # weight of a prior, as a share of the norm of a column, that is n
 
 @dataclass(frozen=True)
 class Posterior:
-    """mean: of b and e, shape (p,). cov: in units of sigma^2, shape (p, p). noise_std: sigma.
+    """mean: of b and e, shape (p,). root: L of their covariance L L', in units of sigma^2.
 
-    scale: the most likely s. evidence: log-likelihood of the data with b, e and sigma integrated
-    out, comparable between fits of the same data.
+    noise_std: sigma. scale: the most likely s. evidence: log-likelihood of the data with b, e and
+    sigma integrated out, comparable between fits of the same data.
     """
 
     mean: Array
-    cov: Array
+    root: Array  # shape (p, ..)
     noise_std: float
     scale: float
     evidence: float
+
+    @cached_property
+    def cov(self) -> Array:
+        """Covariance, shape (p, p)."""
+        return self.root @ self.root.T
 
 
 class Triangle:
     """R of the weighted rows [X, y] so far, shape (p + 1, p + 1), and the sum of their weights.
 
-    weights: of a prior at zero, shape (p,), that keeps R regular and is no information.
+    weights: of a prior at zero, shape (p,), that keeps R regular and is no information. given: how
+    many other unknowns these p are given.
     """
 
     def __init__(self, weights: Array) -> None:
-        self.count = 0.0
+        self.count, self.given = 0.0, 0
         self.r: Array = np.diag(np.append(weights, 0.0))
 
     def append(self, rows: Array, y: Array, count: float) -> None:
@@ -82,15 +88,18 @@ class Triangle:
     def hold_noise(self, noise_std: float) -> None:
         """Let the residual so far be that of noise of this deviation."""
         size = len(self.r) - 1
-        self.r[size, size] = noise_std * sqrt(max(self.count - size, 0.0))
+        self.r[size, size] = noise_std * sqrt(max(self.count - self.given - size, 0.0))
 
-    def without(self, column: int) -> Triangle:
-        """The same where this unknown is 0."""
-        size = len(self.r) - 1
-        kept = np.empty((size + 1, size), order='F')
-        kept[:, :column], kept[:, column:] = self.r[:, :column], self.r[:, column + 1:]
+    def after(self, count: int) -> Triangle:
+        """That of the other unknowns given the first `count` ones."""
         other = copy(self)
-        other.r = np.where(_upper(size), lapack.dgeqrf(kept, overwrite_a=1)[0][:size], 0.0)
+        other.r, other.given = self.r[count:, count:], self.given + count
+        return other
+
+    def without_first(self) -> Triangle:
+        """The same where the first unknown is 0."""
+        other, size = copy(self), len(self.r) - 1
+        other.r = np.where(_upper(size), lapack.dgeqrf(self.r[:, 1:])[0][:size], 0.0)
         return other
 
     def log_precision(self, first: int, last: int) -> float:
@@ -111,7 +120,7 @@ class Triangle:
         """Deviation of the noise, as far as the rows tell it without a prior."""
         size = len(self.r) - 1
         squares = float(self.r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2
-        return sqrt(squares / (max(self.count - size, 0.0) + NOISE_WEIGHT))
+        return sqrt(squares / (max(self.count - self.given - size, 0.0) + NOISE_WEIGHT))
 
     def _with_rows(self, rows: Array, y: Array) -> Triangle:
         """The same with rows that count for no sample."""
@@ -129,20 +138,41 @@ class Triangle:
         least_scale, most_scale: those that are considered; the first one counts where they
         contradict each other. Raises LinAlgError where numbers get too large.
         """
+        of_errors = self.after(base)._of_errors(
+            abs(slope) * spreads, told_std, least_scale, most_scale
+        )
+        return self.with_first(of_errors)
+
+    def with_first(self, of_last: Posterior) -> Posterior:
+        """Posterior of all unknowns from one of the last ones."""
+        first = len(self.r) - 1 - len(of_last.mean)
+        if not first:
+            return of_last
+        inverse = lapack.dtrtri(self.r[:first, :first])[0]
+        # How the first ones depend on the last ones, and on y.
+        by = inverse @ self.r[:first, first:]
+        root = np.zeros((len(self.r) - 1, first + of_last.root.shape[1]))
+        root[:first, :first] = inverse
+        root[:first, first:] = -by[:, :-1] @ of_last.root
+        root[first:, first:] = of_last.root
+        mean = np.concatenate([by[:, -1] - by[:, :-1] @ of_last.mean, of_last.mean])
+        return replace(of_last, mean=mean, root=root)
+
+    def _of_errors(
+        self, weights: Array, told_std: float, least_scale: float, most_scale: float,
+    ) -> Posterior:
+        """Posterior of all unknowns as e. weights: prior deviation of each at s = 1."""
         r, size = self.r, len(self.r) - 1
         weight = self.count + NOISE_WEIGHT
-        freedom = max(self.count - base, 0.0) + NOISE_WEIGHT
+        freedom = max(self.count - self.given, 0.0) + NOISE_WEIGHT
         squares = float(r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2
-        inverse = lapack.dtrtri(r[:base, :base])[0]
-        target = inverse @ r[:base, size]
-        if size == base:
+        if not size:
             evidence = -0.5 * weight * log(squares / weight)
-            return Posterior(target, inverse @ inverse.T, sqrt(squares / freedom), 0.0, evidence)
-        weights = abs(slope) * spreads
-        u, s, vt, failed = lapack.dgesdd(r[base:size, base:size] * weights)
+            return Posterior(np.zeros(0), np.zeros((0, 0)), sqrt(squares / freedom), 0.0, evidence)
+        u, s, vt, failed = lapack.dgesdd(r[:size, :size] * weights)
         if failed:
             raise np.linalg.LinAlgError('the samples leave no singular values')
-        z = r[base:size, size] @ u
+        z = r[:size, size] @ u
         # Grid of (s / sigma)^2, the form in which sigma can be integrated out.
         ratios = RATIOS * (freedom / squares)
         shrink = 1.0 / (1.0 + np.outer(ratios, s * s))
@@ -169,19 +199,9 @@ class Triangle:
         mean = share @ means
         within = (share * left / (freedom * noise_var)) @ gains
         between = (means - mean) * np.sqrt(share / noise_var)[:, None]
-        # All unknowns by e, and b besides by what the rows say of it for a given e.
-        by = np.empty((size, size - base))
-        np.multiply(weights[:, None], vt.T, out=by[base:])
-        by[:base] = inverse @ (-r[:base, base:size] @ by[base:])
-        root = np.zeros((size, size + len(between)))
-        root[:base, :base] = inverse
-        root[:, base:size] = by * np.sqrt(within)
-        root[:, size:] = by @ between.T
-        all_means = by @ mean
-        all_means[:base] += target
-        return Posterior(
-            all_means, root @ root.T, sqrt(noise_var), float(scales[best]), highest
-        )
+        by = weights[:, None] * vt.T
+        root = np.concatenate([by * np.sqrt(within), by @ between.T], axis=1)
+        return Posterior(by @ mean, root, sqrt(noise_var), float(scales[best]), highest)
 
 
 @lru_cache(maxsize=64)
@@ -190,17 +210,11 @@ def _upper(size: int) -> NDArray[np.bool_]:
     return np.triu(np.ones((size, size), dtype=np.bool_))
 
 
-def with_zero(posterior: Posterior, where: int) -> Posterior:
-    """The same with one more unknown, which is known to be 0."""
-    size = len(posterior.mean) + 1
-    mean, cov = np.zeros(size), np.zeros((size, size))
-    before, after = slice(where), slice(where + 1, None)
-    mean[before], mean[after] = posterior.mean[before], posterior.mean[where:]
-    cov[before, before] = posterior.cov[before, before]
-    cov[before, after] = posterior.cov[before, where:]
-    cov[after, before] = posterior.cov[where:, before]
-    cov[after, after] = posterior.cov[where:, where:]
-    return replace(posterior, mean=mean, cov=cov)
+def with_zero(posterior: Posterior) -> Posterior:
+    """The same with one more unknown before all others, which is known to be 0."""
+    root = np.zeros((len(posterior.root) + 1, posterior.root.shape[1]))
+    root[1:] = posterior.root
+    return replace(posterior, mean=np.concatenate([[0.0], posterior.mean]), root=root)
 
 
 def mixture(one: Posterior, other: Posterior, bonus: float) -> Posterior:
@@ -209,10 +223,13 @@ def mixture(one: Posterior, other: Posterior, bonus: float) -> Posterior:
     share = 1.0 / (1.0 + exp(-bonus)) if bonus > -LARGEST_EXPONENT else 0.0
     noise_var = (1.0 - share) * one.noise_std**2 + share * other.noise_std**2
     mean, apart = (1.0 - share) * one.mean + share * other.mean, other.mean - one.mean
-    cov: Array = ((1.0 - share) * one.noise_std**2 / noise_var) * one.cov
-    cov += (share * other.noise_std**2 / noise_var) * other.cov
-    cov += np.outer((share * (1.0 - share) / noise_var) * apart, apart)
+    noise_std = sqrt(noise_var)
+    root = np.concatenate([
+        (sqrt(1.0 - share) * one.noise_std / noise_std) * one.root,
+        (sqrt(share) * other.noise_std / noise_std) * other.root,
+        (sqrt(share * (1.0 - share)) / noise_std) * apart[:, None],
+    ], axis=1)
     return Posterior(
-        mean, cov, sqrt(noise_var), (one if share < 0.5 else other).scale,
+        mean, root, noise_std, (one if share < 0.5 else other).scale,
         one.evidence + max(bonus, 0.0) + log1p(exp(-abs(bonus))),
     )
