@@ -35,9 +35,10 @@ class WeightedSamples:
 
     def take(self, rows: Array, y: Array, weights: Array) -> None:
         """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
-        weight = np.where(np.isfinite(y), weights, 0.0)
+        known = np.isfinite(y)
+        weight = weights * known
         root = np.sqrt(weight)
-        self._append(rows * root[:, None], np.where(weight > 0.0, y, 0.0) * root, weight.sum())
+        self._append(rows * root[:, None], np.where(known, y, 0.0) * root, weight.sum())
 
     def begin_rounded(self, rounding: Rounding) -> None:
         """Begin again with all samples, to be taken in for the intervals that they tell."""

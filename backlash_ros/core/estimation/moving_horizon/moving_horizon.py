@@ -123,10 +123,13 @@ class MovingHorizon:
     @property
     def proposal(self) -> StateModel | None:
         """The G that was learned where it is another one than `model`."""
-        learning, learned = self._learning, self.learned_model
+        learning = self._learning
+        learned = learning.learned_model
+        if learned is self._following.model:
+            return None
         # That of a fit which is not believed is no better than the one in use.
         known = learning.current is not None and learning.reason is not Status.INCONSISTENT
-        return learned if known and learned is not self.model else None
+        return learned if known else None
 
     @property
     def learned_model(self) -> StateModel:
@@ -268,10 +271,10 @@ class MovingHorizon:
     def _status(self) -> Status:
         if self._lost_in_a_row >= NO_DATA:
             return Status.NO_DATA
-        reason = self._learning.reason
-        if not self._following.begun or reason is Status.INCONSISTENT:
+        reason, following = self._learning.reason, self._following
+        if not following.begun or reason is Status.INCONSISTENT:
             return reason
-        if self._following.since_motion > self.model.memory:
+        if following.since_motion > following.model.memory:
             return Status.NOT_EXCITED
         return Status.TRACKING if self._learning.confirmed else Status.ACQUIRING
 

@@ -174,17 +174,17 @@ class Triangle:
             raise np.linalg.LinAlgError('the samples leave no singular values')
         z = r[:size, size] @ u
         # Grid of (s / sigma)^2, the form in which sigma can be integrated out.
-        ratios = RATIOS * (freedom / squares)
-        shrink = 1.0 / (1.0 + np.outer(ratios, s * s))
+        ratios = RATIOS[:, None] * (freedom / squares)
+        shrink = 1.0 / (1.0 + ratios * (s * s))
         left = squares + shrink @ (z * z)
-        scales = np.sqrt(ratios * left / freedom)
+        scales2 = RATIOS * left / squares
         # The uncertainty that was told is the deviation of what s = 1 stands for.
-        evidence = 0.5 * (np.log(shrink).sum(axis=1) - weight * np.log(left / weight) - scales**2)
+        evidence = 0.5 * (np.log(shrink).sum(axis=1) - weight * np.log(left / weight) - scales2)
         # Half a step of the grid beyond is the same. None at all, and the largest one, remain.
         if least_scale > 0.0:
-            evidence[:-1][scales[:-1] < least_scale * SAME] = -inf
+            evidence[:-1][scales2[:-1] < (least_scale * SAME)**2] = -inf
         if most_scale < inf:
-            evidence[1:][scales[1:] > max(most_scale, least_scale) / SAME] = -inf
+            evidence[1:][scales2[1:] > (max(most_scale, least_scale) / SAME)**2] = -inf
         best = int(evidence.argmax())
         highest = float(evidence[best])
         if not isfinite(highest):
@@ -194,14 +194,14 @@ class Triangle:
         share /= share.sum()
         noise_var = float(share @ left) / freedom
         # The mixture over all scales: its mean, its mean covariance, and that of its means.
-        gains = ratios[:, None] * shrink
+        gains = ratios * shrink
         means = gains * (s * z)
         mean = share @ means
         within = (share * left / (freedom * noise_var)) @ gains
         between = (means - mean) * np.sqrt(share / noise_var)[:, None]
         by = weights[:, None] * vt.T
         root = np.concatenate([by * np.sqrt(within), by @ between.T], axis=1)
-        return Posterior(by @ mean, root, sqrt(noise_var), float(scales[best]), highest)
+        return Posterior(by @ mean, root, sqrt(noise_var), sqrt(scales2[best]), highest)
 
 
 @lru_cache(maxsize=64)

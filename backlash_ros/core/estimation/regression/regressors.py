@@ -38,7 +38,10 @@ SIGNALS = 6  # that drive G: 1_H, v_a, -1_R, -1_L, p(k) - p(k-1), the first jump
 
 def held(y: Array, before: float) -> Array:
     """y (N,) with what was lost replaced by the value before it."""
-    known = np.where(np.isfinite(y), np.arange(len(y)), -1)
+    finite = np.isfinite(y)
+    if finite.all():
+        return y
+    known = np.where(finite, np.arange(len(y)), -1)
     np.maximum.accumulate(known, out=known)
     return np.where(known < 0, before, y[known])
 
