@@ -284,26 +284,32 @@ class MovingHorizon:
         """Go on with the fit, in pieces, until nothing is left to do or the time is over."""
         timed = budget_s < inf
         begun = before = perf_counter() if timed else 0.0
-        while True:
-            if self._task is None:
-                if self._adapting:
-                    self._task = next_task(self._learning, self.estimate)
-                if self._task is None:
+        task = self._due_task()
+        if task is None:
+            return
+        # What is not finite is refused by the posterior.
+        with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
+            while task is not None:
+                try:
+                    self._go_on(task)
+                except np.linalg.LinAlgError:
+                    self._task = None
+                    self._search_afresh()
                     return
-            try:
-                with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
-                    self._go_on(self._task)  # what is not finite is refused by the posterior
-            except np.linalg.LinAlgError:
-                self._task = None
-                self._search_afresh()
-                return
-            if timed:
-                now = perf_counter()
-                self._learning.pace.note(now - before, budget_s)
-                # Another piece that takes as long must fit in as well.
-                if 2.0 * now - before - begun > budget_s:
-                    return
-                before = now
+                if timed:
+                    now = perf_counter()
+                    self._learning.pace.note(now - before, budget_s)
+                    # Another piece that takes as long must fit in as well.
+                    if 2.0 * now - before - begun > budget_s:
+                        return
+                    before = now
+                task = self._due_task()
+
+    def _due_task(self) -> Task | None:
+        """The task that is under way, or the next one."""
+        if self._task is None and self._adapting:
+            self._task = next_task(self._learning, self.estimate)
+        return self._task
 
     def _go_on(self, task: Task) -> None:
         """Do another piece of the task, and publish what it leaves at its end."""
