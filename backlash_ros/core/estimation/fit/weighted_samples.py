@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.regression.posterior import Posterior, Triangle
+from backlash_ros.core.estimation.regression.posterior import Posterior, vague_triangle
 from backlash_ros.core.estimation.regression.resolution import Rounding, cells
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ class WeightedSamples:
 
     def __init__(self, vague: Array) -> None:
         self._vague = vague
-        self.triangle = Triangle(vague)
+        self.triangle = vague_triangle(vague)
         self.rounding: Rounding | None = None
         self.length = 0
         self._rows: Array = np.empty((0, len(vague)))
@@ -43,7 +43,7 @@ class WeightedSamples:
     def begin_rounded(self, rounding: Rounding) -> None:
         """Begin again with all samples, to be taken in for the intervals that they tell."""
         self.rounding, self.length = rounding, 0
-        self.triangle = Triangle(self._vague)
+        self.triangle = vague_triangle(self._vague)
 
     def take_rounded(self, rows: Array, y: Array, near: Posterior, likeliest: bool = False) -> None:
         """Take in y (N,), nan where lost, as the intervals that they tell, for outputs near these.

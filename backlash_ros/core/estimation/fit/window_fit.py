@@ -264,7 +264,8 @@ class WindowFit:
         rest, base = triangle.after(layout.driven), layout.base - layout.driven
         leaky, offset = rest.with_prior(slice(0, 1), around.error.leak, around.told_std)
         tight, other = rest.without_first(), of(leaky, base)
-        offset += tight.log_precision(0, base - 1) - leaky.log_precision(1, base)
+        if layout.ramps:
+            offset += tight.log_precision(0, base - 1) - leaky.log_precision(1, base)
         both = mixture(with_zero(of(tight, base - 1)), other, offset)
         return triangle.with_first(both), lambda: triangle.with_first(other)
 

@@ -12,7 +12,6 @@ Bayesian interpolation, Neural Computation 4 (1992) 415-447.
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from math import exp, inf, isfinite, log, log1p, sqrt
@@ -57,22 +56,15 @@ class Posterior:
 class Triangle:
     """R of the weighted rows [X, y] so far, shape (p + 1, p + 1), and the sum of their weights.
 
-    weights: of a prior at zero, shape (p,), that keeps R regular and is no information. given: how
-    many other unknowns these p are given.
+    given: how many other unknowns these p are given.
     """
 
-    def __init__(self, weights: Array) -> None:
-        self.count, self.given = 0.0, 0
-        self.r: Array = np.diag(np.append(weights, 0.0))
+    def __init__(self, r: Array, count: float = 0.0, given: int = 0) -> None:
+        self.r, self.count, self.given = r, count, given
 
     def append(self, rows: Array, y: Array, count: float) -> None:
         """Take in weighted rows (N, p) with outputs y (N,); count: sum of their weights."""
-        size = len(self.r)
-        stacked = np.empty((size + len(y), size), order='F')
-        stacked[:size], stacked[size:, :-1], stacked[size:, -1] = self.r, rows, y
-        factored = lapack.dgeqrf(stacked, overwrite_a=1)[0]
-        self.r = np.where(_upper(size), factored[:size], 0.0)
-        self.count += count
+        self.r, self.count = self._r_with(rows, y), self.count + count
 
     def informed(self, where: slice, mean: Array, cov: Array, told_std: float) -> Triangle:
         """The same with a prior of these unknowns: mean (k,), covariance (k, k)."""
@@ -92,15 +84,11 @@ class Triangle:
 
     def after(self, count: int) -> Triangle:
         """That of the other unknowns given the first `count` ones."""
-        other = copy(self)
-        other.r, other.given = self.r[count:, count:], self.given + count
-        return other
+        return Triangle(self.r[count:, count:], self.count, self.given + count)
 
     def without_first(self) -> Triangle:
         """The same where the first unknown is 0."""
-        other, size = copy(self), len(self.r) - 1
-        other.r = np.where(_upper(size), lapack.dgeqrf(self.r[:, 1:])[0][:size], 0.0)
-        return other
+        return Triangle(_triangular(self.r[:, 1:].copy(order='F')), self.count, self.given)
 
     def log_precision(self, first: int, last: int) -> float:
         """Of these unknowns given all before them: how sharply the rows tell them."""
@@ -124,9 +112,13 @@ class Triangle:
 
     def _with_rows(self, rows: Array, y: Array) -> Triangle:
         """The same with rows that count for no sample."""
-        other = copy(self)
-        other.append(rows, y, 0.0)
-        return other
+        return Triangle(self._r_with(rows, y), self.count, self.given)
+
+    def _r_with(self, rows: Array, y: Array) -> Array:
+        size = len(self.r)
+        stacked = np.empty((size + len(y), size), order='F')
+        stacked[:size], stacked[size:, :-1], stacked[size:, -1] = self.r, rows, y
+        return _triangular(stacked)
 
     def posterior(
         self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,
@@ -202,6 +194,17 @@ class Triangle:
         by = weights[:, None] * vt.T
         root = np.concatenate([by * np.sqrt(within), by @ between.T], axis=1)
         return Posterior(by @ mean, root, sqrt(noise_var), sqrt(scales2[best]), highest)
+
+
+def vague_triangle(weights: Array) -> Triangle:
+    """That of a prior at zero, weights (p,), which keeps R regular and is no information."""
+    return Triangle(np.diag(np.append(weights, 0.0)))
+
+
+def _triangular(a: Array) -> Array:
+    """R of a (N, n) in Fortran order, which is overwritten."""
+    n = a.shape[1]
+    return np.where(_upper(n), lapack.dgeqrf(a, overwrite_a=1)[0][:n], 0.0)
 
 
 @lru_cache(maxsize=64)

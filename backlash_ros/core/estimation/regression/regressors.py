@@ -20,7 +20,8 @@ unknown start of p.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +47,8 @@ def held(y: Array, before: float) -> Array:
     return np.where(known < 0, before, y[known])
 
 
-class Layout(NamedTuple):
+@dataclass(frozen=True)
+class Layout:
     """Where the unknowns stand.
 
     n: order of G. errors: K. leak, jump: whether a leak and the first jump are there. ramps: how
@@ -59,28 +61,28 @@ class Layout(NamedTuple):
     jump: bool
     ramps: int
 
-    @property
+    @cached_property
     def driven(self) -> int:
         """Number of unknowns that make the state of G without a walk: x0, u0, theta."""
         return self.n + 4
 
-    @property
+    @cached_property
     def walk(self) -> slice:
         """Heights of the ramps."""
         first = self.driven + int(self.leak)
         return slice(first, first + self.ramps)
 
-    @property
+    @cached_property
     def base(self) -> int:
         """Number of unknowns without those of the error model."""
         return self.driven + int(self.leak) + self.ramps
 
-    @property
+    @cached_property
     def theta(self) -> slice:
         """m, m c_r, m c_l."""
         return slice(self.n + 1, self.n + 4)
 
-    @property
+    @cached_property
     def unknowns(self) -> int:
         """Number p of all unknowns."""
         return self.base + self.errors * (2 if self.jump else 1)
