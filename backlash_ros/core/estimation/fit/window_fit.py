@@ -60,7 +60,7 @@ class WindowFit:
         self._begun = begun = start if past is None else start.at_end(past)
         self._regressors = Regressors(around.model, around.error, begun.side == 0, ramp)
         if past is not None:
-            self._regressors.begin_after(np.diff(past.p, prepend=start.p))
+            self._regressors.begin_after(past.p - np.concatenate([[start.p], past.p[:-1]]))
         self.layout = self._regressors.layout
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.reversals = 0

@@ -83,7 +83,7 @@ def plays(v: Array, gaps: Array, p0: Array) -> Array:
     Only where v turns it has to be stepped: while v rises, p = max(p, v) with the p of the turn
     before; while it falls, p = min(p, v + gap).
     """
-    rising = np.diff(v, prepend=v[0]) > 0.0
+    rising = np.concatenate([[False], v[1:] > v[:-1]])
     last: Array = np.append(np.flatnonzero(rising[1:] != rising[:-1]), len(v) - 1)
     held = np.minimum(np.maximum(p0, v[0]), v[0] + gaps)
     before = np.empty((len(gaps), len(last)))
@@ -91,9 +91,7 @@ def plays(v: Array, gaps: Array, p0: Array) -> Array:
         before[:, k] = held
         held = np.maximum(held, value) if up else np.minimum(held, value + gaps)
     p = np.repeat(before, np.diff(last, prepend=-1), axis=1)
-    np.maximum(p, v, out=p, where=rising)
-    np.minimum(p, v + gaps[:, None], out=p, where=~rising)
-    return p
+    return np.where(rising, np.maximum(p, v), np.minimum(p, v + gaps[:, None]))
 
 
 class Start(NamedTuple):
