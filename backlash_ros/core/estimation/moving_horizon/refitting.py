@@ -54,11 +54,12 @@ def take_block(learning: Learning) -> Task:
     squares, outliers = fit.contradiction(rows, np.where(np.isnan(y), doubted, y), solution)
     # The fit knows how little it knows; who follows the state from sample to sample does not.
     explained = np.isfinite(doubted) & ~outliers
-    y[explained] = doubted[explained]
-    record.restore((number + np.flatnonzero(explained)).tolist())
+    if explained.any():
+        y[explained] = doubted[explained]
+        record.restore((number + np.flatnonzero(explained)).tolist())
     record.decide_doubts(number + len(y))
-    outliers &= np.isfinite(y)
     valid = np.isfinite(y)
+    outliers &= valid
     if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
         valid &= ~outliers
         record.lose(number + np.flatnonzero(outliers))
