@@ -13,7 +13,7 @@ from backlash_ros.core.estimation.regression.posterior import (
     NOISE_WEIGHT,
     SCALES,
     Posterior,
-    Triangle,
+    vague_triangle,
 )
 
 BASE, ERRORS, ROWS = 3, 4, 60
@@ -36,7 +36,7 @@ class Problem:
     def posterior(self, pieces: int = 1, least: float = 0.0, most: float = np.inf) -> Posterior:
         """By the code, from rows in pieces."""
         weights = np.append(np.full(BASE, VAGUE), np.zeros(ERRORS))
-        triangle = Triangle(weights)
+        triangle = vague_triangle(weights)
         for x, y in zip(
             np.array_split(self.x, pieces), np.array_split(self.y, pieces), strict=True
         ):
@@ -149,7 +149,7 @@ def test_a_prior_is_one_more_measurement() -> None:
     rng = np.random.default_rng(6)
     root = rng.standard_normal((2, 2))
     mean, cov = rng.standard_normal(2), 1e-3 * (root @ root.T + np.eye(2))
-    triangle = Triangle(np.full(BASE, VAGUE))
+    triangle = vague_triangle(np.full(BASE, VAGUE))
     triangle.append(problem.x[:, :BASE], problem.y, float(ROWS))
     # In units of the noise that the rows tell, whatever was told.
     noise = triangle.posterior(BASE, SLOPE, np.zeros(0), problem.told, 0.0, np.inf).noise_std

@@ -262,10 +262,14 @@ class AdaptiveController:
         pending, self._pending = self._pending, None
         assert pending is not None
         y, interval, lost, applied, alternatives, commands = pending
-        command, y_m, u_d, f, other = interval
         serial, estimator = self._serial, self.estimator
+        as_made = serial is None and not (applied or alternatives or commands)
+        command, y_m, u_d, f, other = interval
         for i in range(lost + 1):
             measured = y if i == lost else None
+            if as_made:
+                estimator.update(measured, interval)
+                continue
             if commands:
                 command = commands[i]
             # Where nothing is reported the motor is where the command takes it.

@@ -94,12 +94,11 @@ def _distance(plant: StateModel, feedback: Feedback, confidence: float) -> float
     gain = np.append(feedback.gain, 0.0)
     closed = believed - np.outer(drive, gain)
     closed -= np.outer(correction, seen @ closed)
-    z = np.exp(1j * np.geomspace(1e-3, np.pi, 120))[:, None, None]
-    x = np.linalg.solve(z * np.eye(plant.order) - plant.a, plant.b[:, None])
-    x_hat = np.linalg.solve(z * np.eye(len(gain)) - closed, z * correction[:, None])
-    z = z[:, 0, 0]
+    z = np.exp(1j * np.geomspace(1e-3, np.pi, 120))
+    at = z[:, None, None]
+    x_hat = np.linalg.solve(at * np.eye(len(gain)) - closed, at * correction[:, None])
     minus_u = (gain @ x_hat)[:, 0] - feedback.integral / (z - 1.0)
-    return float(np.abs(1.0 + plant.c * x[:, 0, 0] * minus_u).min())
+    return float(np.abs(1.0 + plant.transfer_function.response(z) * minus_u).min())
 
 
 def _believed(model: StateModel) -> tuple[Array, Array, Array]:

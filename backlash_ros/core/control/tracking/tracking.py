@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import partial
 from math import isnan, nan, sqrt
-from operator import sub
+from operator import mul, sub
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,7 +271,8 @@ class Tracking:
         ideal = -dot(self._k, x) - float(gains.preview.dot(window))
         if gains.integral:
             ideal -= gains.integral * self._q
-        return ideal, [dot(row, x) + b * ideal for row, b in self._transition]
+        # Without the call of `dot`: this is made at every sample.
+        return ideal, [sum(map(mul, row, x)) + b * ideal for row, b in self._transition]
 
     def _begin(self, inputs: ControlInput) -> None:
         start, noise = inputs.y, OFF * self._noise_std

@@ -115,7 +115,7 @@ def fitted(
             best = result
         if fit.layout.leak:
             # Without a leak an offset of u explains one as long as the labels are wrong.
-            solution = fit.solve(leaking=True)
+            solution = fit.leaking(solution)
         after = Fitted(fit, solution).beginning(v)
         stands = (
             abs(solution.gap - start.gap) <= STANDS * solution.std_gap

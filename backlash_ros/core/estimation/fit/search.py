@@ -173,20 +173,21 @@ class Comparison:
         # Products of the columns alone would lose in rounding what differs from u and from m.
         columns = self._error.spread.T @ np.swapaxes(self._error.filtered(direct), 1, 2)
         columns *= self._root
-        columns -= (columns @ self._basis) @ self._basis.T
+        rows = columns.reshape(-1, columns.shape[2])  # all of them at once: one product of matrices
+        rows -= (rows @ self._basis) @ self._basis.T
+        columns = rows.reshape(columns.shape)
         along = columns @ moved[:, :, None] / energy[:, None, None]
         columns -= along * moved[:, None, :]
         s, back = np.linalg.eigh(columns @ np.swapaxes(columns, 1, 2))
-        target = columns @ self._y
+        target = rows @ self._y
         s = np.maximum(s, 1e-30)
-        z2 = (np.einsum('hkj,hk->hj', back, target)) ** 2 / s
+        z2 = (target.reshape(s.shape)[:, None, :] @ back)[:, 0] ** 2 / s
         z2 = np.minimum(z2, squares[:, None])
-        s = s * (slopes**2)[:, None]
         squares = np.maximum(squares - z2.sum(axis=1), 0.0) + self._told
-        ratios = RATIOS[None, :, None] * (self._freedom / squares)[:, None, None]
-        shrink = 1.0 / (1.0 + ratios * s[:, None, :])
-        left = squares[:, None] + (shrink * z2[:, None, :]).sum(axis=2)
-        evidence = 0.5 * np.log(shrink).sum(axis=2) + self._log_likelihood(left)
+        s *= (slopes**2 * self._freedom / squares)[:, None]
+        shrink = 1.0 / (1.0 + RATIOS[:, None] * s[:, None, :])
+        left = squares[:, None] + (shrink @ z2[:, :, None])[..., 0]
+        evidence = self._log_likelihood(left) + 0.5 * np.log(shrink).sum(axis=2)
         evidence -= 0.5 * RATIOS  # as posterior.py has it
         return evidence.max(axis=1), slopes
 

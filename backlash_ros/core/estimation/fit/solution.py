@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
 from typing import NamedTuple
@@ -54,7 +55,8 @@ class Solution:
     solution, start: p of the solution at the start. count: samples that count, repeated readings
     once. correlation: of the residual with itself, beyond chance. inflation: 1 - rho + N rho, by
     which the covariance is widened; beside a prior, that of the samples alone. rms: of the
-    residual. alone: of the samples without their prior, None where that was not asked for.
+    residual. alone: of the samples without their prior, None where that was not asked for. leaky:
+    gives the posterior where an integrator of G leaks for sure.
     """
 
     posterior: Posterior
@@ -68,6 +70,7 @@ class Solution:
     inflation: float
     rms: float
     alone: Solution | None
+    leaky: Callable[[], Posterior]
 
     @property
     def m(self) -> float:

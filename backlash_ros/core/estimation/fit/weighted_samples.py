@@ -7,7 +7,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.regression.posterior import Posterior, Triangle
+from backlash_ros.core.estimation.regression.posterior import Posterior, vague_triangle
 from backlash_ros.core.estimation.regression.resolution import Rounding, cells
 
 Array = NDArray[np.float64]
@@ -22,7 +22,7 @@ class WeightedSamples:
 
     def __init__(self, vague: Array) -> None:
         self._vague = vague
-        self.triangle = Triangle(vague)
+        self.triangle = vague_triangle(vague)
         self.rounding: Rounding | None = None
         self.length = 0
         self._rows: Array = np.empty((0, len(vague)))
@@ -35,14 +35,15 @@ class WeightedSamples:
 
     def take(self, rows: Array, y: Array, weights: Array) -> None:
         """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
-        weight = np.where(np.isfinite(y), weights, 0.0)
+        known = np.isfinite(y)
+        weight = weights * known
         root = np.sqrt(weight)
-        self._append(rows * root[:, None], np.where(weight > 0.0, y, 0.0) * root, weight.sum())
+        self._append(rows * root[:, None], np.where(known, y, 0.0) * root, weight.sum())
 
     def begin_rounded(self, rounding: Rounding) -> None:
         """Begin again with all samples, to be taken in for the intervals that they tell."""
         self.rounding, self.length = rounding, 0
-        self.triangle = Triangle(self._vague)
+        self.triangle = vague_triangle(self._vague)
 
     def take_rounded(self, rows: Array, y: Array, near: Posterior, likeliest: bool = False) -> None:
         """Take in y (N,), nan where lost, as the intervals that they tell, for outputs near these.

@@ -7,6 +7,7 @@ gap, so that labels made once more with it are a Gauss-Newton step (relabelling.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from math import inf, sqrt
@@ -59,7 +60,7 @@ class WindowFit:
         self._begun = begun = start if past is None else start.at_end(past)
         self._regressors = Regressors(around.model, around.error, begun.side == 0, ramp)
         if past is not None:
-            self._regressors.begin_after(np.diff(past.p, prepend=start.p))
+            self._regressors.begin_after(past.p - np.concatenate([[start.p], past.p[:-1]]))
         self.layout = self._regressors.layout
         self.gap_spread = 0.0  # deviation of the gap over all labels, at least
         self.reversals = 0
@@ -119,7 +120,7 @@ class WindowFit:
     def _advance(self, labels: Labels) -> None:
         sides = labels.right - labels.left
         before = self._play.side
-        changes = np.count_nonzero(np.diff(sides)) + int(sides[0] != before)
+        changes = np.count_nonzero(sides[1:] != sides[:-1]) + int(sides[0] != before)
         # The first engagement is no reversal.
         self.reversals += changes - int(before == 0 and changes > 0)
         self._play = self._play.at_end(labels)
@@ -168,11 +169,7 @@ class WindowFit:
         walk: instead of that of `around`. leaking: where G integrates, it leaks for sure. alone:
         without the prior of theta.
         """
-        layout, gap = self.layout, self.start.gap
-        spreads: Array = np.ones(layout.errors)
-        if layout.jump:
-            # The first jump of p is known no better than the gap.
-            spreads = np.append(spreads, np.full(layout.errors, max(gap, 1e-12)))
+        layout = self.layout
         triangle, offset, prior = self._with_start(self.samples.triangle), 0.0, self.around.prior
         own: Solution | None = None
         if prior is not None and not alone:
@@ -184,9 +181,21 @@ class WindowFit:
         if layout.ramps:
             step = (walk or self.around.walk) / sqrt(layout.ramps)
             triangle, offset = triangle.with_prior(layout.walk, step, self.around.told_std)
-        posterior = self._posterior(triangle, spreads, leaking)
+        posterior, leaky = self._posteriors(triangle)
         if offset:
             posterior = replace(posterior, evidence=posterior.evidence + offset)
+        return self._solution(leaky() if leaking else posterior, leaky, own)
+
+    def leaking(self, solution: Solution) -> Solution:
+        """The same where an integrator of G leaks for sure."""
+        if solution.alone is not None:
+            return self.solve(leaking=True)  # the samples alone, beside their prior, leak as well
+        return self._solution(solution.leaky(), solution.leaky, None)
+
+    def _solution(
+        self, posterior: Posterior, leaky: Callable[[], Posterior], own: Solution | None,
+    ) -> Solution:
+        layout = self.layout
         residual = self.samples.residual(posterior)
         squares = float(residual @ residual)
         count = self.samples.triangle.count
@@ -203,9 +212,8 @@ class WindowFit:
             squares = max(squares, noise_squares)
         inflation = own.inflation if own else 1.0 - correlation + count * correlation
         posterior = self._with_other_labels(posterior, inflation)
-        now = self._theta_now()
-        theta = now @ posterior.mean
-        cov = now @ posterior.cov @ now.T * (posterior.noise_std**2 * inflation)
+        theta, cov = self._theta_now(posterior)
+        cov = cov * (posterior.noise_std**2 * inflation)
         m = float(theta[0])
         held = float(posterior.mean[layout.n])
         start = self.start.p
@@ -213,9 +221,8 @@ class WindowFit:
             start = (held + float(posterior.mean[layout.n + 2])) / m
         return Solution(
             posterior, theta, cov, crossings_of(theta, cov),
-            float(theta[1] - theta[2]) / m if m != 0.0 else gap, start, count, correlation,
-            inflation, sqrt(squares / max(count, 1.0)),
-            own,
+            float(theta[1] - theta[2]) / m if m != 0.0 else self.start.gap, start, count,
+            correlation, inflation, sqrt(squares / max(count, 1.0)), own, leaky,
         )
 
     def _with_start(self, triangle: Triangle) -> Triangle:
@@ -236,12 +243,15 @@ class WindowFit:
         std = abs(self.slope) * gap / sqrt(12.0)  # of what is anywhere in between
         return triangle.with_combination(row, std, self.around.told_std)
 
-    def _posterior(self, triangle: Triangle, spreads: Array, leaking: bool) -> Posterior:
-        """Of all unknowns; where G integrates, it may leak or not.
+    def _posteriors(self, triangle: Triangle) -> tuple[Posterior, Callable[[], Posterior]]:
+        """Of all unknowns, and where an integrator of G leaks for sure; it may or may not.
 
         One is as likely as the other before the data speak.
         """
         layout, around = self.layout, self.around
+        spreads: Array = np.ones(layout.unknowns - layout.base)
+        # The first jump of p is known no better than the gap.
+        spreads[layout.errors:] = max(self.start.gap, 1e-12)
 
         def of(part: Triangle, base: int) -> Posterior:
             return part.posterior(
@@ -249,17 +259,15 @@ class WindowFit:
             )
 
         if not layout.leak:
-            return of(triangle, layout.base)
-        where, base = layout.driven, layout.base
-        leaky, offset = triangle.with_prior(
-            slice(where, where + 1), around.error.leak, around.told_std
-        )
-        other = of(leaky, base)
-        if leaking:
-            return other
-        tight = triangle.without(where)
-        offset += tight.log_precision(where, base - 1) - leaky.log_precision(where + 1, base)
-        return mixture(with_zero(of(tight, base - 1), where), other, offset)
+            posterior = of(triangle, layout.base)
+            return posterior, lambda: posterior
+        rest, base = triangle.after(layout.driven), layout.base - layout.driven
+        leaky, offset = rest.with_prior(slice(0, 1), around.error.leak, around.told_std)
+        tight, other = rest.without_first(), of(leaky, base)
+        if layout.ramps:
+            offset += tight.log_precision(0, base - 1) - leaky.log_precision(1, base)
+        both = mixture(with_zero(of(tight, base - 1)), other, offset)
+        return triangle.with_first(both), lambda: triangle.with_first(other)
 
     def _with_other_labels(self, posterior: Posterior, inflation: float) -> Posterior:
         """The same with a gap, and all that goes with it, no better known than over all labels."""
@@ -268,20 +276,24 @@ class WindowFit:
         if self.gap_spread == 0.0 or not m > 0.0 or noise_var == 0.0:
             return posterior
         gradient = np.array([(product_l - product_r) / m, 1.0, -1.0]) / m
-        by = posterior.cov[:, where] @ gradient
+        by = posterior.root @ (posterior.root[where].T @ gradient)
         var = float(gradient @ by[where])
         wanted = self.gap_spread**2 / noise_var
         if not 0.0 < var < wanted:
             return posterior
         along = by / var  # by which all unknowns move with the gap
-        return replace(posterior, cov=posterior.cov + (wanted - var) * np.outer(along, along))
+        further = sqrt(wanted - var) * along
+        return replace(posterior, root=np.column_stack([posterior.root, further]))
 
-    def _theta_now(self) -> Array:
-        """From all unknowns to theta after what a walk has moved it by, shape (3, p)."""
-        layout = self.layout
-        now = np.eye(3, layout.unknowns, layout.theta.start)
-        now[1:, layout.walk] = -self._regressors.heights
-        return now
+    def _theta_now(self, posterior: Posterior) -> tuple[Array, Array]:
+        """Theta (3,) after what a walk has moved it by, and its covariance (3, 3) per sigma^2."""
+        layout, where = self.layout, self.layout.theta
+        theta, root = posterior.mean[where], posterior.root[where]
+        if layout.ramps:
+            now = np.eye(3, layout.unknowns, where.start)
+            now[1:, layout.walk] = -self._regressors.heights
+            theta, root = now @ posterior.mean, now @ posterior.root
+        return theta, root @ root.T
 
     def misfit(self, solution: Solution, since: int) -> float:
         """Mean square of the residual from sample `since` on, over that of all samples."""

@@ -56,7 +56,7 @@ def judged(learning: Learning, found: Crossings | None, estimate: Estimate) -> B
         return Belief.AGREES  # so few samples say nothing alone
     proven = learning.consistent >= RECOVERED
     otherwise = solution.moved_otherwise
-    wider = bool(np.any(np.diag(found.cov) > np.diag(held)))
+    wider = bool((found.cov.diagonal() > held.diagonal()).any())
     if beyond_chance(difference(found, estimate), found.cov + held):
         sure = proven and not (otherwise and around.error.count == 0)
         if learning.unconfirmed:

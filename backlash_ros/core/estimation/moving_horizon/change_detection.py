@@ -33,13 +33,13 @@ from backlash_ros.core.estimation.protocol import Estimate, Status
 Array = NDArray[np.float64]
 
 
-def note_block(learning: Learning, fits: bool, number: int, count: int, changed: int) -> None:
+def note_block(learning: Learning, fits: bool, number: int, squares: Array) -> None:
     """Note from when on the samples contradict the fit, or that they fit again.
 
-    fits: whether the `count` samples from `number` on do. changed: sample from which those that do
-    not fit do not.
+    fits: whether those from `number` on do. squares: of their residuals, normalised, shape (N,).
     """
     if fits:
+        count = len(squares)
         learning.consistent += count
         since = learning.contradicted_from
         if since is not None and learning.consistent >= RECOVERED:
@@ -49,7 +49,7 @@ def note_block(learning: Learning, fits: bool, number: int, count: int, changed:
         return
     learning.consistent = 0
     if learning.contradicted_from is None:
-        learning.contradicted_from = learning.next_try = changed
+        learning.contradicted_from = learning.next_try = number + change(squares)
 
 
 def change(squares: Array) -> int:

@@ -123,10 +123,13 @@ class MovingHorizon:
     @property
     def proposal(self) -> StateModel | None:
         """The G that was learned where it is another one than `model`."""
-        learning, learned = self._learning, self.learned_model
+        learning = self._learning
+        learned = learning.learned_model
+        if learned is self._following.model:
+            return None
         # That of a fit which is not believed is no better than the one in use.
         known = learning.current is not None and learning.reason is not Status.INCONSISTENT
-        return learned if known and learned is not self.model else None
+        return learned if known else None
 
     @property
     def learned_model(self) -> StateModel:
@@ -268,10 +271,10 @@ class MovingHorizon:
     def _status(self) -> Status:
         if self._lost_in_a_row >= NO_DATA:
             return Status.NO_DATA
-        reason = self._learning.reason
-        if not self._following.begun or reason is Status.INCONSISTENT:
+        reason, following = self._learning.reason, self._following
+        if not following.begun or reason is Status.INCONSISTENT:
             return reason
-        if self._following.since_motion > self.model.memory:
+        if following.since_motion > following.model.memory:
             return Status.NOT_EXCITED
         return Status.TRACKING if self._learning.confirmed else Status.ACQUIRING
 
@@ -281,26 +284,32 @@ class MovingHorizon:
         """Go on with the fit, in pieces, until nothing is left to do or the time is over."""
         timed = budget_s < inf
         begun = before = perf_counter() if timed else 0.0
-        while True:
-            if self._task is None:
-                if self._adapting:
-                    self._task = next_task(self._learning, self.estimate)
-                if self._task is None:
+        task = self._due_task()
+        if task is None:
+            return
+        # What is not finite is refused by the posterior.
+        with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
+            while task is not None:
+                try:
+                    self._go_on(task)
+                except np.linalg.LinAlgError:
+                    self._task = None
+                    self._search_afresh()
                     return
-            try:
-                with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
-                    self._go_on(self._task)  # what is not finite is refused by the posterior
-            except np.linalg.LinAlgError:
-                self._task = None
-                self._search_afresh()
-                return
-            if timed:
-                now = perf_counter()
-                self._learning.pace.note(now - before, budget_s)
-                # Another piece that takes as long must fit in as well.
-                if 2.0 * now - before - begun > budget_s:
-                    return
-                before = now
+                if timed:
+                    now = perf_counter()
+                    self._learning.pace.note(now - before, budget_s)
+                    # Another piece that takes as long must fit in as well.
+                    if 2.0 * now - before - begun > budget_s:
+                        return
+                    before = now
+                task = self._due_task()
+
+    def _due_task(self) -> Task | None:
+        """The task that is under way, or the next one."""
+        if self._task is None and self._adapting:
+            self._task = next_task(self._learning, self.estimate)
+        return self._task
 
     def _go_on(self, task: Task) -> None:
         """Do another piece of the task, and publish what it leaves at its end."""

@@ -31,7 +31,7 @@ from backlash_ros.core.estimation.fit.relabelling import (
 from backlash_ros.core.estimation.fit.rounding.rounding import with_rounding
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import PAST
-from backlash_ros.core.estimation.moving_horizon.change_detection import change, note_block
+from backlash_ros.core.estimation.moving_horizon.change_detection import note_block
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.observer.attribution import attributed
 from backlash_ros.core.estimation.observer.observer import Observer
@@ -54,11 +54,12 @@ def take_block(learning: Learning) -> Task:
     squares, outliers = fit.contradiction(rows, np.where(np.isnan(y), doubted, y), solution)
     # The fit knows how little it knows; who follows the state from sample to sample does not.
     explained = np.isfinite(doubted) & ~outliers
-    y[explained] = doubted[explained]
-    record.restore((number + np.flatnonzero(explained)).tolist())
+    if explained.any():
+        y[explained] = doubted[explained]
+        record.restore((number + np.flatnonzero(explained)).tolist())
     record.decide_doubts(number + len(y))
-    outliers &= np.isfinite(y)
     valid = np.isfinite(y)
+    outliers &= valid
     if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
         valid &= ~outliers
         record.lose(number + np.flatnonzero(outliers))
@@ -70,7 +71,7 @@ def take_block(learning: Learning) -> Task:
     else:
         fit.samples.take(rows, taken, weights_of(y))
     yield
-    note_block(learning, fits, number, len(v), number + change(squares))
+    note_block(learning, fits, number, squares)
     learning.current = Fitted(fit, fit.solve())
     return fits
 

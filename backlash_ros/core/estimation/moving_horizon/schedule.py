@@ -24,19 +24,19 @@ def next_task(learning: Learning, estimate: Estimate) -> Task | None:
     if current is None:
         return acquire(learning) if record.end >= learning.acquisition.next_at else None
     fit, solution, _ = current
-    contradicted = learning.contradicted_from is not None
+    length, contradicted = fit.length, learning.contradicted_from is not None
     fewest, most = BLOCK
-    wanted = fewest if contradicted else min(max(fit.length // BLOCK_SHARE, fewest), most)
-    if learning.waiting >= wanted:
+    wanted = fewest if contradicted else min(max(length // BLOCK_SHARE, fewest), most)
+    if len(record) - length >= wanted:
         return take_block(learning)
     if contradicted:
         return reconsider(learning, estimate) if record.end >= learning.next_try else None
-    if fit.length >= learning.refit_at or (
-        fit.length >= learning.moved_at
+    if length >= learning.refit_at or (
+        length >= learning.moved_at
         and abs(solution.gap - fit.start.gap) > MOVED * solution.std_gap
     ):
         return refit(learning)
-    aged = solution.correlation > 0.0 or learning.drifts_more(solution, fit.length)
+    aged = solution.correlation > 0.0 or learning.drifts_more(solution, length)
     if not aged or record.end < learning.next_try:
         return None
     # What contradicts may be a G that went astray: the plant has changed only where the best fit

@@ -182,7 +182,7 @@ class StateFollowing:
                 exact = self._replayed(current, record)
         else:
             observer.settle(noise)
-            if exact is None or cov is None or np.trace(cov) > np.trace(observer.noise_cov):
+            if exact is None or cov is None or cov.trace() > observer.noise_cov.trace():
                 exact = None
         p = fit.play_output(gap, solution)
         if exact is not None:

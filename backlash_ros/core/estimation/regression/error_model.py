@@ -99,16 +99,18 @@ class ErrorModel:
 
 
 class ErrorFilter:
-    """The filters F_i with their state: what comes in pieces comes out as if it were one."""
+    """The filters F_i with their state: what comes in pieces comes out as if it were one.
 
-    def __init__(self, error: ErrorModel) -> None:
+    signals: S, how many are filtered beside each other.
+    """
+
+    def __init__(self, error: ErrorModel, signals: int) -> None:
         self._error = error
-        self._once = np.zeros(error.taps)
-        self._twice = np.zeros(error.taps)
-        self._past: Array = np.zeros((3, max(error.taps - 1, 1)))
+        self._once, self._twice = np.zeros((2, signals, error.taps))
+        self._past: Array = np.zeros((3, signals, max(error.taps - 1, 1)))
 
     def filtered(self, direct: Array) -> Array:
-        """Responses to the next samples (N,), shape (N, K)."""
+        """Responses to the next samples (S, N), shape (S, N, K)."""
         error, taps = self._error, self._error.taps
         gain = [error.gain]
         if taps:
@@ -116,16 +118,16 @@ class ErrorFilter:
             twice, self._twice = lfilter(gain, error.stable, once, zi=self._twice)
         else:
             once = twice = direct
-        memory = self._past.shape[1]
-        longer = np.concatenate([self._past, [direct, once, twice]], axis=1)
-        self._past = longer[:, longer.shape[1] - memory:]
-        out = np.empty((len(direct), error.count))
-        column = 0
+        memory = self._past.shape[2]
+        longer = np.concatenate([self._past, [direct, once, twice]], axis=2)
+        self._past = longer[..., longer.shape[2] - memory:]
+        out = np.empty((len(direct), error.count, direct.shape[1]))
+        row = 0
         for signal, delays in zip(longer, (2, taps, taps), strict=True):
             for j in range(delays):
-                out[:, column] = signal[memory - j:len(signal) - j]
-                column += 1
-        return out
+                out[:, row] = signal[:, memory - j:signal.shape[1] - j]
+                row += 1
+        return np.swapaxes(out, 1, 2)
 
 
 @lru_cache(maxsize=8)

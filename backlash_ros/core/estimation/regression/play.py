@@ -56,29 +56,25 @@ def labels_from(
     """The same for a play output p (N,) and sides (N,) that are known."""
     engaged = np.flatnonzero(sides)
     count = len(v)
-    # Index of the last engaged sample at each sample, -1 before the first.
-    last = np.full(count, -1)
-    last[engaged] = engaged
-    np.maximum.accumulate(last, out=last)
-    before = last < 0
-    anchor = np.where(before, v_a, v[last])
-    sign = np.where(before, side, sides[last])
+    # At each sample the number of engaged ones so far: what is said of the last of these.
+    number = np.cumsum(sides != 0)
+    sign = np.concatenate([[side], sides[engaged]])[number]
+    anchor = np.concatenate([[v_a if side else 0.0], v[engaged]])[number]
     moves = np.empty(count)
     moves[:1], moves[1:] = p[:1] - p0, p[1:] - p[:-1]
     jump = np.zeros(count)
     if side == 0 and len(engaged):
         first = engaged[0]
         jump[first], moves[first] = 1.0, 0.0
-    return Labels(
-        (sign > 0).astype(float), (sign < 0).astype(float), (sign == 0).astype(float),
-        np.where(sign == 0, 0.0, anchor), moves, jump, p,
-    )
+    right, left, held = np.equal.outer((1, -1, 0), sign).astype(float)
+    return Labels(right, left, held, anchor, moves, jump, p)
 
 
 def play(v: Array, gap: float, p0: float) -> tuple[Array, NDArray[np.int8]]:
     """Play output p (N,) and side engaged at each sample: 1 right, -1 left, 0 in the gap."""
     p = np.array(play_outputs(v.tolist(), gap, p0))
-    return p, np.where(p == v, 1, np.where(p == v + gap, -1, 0)).astype(np.int8)
+    right = p == v
+    return p, np.subtract(right, (p == v + gap) > right, dtype=np.int8)
 
 
 def plays(v: Array, gaps: Array, p0: Array) -> Array:
@@ -87,7 +83,7 @@ def plays(v: Array, gaps: Array, p0: Array) -> Array:
     Only where v turns it has to be stepped: while v rises, p = max(p, v) with the p of the turn
     before; while it falls, p = min(p, v + gap).
     """
-    rising = np.diff(v, prepend=v[0]) > 0.0
+    rising = np.concatenate([[False], v[1:] > v[:-1]])
     last: Array = np.append(np.flatnonzero(rising[1:] != rising[:-1]), len(v) - 1)
     held = np.minimum(np.maximum(p0, v[0]), v[0] + gaps)
     before = np.empty((len(gaps), len(last)))
@@ -95,9 +91,7 @@ def plays(v: Array, gaps: Array, p0: Array) -> Array:
         before[:, k] = held
         held = np.maximum(held, value) if up else np.minimum(held, value + gaps)
     p = np.repeat(before, np.diff(last, prepend=-1), axis=1)
-    np.maximum(p, v, out=p, where=rising)
-    np.minimum(p, v + gaps[:, None], out=p, where=~rising)
-    return p
+    return np.where(rising, np.maximum(p, v), np.minimum(p, v + gaps[:, None]))
 
 
 class Start(NamedTuple):

@@ -13,8 +13,8 @@ Bayesian interpolation, Neural Computation 4 (1992) 415-447.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from math import exp, log, log1p, sqrt
+from functools import cached_property, lru_cache
+from math import exp, inf, isfinite, log, log1p, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,37 +35,36 @@ VAGUE = 1e-9  # weight of a prior, as a share of the norm of a column, that is n
 
 @dataclass(frozen=True)
 class Posterior:
-    """mean: of b and e, shape (p,). cov: in units of sigma^2, shape (p, p). noise_std: sigma.
+    """mean: of b and e, shape (p,). root: L of their covariance L L', in units of sigma^2.
 
-    scale: the most likely s. evidence: log-likelihood of the data with b, e and sigma integrated
-    out, comparable between fits of the same data.
+    noise_std: sigma. scale: the most likely s. evidence: log-likelihood of the data with b, e and
+    sigma integrated out, comparable between fits of the same data.
     """
 
     mean: Array
-    cov: Array
+    root: Array  # shape (p, ..)
     noise_std: float
     scale: float
     evidence: float
+
+    @cached_property
+    def cov(self) -> Array:
+        """Covariance, shape (p, p)."""
+        return self.root @ self.root.T
 
 
 class Triangle:
     """R of the weighted rows [X, y] so far, shape (p + 1, p + 1), and the sum of their weights.
 
-    weights: of a prior at zero, shape (p,), that keeps R regular and is no information.
+    given: how many other unknowns these p are given.
     """
 
-    def __init__(self, weights: Array) -> None:
-        self.count = 0.0
-        self.r: Array = np.diag(np.append(weights, 0.0))
+    def __init__(self, r: Array, count: float = 0.0, given: int = 0) -> None:
+        self.r, self.count, self.given = r, count, given
 
     def append(self, rows: Array, y: Array, count: float) -> None:
         """Take in weighted rows (N, p) with outputs y (N,); count: sum of their weights."""
-        size = len(self.r)
-        stacked = np.empty((size + len(y), size), order='F')
-        stacked[:size], stacked[size:, :-1], stacked[size:, -1] = self.r, rows, y
-        factored = lapack.dgeqrf(stacked, overwrite_a=1)[0]
-        self.r = np.where(_upper(size), factored[:size], 0.0)
-        self.count += count
+        self.r, self.count = self._r_with(rows, y), self.count + count
 
     def informed(self, where: slice, mean: Array, cov: Array, told_std: float) -> Triangle:
         """The same with a prior of these unknowns: mean (k,), covariance (k, k)."""
@@ -81,21 +80,19 @@ class Triangle:
     def hold_noise(self, noise_std: float) -> None:
         """Let the residual so far be that of noise of this deviation."""
         size = len(self.r) - 1
-        self.r[size, size] = noise_std * sqrt(max(self.count - size, 0.0))
+        self.r[size, size] = noise_std * sqrt(max(self.count - self.given - size, 0.0))
 
-    def without(self, column: int) -> Triangle:
-        """The same where this unknown is 0."""
-        size = len(self.r) - 1
-        other = Triangle(np.zeros(size - 1))
-        other.count = self.count
-        kept = np.empty((size + 1, size), order='F')
-        kept[:, :column], kept[:, column:] = self.r[:, :column], self.r[:, column + 1:]
-        other.r = np.where(_upper(size), lapack.dgeqrf(kept, overwrite_a=1)[0][:size], 0.0)
-        return other
+    def after(self, count: int) -> Triangle:
+        """That of the other unknowns given the first `count` ones."""
+        return Triangle(self.r[count:, count:], self.count, self.given + count)
+
+    def without_first(self) -> Triangle:
+        """The same where the first unknown is 0."""
+        return Triangle(_triangular(self.r[:, 1:].copy(order='F')), self.count, self.given)
 
     def log_precision(self, first: int, last: int) -> float:
         """Of these unknowns given all before them: how sharply the rows tell them."""
-        return float(np.log(np.abs(np.diag(self.r)[first:last])).sum())
+        return float(np.log(np.abs(self.r.diagonal()[first:last])).sum())
 
     def with_prior(self, where: slice, std: float, told_std: float) -> tuple[Triangle, float]:
         """The same with independent priors of these unknowns, and what that adds to the evidence.
@@ -103,8 +100,7 @@ class Triangle:
         std: their deviation, around 0.
         """
         sigma, count = self._noise(told_std), where.stop - where.start
-        rows = np.zeros((count, len(self.r) - 1))
-        rows[:, where] = np.eye(count) * (sigma / std)
+        rows = np.eye(count, len(self.r) - 1, where.start) * (sigma / std)
         other = self._with_rows(rows, np.zeros(count))
         return other, count * log(sigma / std) - other.log_precision(where.start, where.stop)
 
@@ -112,14 +108,17 @@ class Triangle:
         """Deviation of the noise, as far as the rows tell it without a prior."""
         size = len(self.r) - 1
         squares = float(self.r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2
-        return sqrt(squares / (max(self.count - size, 0.0) + NOISE_WEIGHT))
+        return sqrt(squares / (max(self.count - self.given - size, 0.0) + NOISE_WEIGHT))
 
     def _with_rows(self, rows: Array, y: Array) -> Triangle:
         """The same with rows that count for no sample."""
-        other = Triangle(np.zeros(len(self.r) - 1))
-        other.r, other.count = self.r, self.count
-        other.append(rows, y, 0.0)
-        return other
+        return Triangle(self._r_with(rows, y), self.count, self.given)
+
+    def _r_with(self, rows: Array, y: Array) -> Array:
+        size = len(self.r)
+        stacked = np.empty((size + len(y), size), order='F')
+        stacked[:size], stacked[size:, :-1], stacked[size:, -1] = self.r, rows, y
+        return _triangular(stacked)
 
     def posterior(
         self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,
@@ -131,52 +130,81 @@ class Triangle:
         least_scale, most_scale: those that are considered; the first one counts where they
         contradict each other. Raises LinAlgError where numbers get too large.
         """
+        of_errors = self.after(base)._of_errors(
+            abs(slope) * spreads, told_std, least_scale, most_scale
+        )
+        return self.with_first(of_errors)
+
+    def with_first(self, of_last: Posterior) -> Posterior:
+        """Posterior of all unknowns from one of the last ones."""
+        first = len(self.r) - 1 - len(of_last.mean)
+        if not first:
+            return of_last
+        inverse = lapack.dtrtri(self.r[:first, :first])[0]
+        # How the first ones depend on the last ones, and on y.
+        by = inverse @ self.r[:first, first:]
+        root = np.zeros((len(self.r) - 1, first + of_last.root.shape[1]))
+        root[:first, :first] = inverse
+        root[:first, first:] = -by[:, :-1] @ of_last.root
+        root[first:, first:] = of_last.root
+        mean = np.concatenate([by[:, -1] - by[:, :-1] @ of_last.mean, of_last.mean])
+        return replace(of_last, mean=mean, root=root)
+
+    def _of_errors(
+        self, weights: Array, told_std: float, least_scale: float, most_scale: float,
+    ) -> Posterior:
+        """Posterior of all unknowns as e. weights: prior deviation of each at s = 1."""
         r, size = self.r, len(self.r) - 1
         weight = self.count + NOISE_WEIGHT
-        freedom = max(self.count - base, 0.0) + NOISE_WEIGHT
+        freedom = max(self.count - self.given, 0.0) + NOISE_WEIGHT
         squares = float(r[size, size]) ** 2 + NOISE_WEIGHT * told_std**2
-        inverse = lapack.dtrtri(np.asfortranarray(r[:base, :base]))[0]
-        target = inverse @ r[:base, size]
-        if size == base:
+        if not size:
             evidence = -0.5 * weight * log(squares / weight)
-            return Posterior(target, inverse @ inverse.T, sqrt(squares / freedom), 0.0, evidence)
-        weights = abs(slope) * spreads
-        u, s, vt = np.linalg.svd(r[base:size, base:size] * weights)
-        z = u.T @ r[base:size, size]
+            return Posterior(np.zeros(0), np.zeros((0, 0)), sqrt(squares / freedom), 0.0, evidence)
+        u, s, vt, failed = lapack.dgesdd(r[:size, :size] * weights)
+        if failed:
+            raise np.linalg.LinAlgError('the samples leave no singular values')
+        z = r[:size, size] @ u
         # Grid of (s / sigma)^2, the form in which sigma can be integrated out.
-        ratios = (RATIOS * (freedom / squares))[:, None]
+        ratios = RATIOS[:, None] * (freedom / squares)
         shrink = 1.0 / (1.0 + ratios * (s * s))
         left = squares + shrink @ (z * z)
-        evidence = 0.5 * np.log(shrink).sum(axis=1) - 0.5 * weight * np.log(left / weight)
-        scales = np.sqrt(ratios[:, 0] * left / freedom)
+        scales2 = RATIOS * left / squares
         # The uncertainty that was told is the deviation of what s = 1 stands for.
-        evidence -= 0.5 * scales**2
+        evidence = 0.5 * (np.log(shrink).sum(axis=1) - weight * np.log(left / weight) - scales2)
         # Half a step of the grid beyond is the same. None at all, and the largest one, remain.
-        evidence[:-1][scales[:-1] < least_scale * SAME] = -np.inf
-        evidence[1:][scales[1:] > max(most_scale, least_scale) / SAME] = -np.inf
-        best = int(np.argmax(evidence))
-        if not np.isfinite(evidence[best]):
+        if least_scale > 0.0:
+            evidence[:-1][scales2[:-1] < (least_scale * SAME)**2] = -inf
+        if most_scale < inf:
+            evidence[1:][scales2[1:] > (max(most_scale, least_scale) / SAME)**2] = -inf
+        best = int(evidence.argmax())
+        highest = float(evidence[best])
+        if not isfinite(highest):
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
         # The grid is one of the logarithm of s: each scale stands for as much of s as it is large.
-        share = STEPS * np.exp(evidence - evidence[best])
+        share = STEPS * np.exp(evidence - highest)
         share /= share.sum()
         noise_var = float(share @ left) / freedom
         # The mixture over all scales: its mean, its mean covariance, and that of its means.
-        means = ratios * s * shrink * z
+        gains = ratios * shrink
+        means = gains * (s * z)
         mean = share @ means
-        within = share @ (ratios * shrink * (left / (freedom * noise_var))[:, None])
+        within = (share * left / (freedom * noise_var)) @ gains
         between = (means - mean) * np.sqrt(share / noise_var)[:, None]
-        # All unknowns by e, and b besides by what the rows say of it for a given e.
-        by = np.concatenate([inverse @ -r[:base, base:size], np.eye(size - base)]) @ (
-            weights[:, None] * vt.T
-        )
-        root = by @ np.concatenate([np.diag(np.sqrt(within)), between.T], axis=1)
-        all_means, cov = by @ mean, root @ root.T
-        all_means[:base] += target
-        cov[:base, :base] += inverse @ inverse.T
-        return Posterior(
-            all_means, cov, sqrt(noise_var), float(scales[best]), float(evidence[best])
-        )
+        by = weights[:, None] * vt.T
+        root = np.concatenate([by * np.sqrt(within), by @ between.T], axis=1)
+        return Posterior(by @ mean, root, sqrt(noise_var), sqrt(scales2[best]), highest)
+
+
+def vague_triangle(weights: Array) -> Triangle:
+    """That of a prior at zero, weights (p,), which keeps R regular and is no information."""
+    return Triangle(np.diag(np.append(weights, 0.0)))
+
+
+def _triangular(a: Array) -> Array:
+    """R of a (N, n) in Fortran order, which is overwritten."""
+    n = a.shape[1]
+    return np.where(_upper(n), lapack.dgeqrf(a, overwrite_a=1)[0][:n], 0.0)
 
 
 @lru_cache(maxsize=64)
@@ -185,17 +213,11 @@ def _upper(size: int) -> NDArray[np.bool_]:
     return np.triu(np.ones((size, size), dtype=np.bool_))
 
 
-def with_zero(posterior: Posterior, where: int) -> Posterior:
-    """The same with one more unknown, which is known to be 0."""
-    size = len(posterior.mean) + 1
-    mean, cov = np.zeros(size), np.zeros((size, size))
-    before, after = slice(where), slice(where + 1, None)
-    mean[before], mean[after] = posterior.mean[before], posterior.mean[where:]
-    cov[before, before] = posterior.cov[before, before]
-    cov[before, after] = posterior.cov[before, where:]
-    cov[after, before] = posterior.cov[where:, before]
-    cov[after, after] = posterior.cov[where:, where:]
-    return replace(posterior, mean=mean, cov=cov)
+def with_zero(posterior: Posterior) -> Posterior:
+    """The same with one more unknown before all others, which is known to be 0."""
+    root = np.zeros((len(posterior.root) + 1, posterior.root.shape[1]))
+    root[1:] = posterior.root
+    return replace(posterior, mean=np.concatenate([[0.0], posterior.mean]), root=root)
 
 
 def mixture(one: Posterior, other: Posterior, bonus: float) -> Posterior:
@@ -203,12 +225,14 @@ def mixture(one: Posterior, other: Posterior, bonus: float) -> Posterior:
     bonus += other.evidence - one.evidence
     share = 1.0 / (1.0 + exp(-bonus)) if bonus > -LARGEST_EXPONENT else 0.0
     noise_var = (1.0 - share) * one.noise_std**2 + share * other.noise_std**2
-    mean = (1.0 - share) * one.mean + share * other.mean
-    cov = np.zeros_like(one.cov)
-    for part, weight in ((one, 1.0 - share), (other, share)):
-        off = part.mean - mean
-        cov += (weight / noise_var) * (part.noise_std**2 * part.cov + np.outer(off, off))
+    mean, apart = (1.0 - share) * one.mean + share * other.mean, other.mean - one.mean
+    noise_std = sqrt(noise_var)
+    root = np.concatenate([
+        (sqrt(1.0 - share) * one.noise_std / noise_std) * one.root,
+        (sqrt(share) * other.noise_std / noise_std) * other.root,
+        (sqrt(share * (1.0 - share)) / noise_std) * apart[:, None],
+    ], axis=1)
     return Posterior(
-        mean, cov, sqrt(noise_var), (one if share < 0.5 else other).scale,
+        mean, root, noise_std, (one if share < 0.5 else other).scale,
         one.evidence + max(bonus, 0.0) + log1p(exp(-abs(bonus))),
     )

@@ -13,6 +13,7 @@ def weights_of(y: Array) -> Array:
 
     A sensor with a resolution repeats its error with its reading; what repeats tells nothing new.
     """
-    changes = np.flatnonzero(np.diff(y) != 0.0) + 1  # nan differs from itself
-    lengths = np.diff(np.concatenate([[0], changes, [len(y)]]))
+    changes = np.flatnonzero(y[1:] != y[:-1]) + 1  # nan differs from itself
+    ends = np.concatenate([[0], changes, [len(y)]])
+    lengths = ends[1:] - ends[:-1]
     return np.repeat(1.0 / lengths, lengths)

@@ -20,7 +20,8 @@ unknown start of p.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +39,16 @@ SIGNALS = 6  # that drive G: 1_H, v_a, -1_R, -1_L, p(k) - p(k-1), the first jump
 
 def held(y: Array, before: float) -> Array:
     """y (N,) with what was lost replaced by the value before it."""
-    known = np.where(np.isfinite(y), np.arange(len(y)), -1)
+    finite = np.isfinite(y)
+    if finite.all():
+        return y
+    known = np.where(finite, np.arange(len(y)), -1)
     np.maximum.accumulate(known, out=known)
     return np.where(known < 0, before, y[known])
 
 
-class Layout(NamedTuple):
+@dataclass(frozen=True)
+class Layout:
     """Where the unknowns stand.
 
     n: order of G. errors: K. leak, jump: whether a leak and the first jump are there. ramps: how
@@ -56,28 +61,28 @@ class Layout(NamedTuple):
     jump: bool
     ramps: int
 
-    @property
+    @cached_property
     def driven(self) -> int:
         """Number of unknowns that make the state of G without a walk: x0, u0, theta."""
         return self.n + 4
 
-    @property
+    @cached_property
     def walk(self) -> slice:
         """Heights of the ramps."""
         first = self.driven + int(self.leak)
         return slice(first, first + self.ramps)
 
-    @property
+    @cached_property
     def base(self) -> int:
         """Number of unknowns without those of the error model."""
         return self.driven + int(self.leak) + self.ramps
 
-    @property
+    @cached_property
     def theta(self) -> slice:
         """m, m c_r, m c_l."""
         return slice(self.n + 1, self.n + 4)
 
-    @property
+    @cached_property
     def unknowns(self) -> int:
         """Number p of all unknowns."""
         return self.base + self.errors * (2 if self.jump else 1)
@@ -102,7 +107,7 @@ class Regressors:
         # observer form.
         self._states: Array = np.zeros((n + SIGNALS + self.layout.ramps, n))
         self._states[:n] = model.to_observer.T
-        self._errors, self._jumps = ErrorFilter(error), ErrorFilter(error)
+        self._errors = ErrorFilter(error, 2 if self.layout.jump else 1)
         self._sum = self._y = 0.0  # of all y so far, and the newest one
 
     def rows(self, labels: Labels, y: Array) -> Array:
@@ -110,8 +115,7 @@ class Regressors:
 
         y: measured after each of them, nan where lost, shape (N,).
         """
-        layout, n = self.layout, self.layout.n
-        count, base, driven = len(labels.v_a), layout.base, layout.driven
+        layout, n, count = self.layout, self.layout.n, len(y)
         signals = np.zeros((len(self._states), count))
         signals[n], signals[n + 1] = labels.held, labels.v_a
         np.negative(labels.right, out=signals[n + 2])
@@ -121,24 +125,24 @@ class Regressors:
             signals[n + SIGNALS:] = self.ramps(self._count, count)
         self._count += count
         answers, self._states = self._answers(signals, self._states)
-        rows = np.empty((count, layout.unknowns))
-        rows[:, :driven] = answers[:driven].T
+        driven = layout.driven
+        columns = np.empty((layout.unknowns, count))
+        columns[:driven] = answers[:driven]
         if layout.leak:
-            rows[:, driven] = self._leak(y)
-        rows[:, layout.walk] = answers[n + SIGNALS:].T
+            columns[driven] = self._leak(y)
+        columns[layout.walk] = answers[n + SIGNALS:]
         if layout.errors:
-            spread, end = self._error.spread, base + layout.errors
-            rows[:, base:end] = self._errors.filtered(answers[driven]) @ spread
-            if layout.jump:
-                rows[:, end:] = self._jumps.filtered(answers[driven + 1]) @ spread
-        return rows
+            filtered = self._errors.filtered(answers[driven:driven + 1 + layout.jump])
+            responses = self._error.spread.T @ np.swapaxes(filtered, 1, 2)
+            columns[layout.base:] = responses.reshape(-1, count)
+        return columns.T
 
     def begin_after(self, moves: Array) -> None:
         """Begin where the error of G still answers to these moves of p (N,), the newest last."""
         driven = self.layout.driven
         states: Array = self._states[driven:driven + 1]
         answers, self._states[driven:driven + 1] = self._answers(moves[None], states)
-        self._errors.filtered(answers[0])
+        self._errors.filtered(answers)
 
     def _answers(self, signals: Array, states: Array) -> tuple[Array, Array]:
         """Outputs of G after each sample of the signals (M, N), and its states after the last."""
@@ -151,7 +155,7 @@ class Regressors:
     def _leak(self, y: Array) -> Array:
         """Minus the sum of all y before, a lost one counting as the one before it."""
         filled = held(y, self._y)
-        before: Array = np.cumsum(np.append(self._sum + self._y, filled))
+        before: Array = np.concatenate([[self._sum + self._y], filled]).cumsum()
         self._sum, self._y = float(before[-2]), float(filled[-1])
         return -before[:-1]
 

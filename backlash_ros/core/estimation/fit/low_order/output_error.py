@@ -48,8 +48,13 @@ class OutputError:
 
     def free(self, poles: Array) -> Array:
         """Free responses of G, shape (n, N)."""
-        order = len(poles) - 1
-        return np.asarray(lfilter([1.0], poles, np.eye(max(order, 1), self.samples))[:order])
+        responses = np.zeros((len(poles) - 1, self.samples))
+        impulse = np.zeros(self.samples)
+        impulse[0] = 1.0
+        response = lfilter([1.0], poles, impulse)
+        for delay, delayed in enumerate(responses):
+            delayed[delay:] = response[:self.samples - delay]
+        return responses
 
     def response(self, b: Array, poles: Array, delay: int) -> Array:
         """Response of G to u and what was before it, from the first of these on."""
