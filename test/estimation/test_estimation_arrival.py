@@ -27,7 +27,7 @@ def fit_of(prior: Prior | None, size: float = 3.0) -> Fitted:
     """The fit of a record of 400 samples in which G is uncertain."""
     v = swing(400, size)
     y = output(resonance(), v, TRUTH, NOISE)
-    around = Around(MODEL, build_error_model(MODEL, 0.2), NOISE, prior, inherited=True)
+    around = Around(build_error_model(MODEL, 0.2), NOISE, prior, inherited=True)
     start = Start(TRUTH.gap, float(v[0]) + 0.5 * TRUTH.gap)
     return drained(fitted(v, y, around, start, TRUTH.m, Pace()))
 
@@ -62,7 +62,7 @@ def test_unexplained_motion_makes_what_was_known_no_worse() -> None:
     sharp = Prior(THETA, np.diag([1e-3, 1e-3, 1e-3])**2)
     v = swing(400, 3.0)
     y = output(resonance(), v, TRUTH, NOISE) + 0.05 * np.sign(np.sin(0.2 * np.arange(400)))
-    around = Around(MODEL, build_error_model(MODEL, 0.2), NOISE, sharp, inherited=True)
+    around = Around(build_error_model(MODEL, 0.2), NOISE, sharp, inherited=True)
     start = Start(TRUTH.gap, float(v[0]) + 0.5 * TRUTH.gap)
     solution = drained(fitted(v, y, around, start, TRUTH.m, Pace())).solution
     assert solution.inflation > 10.0

@@ -38,7 +38,7 @@ uncertainties = st.sampled_from([0.0, 0.2])
 def around(uncertainty: float) -> Around:
     """The exact G, said to be as uncertain as this."""
     model = StateModel(MODEL)
-    return Around(model, build_error_model(model, uncertainty), NOISE)
+    return Around(build_error_model(model, uncertainty), NOISE)
 
 
 def found_in(v: np.ndarray, y: np.ndarray, uncertainty: float) -> Found:
@@ -208,8 +208,7 @@ def test_search_and_fit_learn_the_backlash_through_a_wrong_model(
     assert result.solution.gap == pytest.approx(truth.gap, rel=0.02)
     assert result.solution.m == pytest.approx(truth.m, rel=0.02)
     if ratio != 1.0:
-        # Whether G moves or its error terms say so is up to the evidence.
-        assert max(result.around.scale, result.solution.posterior.scale) > 0.1
+        assert result.solution.posterior.scale > 0.1
 
 
 def test_a_constant_u_is_no_backlash() -> None:
@@ -228,7 +227,9 @@ def test_a_first_gap_is_as_well_known_as_it_says() -> None:
         v *= rng.uniform(0.9, 3.0) / np.abs(v).max()
         y = output(MODEL, v, truth, NOISE * 10.0 ** rng.uniform(-1.0, 1.0), seed)
         found = drained(searched(v, y, around(0.0), 10.0, Pace()))
-        crossings = None if found is None else found.solution.crossings
+        # As for a first estimate.
+        clear = found is not None and found.decided and found.fit.reversals > 0
+        crossings = found.solution.crossings if found is not None and clear else None
         if crossings is not None and crossings.std_gap < 0.3 * crossings.gap:
             judged += 1
             wrong += abs(crossings.gap - truth.gap) > 5.0 * crossings.std_gap

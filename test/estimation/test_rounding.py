@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from records import Truth, output, resonance, swing
 
-from backlash_ros.core.estimation.fit.low_order.better_model import Refined, refined_model
+from backlash_ros.core.estimation.fit.learned_error import Learned, likelier
 from backlash_ros.core.estimation.fit.pace import Pace, drained
-from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted_with_model
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.rounding.rounding import with_rounding
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.regression.error_model import build_error_model
@@ -36,9 +36,14 @@ def rounded(v: np.ndarray, frequency_hz: float = 5.0, noise_std: float = 0.0) ->
 
 def by_values(v: np.ndarray, y: np.ndarray, uncertainty: float = 0.2) -> Fitted:
     model = StateModel(resonance())
-    around = Around(model, build_error_model(model, uncertainty), STEP / 12**0.5)
+    around = Around(build_error_model(model, uncertainty), STEP / 12**0.5)
     start = Start(TRUTH.gap, TRUTH.start(v))
-    return drained(fitted_with_model(v, y, around, start, TRUTH.m, Pace()))
+    return drained(fitted(v, y, around, start, TRUTH.m, Pace()))
+
+
+def told() -> Learned:
+    error = build_error_model(StateModel(resonance()), 0.2)
+    return Learned(error.model, np.zeros(error.count), 0)
 
 
 def both(v: np.ndarray, y: np.ndarray, uncertainty: float = 0.2) -> tuple[Fitted, Fitted]:
@@ -174,9 +179,7 @@ def test_g_of_low_order_is_found_by_intervals_as_well() -> None:
         true = resonance(6.0)
         y = rounded(v, 6.0)
         for fit in both(v, y):
-            learned = drained(refined_model(
-                v, y, fit.fit, fit.solution, Refined(fit.fit.model, 0), Pace()
-            ))
+            learned = likelier(fit.fit, fit.solution, told())
             response = learned.model.transfer_function.response(Z) / true.response(Z)
             off.append(float(np.abs(response - 1.0).max()))
     values, intervals = np.array(off).reshape(-1, 2).T
@@ -187,7 +190,6 @@ def test_g_that_explains_the_readings_as_well_stays() -> None:
     v = swing(SAMPLES)
     y = rounded(v, 6.0)
     fit = both(v, y)[1]
-    told = Refined(fit.fit.model, 0)
-    first = drained(refined_model(v, y, fit.fit, fit.solution, told, Pace()))
-    assert 300 <= first.samples <= SAMPLES
-    assert drained(refined_model(v, y, fit.fit, fit.solution, first, Pace())) is first
+    first = likelier(fit.fit, fit.solution, told())
+    assert first.samples == SAMPLES
+    assert likelier(fit.fit, fit.solution, first) is first

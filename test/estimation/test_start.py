@@ -21,7 +21,7 @@ NOISE = 1e-3
 def fit_from(share: float, seed: int) -> tuple[Fitted, float]:
     """A fit that begins with p at this share of the gap, and the first v."""
     model = StateModel(resonance())
-    around = Around(model, build_error_model(model, 0.2), NOISE)
+    around = Around(build_error_model(model, 0.2), NOISE)
     v = swing(500, seed=seed)
     y = output(resonance(5.5), v, TRUTH, NOISE)
     start = Start(TRUTH.gap, float(v[0]) + share * TRUTH.gap)
@@ -43,7 +43,7 @@ def test_pieces_of_columns_that_are_taken_later_leave_the_first_v_as_it_is() -> 
     found = []
     for piece in (500, 100):
         fit = WindowFit(
-            Around(model, build_error_model(model, 0.2), NOISE), start, TRUTH.m,
+            Around(build_error_model(model, 0.2), NOISE), start, TRUTH.m,
             (float(np.abs(y).max()), float(np.abs(v).max())),
         )
         rows = np.concatenate([

@@ -33,7 +33,7 @@ class Problem:
         b = rng.standard_normal(BASE)
         self.y = self.x @ np.append(b, e) + noise * rng.standard_normal(ROWS)
 
-    def posterior(self, pieces: int = 1, least: float = 0.0, most: float = np.inf) -> Posterior:
+    def posterior(self, pieces: int = 1, most: float = np.inf) -> Posterior:
         """By the code, from rows in pieces."""
         weights = np.append(np.full(BASE, VAGUE), np.zeros(ERRORS))
         triangle = vague_triangle(weights)
@@ -41,7 +41,7 @@ class Problem:
             np.array_split(self.x, pieces), np.array_split(self.y, pieces), strict=True
         ):
             triangle.append(x, y, float(len(y)))
-        return triangle.posterior(BASE, SLOPE, SPREADS, self.told, least, most)
+        return triangle.posterior(BASE, SLOPE, SPREADS, self.told, most)
 
     def ratios(self) -> np.ndarray:
         """Those (scale / noise)^2 that are compared: none, and a grid about the residual."""
@@ -140,7 +140,6 @@ def test_an_error_that_is_not_there_is_not_learned() -> None:
 
 def test_limits_of_the_scale_are_kept() -> None:
     problem = Problem(1, 0.3, 0.01, 0.01)
-    assert problem.posterior(least=1.0).scale >= 0.7
     assert problem.posterior(most=0.01).scale <= 0.01 / 0.7
 
 
@@ -152,9 +151,9 @@ def test_a_prior_is_one_more_measurement() -> None:
     triangle = vague_triangle(np.full(BASE, VAGUE))
     triangle.append(problem.x[:, :BASE], problem.y, float(ROWS))
     # In units of the noise that the rows tell, whatever was told.
-    noise = triangle.posterior(BASE, SLOPE, np.zeros(0), problem.told, 0.0, np.inf).noise_std
+    noise = triangle.posterior(BASE, SLOPE, np.zeros(0), problem.told, np.inf).noise_std
     informed = triangle.informed(slice(1, 3), mean, cov, problem.told)
-    found = informed.posterior(BASE, SLOPE, np.zeros(0), problem.told, 0.0, np.inf)
+    found = informed.posterior(BASE, SLOPE, np.zeros(0), problem.told, np.inf)
     information = problem.x[:, :BASE].T @ problem.x[:, :BASE] + VAGUE**2 * np.eye(BASE)
     target = problem.x[:, :BASE].T @ problem.y
     of_prior = np.linalg.inv(cov) * noise**2

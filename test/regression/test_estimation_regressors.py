@@ -14,7 +14,7 @@ from records import resonance
 from scipy.signal import lfilter
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, signals
 
-from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel, monic
+from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel
 from backlash_ros.core.estimation.regression.play import Labels, labels_of
 from backlash_ros.core.estimation.regression.readings import weights_of
 from backlash_ros.core.estimation.regression.regressors import Regressors
@@ -114,11 +114,11 @@ def test_error_filter_in_pieces_equals_one_piece(
 def delta(name: str, h: np.ndarray, u: np.ndarray) -> np.ndarray:
     """(1 - z^-1) sum h_i F_i applied to the moves of u, from the formulas of the F_i."""
     poles = MODELS[name].poles
-    a = monic(poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)])
+    moving = poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)]
+    a = np.atleast_1d(np.real(np.poly(moving)))
     taps = len(a) - 1
-    once, twice = ([a.sum()], a), ([a.sum() ** 2], np.polymul(a, a))
-    bases = [([1.0], [1.0])] * 2 + [once] * taps + [twice] * taps
-    delays = [0, 1, *range(taps), *range(taps)]
+    bases = [([1.0], [1.0])] * 2 + [([a.sum()], a)] * taps
+    delays = [0, 1, *range(taps)]
     total = np.zeros(len(u))
     for weight, (b, a_i), delay in zip(h, bases, delays, strict=True):
         total += weight * lfilter(np.append(np.zeros(delay), b), a_i, u)

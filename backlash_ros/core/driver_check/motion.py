@@ -207,7 +207,7 @@ def _mismatch(fit: RecordFit, other: float | None, p: Parameters) -> tuple[str, 
 
 
 def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None:
-    """Sample period [s] for which the poles of G fit as they are, to within plant.uncertainty."""
+    """Sample period [s] for which the poles of G fit to within plant.uncertainty, or far better."""
     later = Record(record.v[MORE_DELAY:], record.y[MORE_DELAY:], record.lag)
     others: list[tuple[float, float]] = []
     for ratio in OTHER_PERIODS:
@@ -215,7 +215,9 @@ def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None
         other = TransferFunction(fit.told.numerator.tolist(), denominator)
         # The same samples of y as in the fit, whose evidence is compared.
         refit = _fit(other, later, p, more_delay=0)
-        if refit.predicted >= PREDICTED and refit.error_scale <= 1.0:
+        # The zeros are still those of the other period: G may be off by more, if it explains more.
+        fits = refit.error_scale <= 1.0 or refit.evidence > fit.evidence + DECISIVE
+        if refit.predicted >= PREDICTED and fits:
             others.append((refit.evidence, ratio))
     best, ratio = max(others, default=(-inf, 1.0))
     return p.get_float('sample_period') / ratio if best > fit.evidence - DECISIVE else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,103 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.constants import BY_CHANCE, LINEAR
 from backlash_ros.core.estimation.fit.solution import Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
+from backlash_ros.core.estimation.regression.error_model import TAPS, ErrorModel
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.model_check import check_model
 from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
+
+WORTH_A_DESIGN = 1.0  # log-likelihood by which another G has to be likelier at least
+
+
+def error_of(fit: WindowFit, solution: Solution) -> tuple[Array, Array]:
+    """xi of the true G, beside the G of the fit: mean (K,) and covariance (K, K). For m > 0."""
+    part = slice(fit.layout.base, fit.layout.base + fit.layout.errors)
+    posterior, m = solution.posterior, solution.m
+    noise = posterior.noise_std / m  # whose square is a number, unlike that of any m
+    cov = posterior.cov[part, part] * (noise * noise * solution.inflation)
+    return fit.around.error.told + posterior.mean[part] / m, cov
+
+
+def strayed(fit: WindowFit, solution: Solution) -> bool:
+    """Whether the poles of G are so far from those of the fit that first order is not enough."""
+    layout, error, m = fit.layout, fit.around.error, solution.m
+    if not _tells_more(fit, solution):
+        return False
+    poles = error_of(fit, solution)[0][TAPS:]
+    columns = slice(layout.base + TAPS, layout.base + layout.errors)
+    first_order = fit.samples.triangle.r[:-1, columns] @ (poles * m)
+    relative = error.uncertainty * float(np.abs(poles).max(initial=0.0))
+    return relative * float(np.linalg.norm(first_order)) > LINEAR * solution.posterior.noise_std
+
+
+def moved_error(fit: WindowFit, solution: Solution, share: float = 1.0) -> ErrorModel:
+    """The error model around the G that the fit speaks for; the same one where that is near.
+
+    share: of the way to its poles.
+    """
+    error = fit.around.error
+    if not _tells_more(fit, solution):
+        return error
+    xi, _ = error_of(fit, solution)
+    # Poles are looked for around the right delay: slower ones may pass for it.
+    later = error.delayed(xi) if share == 1.0 else error
+    return later if later is not error or not strayed(fit, solution) else error.moved(share * xi)
+
+
+def _tells_more(fit: WindowFit, solution: Solution) -> bool:
+    """Whether the samples tell another G than that of the fit, beside what no G explains.
+
+    One that was identified with the backlash stays: it is that of this very motion.
+    """
+    if not fit.layout.errors or fit.around.inherited or not solution.m > 0.0:
+        return False
+    xi, cov = error_of(fit, solution)
+    return float(xi @ np.linalg.pinv(cov, hermitian=True) @ xi) > 2.0 * len(xi)
+
+
+class Learned(NamedTuple):
+    """A G of low order, its xi beside the one that was told, and how many samples told it."""
+
+    model: StateModel
+    xi: Array
+    samples: int
+
+
+def likelier(fit: WindowFit, solution: Solution, present: Learned) -> Learned:
+    """The G that the fit speaks for, unless the present one explains the samples as well.
+
+    More samples tell more; as many have to say more than chance does.
+    """
+    error = fit.around.error
+    if not solution.m > 0.0:
+        return present
+    xi, cov = error_of(fit, solution)
+    of_told = xi - error.told
+    apart = of_told - present.xi
+    less_likely = 0.5 * float(apart @ np.linalg.pinv(cov, hermitian=True) @ apart)
+    by = WORTH_A_DESIGN if fit.length > present.samples else float(error.count)
+    model = low_order(fit, solution) if less_likely > by else fit.model
+    return present if model is fit.model else Learned(model, of_told, fit.length)
+
+
+def low_order(fit: WindowFit, solution: Solution) -> StateModel:
+    """The G of low order that the fit speaks for, or that of the fit where there is none."""
+    error = fit.around.error
+    if not error.count or not solution.m > 0.0:
+        return fit.model
+    model = error.low_order(error_of(fit, solution)[0])
+    return fit.model if model is None or not _allowed(model) else StateModel(model)
+
+
+def _allowed(model: TransferFunction) -> bool:
+    try:
+        check_model(model)
+    except ParameterError:
+        return False
+    return True
 
 
 def response_std(
@@ -28,11 +123,12 @@ def response_std(
     error, m = fit.around.error, solution.m
     part = slice(layout.base, layout.base + layout.errors)
     by: NDArray[np.complex128] = np.zeros((len(z), layout.unknowns), dtype=np.complex128)
+    responses = error.responses(z)
     if m != 0.0:
-        by[:, part] = error.responses(z) @ error.spread / m
+        by[:, part] = responses / m
     if layout.leak:
         by[:, layout.driven] = -1.0 / (z - 1.0)
-    known = by @ posterior.mean
+    known = by @ posterior.mean + responses @ error.told
     if m != 0.0:
         by[:, layout.n + 1] = -(by[:, part] @ posterior.mean[part]) / m
     variance = np.einsum('mp,pq,mq->m', by, posterior.cov, by.conj()).real
@@ -50,18 +146,3 @@ def plausible(fit: WindowFit, solution: Solution) -> bool:
     error = solution.posterior.mean[layout.base:layout.base + layout.errors]
     size = float(error @ error) / (most * solution.m) ** 2 if most > 0.0 else 0.0
     return size <= BY_CHANCE**2 * layout.errors
-
-
-def wants_another_model(fit: WindowFit, solution: Solution) -> bool:
-    """Whether the error of G is more than chance: then a G of low order may take it over.
-
-    But where G was identified with the backlash, its uncertainty was measured: what is far beyond
-    that is no error of G.
-    """
-    layout, posterior = fit.layout, solution.posterior
-    if posterior.scale < LINEAR or (fit.around.inherited and posterior.scale > BY_CHANCE):
-        return False
-    part = slice(layout.base, layout.base + layout.errors)
-    spread = posterior.noise_std**2 * solution.inflation
-    error, cov = posterior.mean[part], posterior.cov[part, part] * spread
-    return float(error @ np.linalg.pinv(cov) @ error) > 2.0 * layout.errors

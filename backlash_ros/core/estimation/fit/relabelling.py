@@ -26,8 +26,7 @@ from backlash_ros.core.estimation.constants import (
     ZOOM,
 )
 from backlash_ros.core.estimation.fit.crossings import crossings_of
-from backlash_ros.core.estimation.fit.learned_error import wants_another_model
-from backlash_ros.core.estimation.fit.low_order.better_model import better_model
+from backlash_ros.core.estimation.fit.learned_error import moved_error
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, beyond_chance, contradicts
 from backlash_ros.core.estimation.fit.search import (
@@ -44,10 +43,11 @@ from backlash_ros.core.estimation.regression.readings import weights_of
 
 Array = NDArray[np.float64]
 
-RELABELLINGS = 8  # of relabelling, at most
+RELABELLINGS = 12  # Gauss-Newton steps, at most
+SHORTER = 0.3  # share of a step of G that is tried where the whole one makes it less likely
+AS_LIKELY = 1.0  # log-likelihood by which one G may fall behind another that is no better
 NEIGHBOURS = 0.02  # relative distance of gaps that lead to the same fit
 SAME = 1.5  # ratio of deviations of the gap up to which they say the same
-MODELS = 6  # times that G may move in one fit
 
 
 class Fitted(NamedTuple):
@@ -103,27 +103,36 @@ def fitted(
     weights = weights_of(y)
     extent = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
     best: Fitted | None = None
+    share = 1.0
     for _ in range(RELABELLINGS):
         fit = WindowFit(around, start, slope, extent, int(GROWTH * len(v)))
         while fit.length < len(v):
             part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
             fit.samples.take(fit.columns(v[part], y[part]), y[part], weights[part])
             yield
-        solution = fit.solve()
-        result = Fitted(fit, solution)
-        if best is None or result.evidence >= best.evidence:
-            best = result
+        result = Fitted(fit, fit.solve())
+        if best is not None and around.error is not best.around.error \
+                and result.evidence < best.evidence - AS_LIKELY:
+            # G was moved too far.
+            share, result = SHORTER * share, best
+        else:
+            share = 1.0
+            if best is None or result.evidence >= best.evidence - AS_LIKELY:
+                best = result
+        fit, solution = result.fit, result.solution
         if fit.layout.leak:
             # Without a leak an offset of u explains one as long as the labels are wrong.
             solution = fit.leaking(solution)
         after = Fitted(fit, solution).beginning(v)
+        error = moved_error(fit, solution, share)
         stands = (
-            abs(solution.gap - start.gap) <= STANDS * solution.std_gap
-            and abs(after.p - start.p) <= STANDS * after.gap
+            error is fit.around.error
+            and abs(solution.gap - fit.start.gap) <= STANDS * solution.std_gap
+            and abs(after.p - fit.start.p) <= STANDS * after.gap
         )
         if stands or solution.m == 0.0:
             break
-        slope, start = solution.m, after
+        slope, start, around = solution.m, after, around._replace(error=error)
         yield
     assert best is not None
     return best
@@ -157,8 +166,7 @@ def searched(
         found.comparison, found.candidates, best.solution.gap, best.solution.std_gap,
         _gap_of(around.prior), pace,
     )
-    result = yield from with_better_model(v, y, best, pace)
-    return result.with_gap_spread(spread)._replace(decided=best.decided)
+    return best.with_gap_spread(spread)
 
 
 def with_other_gaps(
@@ -202,14 +210,6 @@ def _apart(candidates: list[Candidate], far: int) -> list[Candidate]:
     return chosen
 
 
-def fitted_with_model(
-    v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
-) -> Generator[None, None, Fitted]:
-    """The fit of a record, with the better G that follows from it."""
-    result = yield from fitted(v, y, around, start, slope, pace)
-    return (yield from with_better_model(v, y, result, pace))
-
-
 def motionless(
     v: Array, y: Array, around: Around, slope: float, swing: float, pace: Pace,
 ) -> Generator[None, None, Fitted]:
@@ -221,36 +221,6 @@ def motionless(
 def most_likely(results: Sequence[Fitted]) -> Fitted:
     """The one with the largest evidence, the first of equals."""
     return max(results, key=lambda result: result.evidence)
-
-
-def with_better_model(
-    v: Array, y: Array, result: Fitted, pace: Pace,
-) -> Generator[None, None, Fitted]:
-    """Let G move to the one of low order that fits best, until the evidence grows no more.
-
-    Every move begins with the G of `result`, whose prior it is: from move to move the samples leave
-    some directions open, and G would go astray there.
-    """
-    count = result.around.error.count
-    for _ in range(MODELS):
-        solution, around = result.solution, result.around
-        posterior = solution.posterior
-        if not solution.m > 0.0 or not wants_another_model(result.fit, solution):
-            break
-        model = yield from better_model(v, y, result.fit, solution, pace)
-        if model is None:
-            break
-        moved = around.moved_to(model)._replace(scale=max(around.scale, posterior.scale))
-        yield
-        other = yield from fitted(v, y, moved, result.beginning(v), solution.m, pace)
-        gained = (other.evidence - result.evidence) / solution.inflation
-        # What moving K coefficients may cost or bring by chance.
-        if gained < -count:
-            break
-        result = other
-        if gained < count:
-            break
-    return result
 
 
 def with_walk(

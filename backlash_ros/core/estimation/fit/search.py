@@ -162,6 +162,9 @@ class Comparison:
         """Evidence and slope of each pair, shape (H,)."""
         p = plays(self._v, gaps, starts)
         moved = self._projected(self._filtered(p))
+        if self._error.count:
+            columns = self._error_columns(p, starts)
+            moved += self._error.told @ columns
         energy = np.einsum('hn,hn->h', moved, moved)
         still = energy <= 0.0  # v never engaged: all is in common
         energy[still] = 1.0
@@ -169,19 +172,13 @@ class Comparison:
         squares = np.maximum(self._energy - slopes**2 * energy, 0.0)
         if not self._error.count:
             return self._log_likelihood(squares + self._told), slopes
-        direct = self._answers(np.diff(p, prepend=starts[:, None]))
         # Products of the columns alone would lose in rounding what differs from u and from m.
-        columns = self._error.spread.T @ np.swapaxes(self._error.filtered(direct), 1, 2)
-        columns *= self._root
-        rows = columns.reshape(-1, columns.shape[2])  # all of them at once: one product of matrices
-        rows -= (rows @ self._basis) @ self._basis.T
-        columns = rows.reshape(columns.shape)
         along = columns @ moved[:, :, None] / energy[:, None, None]
         columns -= along * moved[:, None, :]
         s, back = np.linalg.eigh(columns @ np.swapaxes(columns, 1, 2))
-        target = rows @ self._y
+        target = columns @ self._y
         s = np.maximum(s, 1e-30)
-        z2 = (target.reshape(s.shape)[:, None, :] @ back)[:, 0] ** 2 / s
+        z2 = (target[:, None, :] @ back)[:, 0] ** 2 / s
         z2 = np.minimum(z2, squares[:, None])
         squares = np.maximum(squares - z2.sum(axis=1), 0.0) + self._told
         s *= (slopes**2 * self._freedom / squares)[:, None]
@@ -190,6 +187,15 @@ class Comparison:
         evidence = self._log_likelihood(left) + 0.5 * np.log(shrink).sum(axis=2)
         evidence -= 0.5 * RATIOS  # as posterior.py has it
         return evidence.max(axis=1), slopes
+
+    def _error_columns(self, p: Array, starts: Array) -> Array:
+        """Columns of the error of G for play outputs (H, N), shape (H, K, N)."""
+        direct = self._answers(np.diff(p, prepend=starts[:, None]))
+        columns = self._error.spread.T @ np.swapaxes(self._error.filtered(direct), 1, 2)
+        columns *= self._root
+        rows = columns.reshape(-1, columns.shape[2])  # all of them at once: one product of matrices
+        rows -= (rows @ self._basis) @ self._basis.T
+        return rows.reshape(columns.shape)
 
     def _log_likelihood(self, squares: Array | float) -> Array:
         return np.asarray(-0.5 * self._freedom * np.log(squares / self._freedom))

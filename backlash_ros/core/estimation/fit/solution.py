@@ -25,26 +25,24 @@ SMALLEST_NOISE = 1e-12  # deviation of y that is assumed at least
 class Around(NamedTuple):
     """What a fit is made around.
 
-    model, error: G and its error model. told_std: noise on y as told. prior: of theta. scale: that
-    of the error of the G that was told, once this one was moved to where the data want it: it is no
-    better known for that. most: largest scale that is believed. walk: deviation by which a
-    disturbance of u walks over the record [unit of u], 0 for none. inherited: whether the backlash
-    was known before the first sample: then what contradicts it needs more to be believed than where
-    samples of this run alone have told it.
+    error: G and its error model. told_std: noise on y as told. prior: of theta. most: largest
+    scale of the error that is believed. walk: deviation by which a disturbance of u walks over the
+    record [unit of u], 0 for none. inherited: whether the backlash was known before the first
+    sample: then what contradicts it needs more to be believed than where samples of this run alone
+    have told it.
     """
 
-    model: StateModel
     error: ErrorModel
     told_std: float
     prior: Prior | None = None
-    scale: float = 0.0
     most: float = inf
     walk: float = 0.0
     inherited: bool = False
 
-    def moved_to(self, model: StateModel) -> Around:
-        """The same around another G with as many moving poles."""
-        return self._replace(model=model, error=self.error.around(model))
+    @property
+    def model(self) -> StateModel:
+        """G."""
+        return self.error.model
 
 
 @dataclass(frozen=True)

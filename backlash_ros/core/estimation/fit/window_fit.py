@@ -217,7 +217,7 @@ class WindowFit:
         m = float(theta[0])
         held = float(posterior.mean[layout.n])
         start = self.start.p
-        if self._begun.side == 0 and m != 0.0:
+        if self._begins_within_the_gap and m != 0.0:
             start = (held + float(posterior.mean[layout.n + 2])) / m
         return Solution(
             posterior, theta, cov, crossings_of(theta, cov),
@@ -228,20 +228,24 @@ class WindowFit:
     def _with_start(self, triangle: Triangle) -> Triangle:
         """The same where p began anywhere within the gap.
 
-        The labels may leave few samples to tell, and u before them would be anything. Where the
-        first v moved p, the labels tell u themselves; where v never engaged, u is all there is.
+        The labels may leave few samples to tell, and u before them would be anything. Where v never
+        engaged, u is all there is.
         """
-        gap, p, n = self.start.gap, self._begun.p, self.layout.n
-        first = self._first_v
-        if first is None or self._begun.side != 0 or self._play.side == 0:
-            return triangle
-        if not first < p < first + gap:
+        gap, n, first = self.start.gap, self.layout.n, self._first_v
+        if first is None or self._play.side == 0 or not self._begins_within_the_gap:
             return triangle
         # u0 = m (p - c_r), and p = v(0) + g/2 on average.
         row = np.zeros(self.layout.unknowns)
         row[n:n + 4] = 1.0, -first, 0.5, 0.5
         std = abs(self.slope) * gap / sqrt(12.0)  # of what is anywhere in between
         return triangle.with_combination(row, std, self.around.told_std)
+
+    @property
+    def _begins_within_the_gap(self) -> bool:
+        """Whether the first v leaves the play output where it was; otherwise it tells nothing."""
+        begun, first = self._begun, self._first_v
+        return begun.side == 0 and first is not None \
+            and first < begun.p < first + self.start.gap
 
     def _posteriors(self, triangle: Triangle) -> tuple[Posterior, Callable[[], Posterior]]:
         """Of all unknowns, and where an integrator of G leaks for sure; it may or may not.
@@ -255,7 +259,7 @@ class WindowFit:
 
         def of(part: Triangle, base: int) -> Posterior:
             return part.posterior(
-                base, self.slope, spreads, around.told_std, around.scale, around.most
+                base, self.slope, spreads, around.told_std, around.most
             )
 
         if not layout.leak:

@@ -21,7 +21,6 @@ from backlash_ros.core.estimation.fit.prior import Prior, contradicts
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
-    fitted_with_model,
     most_likely,
     searched,
 )
@@ -173,7 +172,7 @@ def _best_of_all(
             result = yield from searched(v, y, beginning, learning.widest, pace)
         else:
             start = current.fit.start.with_gap(current.solution.gap, v)
-            result = yield from fitted_with_model(
+            result = yield from fitted(
                 v, y, beginning, start, current.solution.m, pace
             )
         if result is not None and result.keeps_prior and learning.usable(result) is not None:

@@ -26,7 +26,7 @@ from backlash_ros.core.estimation.constants import (
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
 from backlash_ros.core.estimation.fit.crossings import Crossings
-from backlash_ros.core.estimation.fit.low_order.better_model import Refined
+from backlash_ros.core.estimation.fit.learned_error import Learned, likelier
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, drifted
 from backlash_ros.core.estimation.fit.record import Record
@@ -36,7 +36,6 @@ from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.moving_horizon.acceptance import usable
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.regression.play import Labels, Start
-from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 Task = Generator[None, None, bool]
@@ -69,15 +68,16 @@ class Learning:
     told: around what the first fit is made, with G as told. told_walk: of u, a first guess. drift:
     random walk of m, c_r, c_l per square root of a sample, shape (3,). around: what the next fit is
     made around. current: the fit, None while it is searched for. reason: why there is no estimate.
-    refit_at: length of the record at which all of it is refitted; moved_at: from which a gap
-    that moved is reason to do so. contradicted_from: sample from which the fit does not hold;
+    refit_at: length of the record at which all of it is refitted; moved_at: from which it is
+    reason to do so that gap or poles of G have `strayed` from those that the fit was made around.
+    contradicted_from: sample from which the fit does not hold;
     consistent: samples that do fit since then; next_try: sample at which to look for an explanation
     again. changed: what theta seems to have become. refitted: whether it was refitted since the
     record contradicts itself. unconfirmed: whether the estimate was learned before, and the samples
     merely do not deny it; supported: whether they alone are precise enough to speak for it.
     contradiction: fit of samples that nothing explains, around what was known; None while there are
-    none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before. refined: the G
-    that explains y better than that of the fit does without its error, None while there is none.
+    none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before. learned: the G
+    of low order that explains y.
     """
 
     bounds: Bounds
@@ -92,6 +92,7 @@ class Learning:
     reason: Status = Status.ACQUIRING
     refit_at: float = 0.0
     moved_at: int = 0
+    strayed: bool = False
     contradicted_from: int | None = None
     consistent: int = 0
     next_try: int = 0
@@ -101,7 +102,11 @@ class Learning:
     supported: bool = False
     contradiction: Fitted | None = None
     held: Array | None = None
-    refined: Refined | None = None
+    learned: Learned = field(init=False)
+
+    def __post_init__(self) -> None:
+        error = self.told.error
+        self.learned = Learned(error.model, np.zeros(error.count), 0)
 
     @property
     def expects_changes(self) -> bool:
@@ -142,20 +147,14 @@ class Learning:
         taken = self.current.fit.length if self.current is not None else 0
         return len(self.record) - taken
 
-    @property
-    def learned_model(self) -> StateModel:
-        """The G that explains y best."""
-        return self.refined.model if self.refined is not None else self.around.model
-
     def beginnings(self, around: Around) -> list[Around]:
         """This one, and that of the G that was told where it is another one.
 
         A G that was moved step by step may have gone astray.
         """
-        told = self.told
-        if around.model is told.model:
+        if around.error is self.told.error:
             return [around]
-        return [around, around._replace(model=told.model, error=told.error, scale=0.0)]
+        return [around, around._replace(error=self.told.error)]
 
     def reversed_often(self, fit: WindowFit | Labels) -> bool:
         """Whether the engaged side has changed so often that no lag passes for a gap."""
@@ -186,7 +185,7 @@ class Learning:
         """Look for the backlash afresh; inherited: what is believed unless the samples deny it."""
         self.current = None
         self.acquisition = Acquisition(self.record.end + FIRST_SEARCH, inherited)
-        self.refit_at, self.moved_at = 0.0, 0
+        self.refit_at, self.moved_at, self.strayed = 0.0, 0, False
         self.refitted = False
         self.contradicted_from = self.changed = None
         self.unconfirmed = False
@@ -194,14 +193,14 @@ class Learning:
             self.contradiction = None
 
     def go_on_from(
-        self, result: Fitted, first: int, changed: bool = False, refined: Refined | None = None,
+        self, result: Fitted, first: int, changed: bool = False,
     ) -> bool:
         """Go on from this fit of the record from sample `first` on; it is to be published.
 
-        changed: whether it is of a plant that has changed. refined: G, where it was looked for.
+        changed: whether it is of a plant that has changed.
         """
-        if refined is not None or result.around.model is not self.around.model:
-            self.refined = refined
+        if result.around.error.count and not result.around.inherited:
+            self.learned = likelier(result.fit, result.solution, self.learned)
         self.current, self.around = result, result.around
         if result.around.prior is None:
             self.unconfirmed = False
@@ -209,7 +208,7 @@ class Learning:
         # As long as the gap may be another one the search for it goes on.
         growth = SEARCH_GROWTH if result.fit.gap_spread > 0.0 else GROWTH
         self.refit_at = next_length(result.fit.length, growth)
-        self.moved_at = result.fit.length + BLOCK[1]
+        self.moved_at, self.strayed = result.fit.length + BLOCK[1], False
         self.contradicted_from = self.changed = self.acquisition.rejected = None
         self.contradiction = None
         if changed:

@@ -63,7 +63,7 @@ class MovingHorizon:
         self.failed_fits = 0
         error = build_error_model(model, uncertainty)
         told = Around(
-            model, error, max(noise_std, SMALLEST_NOISE),
+            error, max(noise_std, SMALLEST_NOISE),
             inherited=initial.learned and error.count > 0,
         )
         self._learning = Learning(
@@ -124,7 +124,7 @@ class MovingHorizon:
     def proposal(self) -> StateModel | None:
         """The G that was learned where it is another one than `model`."""
         learning = self._learning
-        learned = learning.learned_model
+        learned = learning.learned.model
         if learned is self._following.model:
             return None
         # That of a fit which is not believed is no better than the one in use.
@@ -134,7 +134,7 @@ class MovingHorizon:
     @property
     def learned_model(self) -> StateModel:
         """The G behind the newest estimates, whether or not a structure has taken it up."""
-        return self._learning.learned_model
+        return self._learning.learned.model
 
     @property
     def noise_ratio(self) -> float:
@@ -209,7 +209,6 @@ class MovingHorizon:
                 learning.current, self.estimate, learning.record, self.learned_model
             )
             return
-        learning.around = learning.around.moved_to(model)
 
     def set_noise(self, noise_std: float, walk_std: float, drift_std: Array) -> None:
         """Take another first guess of the noise and the walk; whatever was learned stays.

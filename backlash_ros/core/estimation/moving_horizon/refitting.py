@@ -13,16 +13,16 @@ from backlash_ros.core.estimation.constants import (
     BLOCK,
     LONGEST,
     MISFIT,
+    MOVED,
     OUTLIER_SHARE,
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.low_order.better_model import Refined, refined_model
+from backlash_ros.core.estimation.fit.learned_error import low_order, strayed
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
-    fitted_with_model,
     most_likely,
     searched,
     with_other_gaps,
@@ -45,13 +45,13 @@ AT_ONCE = 4  # largest blocks that are taken in at once, where there was no time
 
 def take_block(learning: Learning) -> Task:
     """Take in the samples that have come since the last block."""
-    record, (fit, solution, _) = learning.record, learning.fit
+    record, (fit, before, _) = learning.record, learning.fit
     number = record.first + fit.length
     v, y = record.since(number)
     v, y = v[:AT_ONCE * BLOCK[1]], y[:AT_ONCE * BLOCK[1]]
     doubted = record.doubted(number, len(y))
     rows = fit.columns(v, y)
-    squares, outliers = fit.contradiction(rows, np.where(np.isnan(y), doubted, y), solution)
+    squares, outliers = fit.contradiction(rows, np.where(np.isnan(y), doubted, y), before)
     # The fit knows how little it knows; who follows the state from sample to sample does not.
     explained = np.isfinite(doubted) & ~outliers
     if explained.any():
@@ -67,12 +67,15 @@ def take_block(learning: Learning) -> Task:
     fits = misfit <= MISFIT
     taken = np.where(valid & fits, y, nan)
     if fit.samples.rounding is not None:
-        fit.samples.take_rounded(rows, taken, solution.posterior)
+        fit.samples.take_rounded(rows, taken, before.posterior)
     else:
         fit.samples.take(rows, taken, weights_of(y))
     yield
     note_block(learning, fits, number, squares)
-    learning.current = Fitted(fit, fit.solve())
+    solution = fit.solve()
+    learning.current = Fitted(fit, solution)
+    learning.strayed = strayed(fit, solution) \
+        or abs(solution.gap - fit.start.gap) > MOVED * solution.std_gap
     return fits
 
 
@@ -83,28 +86,13 @@ def refit(learning: Learning) -> Task:
     around, start, first = yield from _shortened(learning, current)
     v, y = learning.record.since(first)
     start = start.with_gap(current.solution.gap, v)
-    m = current.solution.m
-    *present, told = learning.beginnings(around)
-    result = afresh = yield from fitted_with_model(v, y, told, start, m, learning.pace)
-    for beginning in present:
-        # The scale of the error of the G that was told holds, whether or not this fit has moved it.
-        scale = max(afresh.around.scale, afresh.solution.posterior.scale)
-        kept = yield from fitted(v, y, beginning._replace(scale=scale), start, m, learning.pace)
-        # A G that is likelier by no more than chance would only make the structure follow it.
-        if afresh.evidence <= kept.evidence + around.error.count:
-            result = kept
+    result = yield from fitted(v, y, around, start, current.solution.m, learning.pace)
     result = yield from with_walk(v, y, result, learning.pace)
     if len(v) <= SEARCHED:
         result = yield from _beside_other_gaps(learning, v, y, result)
     if not around.inherited:
         result = yield from with_rounding(v, y, result, learning.pace)
-    refined: Refined | None = None
-    if around.error.count and not around.inherited:
-        refined = yield from refined_model(
-            v, y, result.fit, result.solution, learning.refined or Refined(around.model, 0),
-            learning.pace,
-        )
-    return learning.go_on_from(result, first, refined=refined)
+    return learning.go_on_from(result, first)
 
 
 def _beside_other_gaps(
@@ -151,10 +139,11 @@ def _shortened(
 
 def _attribute(learning: Learning, current: Fitted) -> Generator[None, None, None]:
     """Let those v have acted over the record that the estimates speak for."""
-    record, found, model = learning.record, current.solution.crossings, learning.around.model
+    record, found = learning.record, current.solution.crossings
     others = record.others(record.first)
     if found is None or np.isnan(others).all():
         return
+    model = low_order(current.fit, current.solution)
     # The observer begins at rest: what it expects says nothing yet.
     others[:model.memory] = nan
     v, y = record.since(record.first)

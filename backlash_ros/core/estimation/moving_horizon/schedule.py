@@ -3,14 +3,14 @@
     no estimate yet                    acquire      (acquisition.py)
     a block of new samples             take_block   (refitting.py)
     samples contradict the fit         reconsider   (change_detection.py)
-    the record has grown, or the gap
-    has left its labels                refit        (refitting.py)
+    the record has grown, or gap or G
+    have left those of the fit         refit        (refitting.py)
     the record contradicts itself      refit, and if that does not help halve (change_detection.py)
 """
 
 from __future__ import annotations
 
-from backlash_ros.core.estimation.constants import BLOCK, BLOCK_SHARE, MOVED
+from backlash_ros.core.estimation.constants import BLOCK, BLOCK_SHARE
 from backlash_ros.core.estimation.moving_horizon.acquisition import acquire
 from backlash_ros.core.estimation.moving_horizon.change_detection import halve, reconsider
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
@@ -31,10 +31,7 @@ def next_task(learning: Learning, estimate: Estimate) -> Task | None:
         return take_block(learning)
     if contradicted:
         return reconsider(learning, estimate) if record.end >= learning.next_try else None
-    if length >= learning.refit_at or (
-        length >= learning.moved_at
-        and abs(solution.gap - fit.start.gap) > MOVED * solution.std_gap
-    ):
+    if length >= learning.refit_at or (length >= learning.moved_at and learning.strayed):
         return refit(learning)
     aged = solution.correlation > 0.0 or learning.drifts_more(solution, length)
     if not aged or record.end < learning.next_try:

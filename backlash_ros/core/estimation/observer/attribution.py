@@ -31,7 +31,9 @@ class Attribution:
 
     def __init__(self, observer: Observer) -> None:
         self._observer = observer
-        self._delay = observer.model.transfer_function.delay
+        # Samples until y shows it: a first tap that is small beside the others shows little.
+        taps = np.abs(observer.model.transfer_function.numerator)
+        self._delay = int(np.flatnonzero(taps >= 0.5 * taps.max())[0])
         # What the other commands would have added to the state of the observer, the oldest first.
         self._pending: list[list[float]] = []
 

@@ -53,7 +53,7 @@ class StateFollowing:
         self._observer: Observer | None = None
         self._attribution: Attribution | None = None  # of this observer
         self._p = self._v = nan
-        self._explains = False  # whether `model` is the G that was learned
+        self._learned = self._explains = False  # whether `model` is a G that was learned
         self._refused: list[int] = []  # numbers of the newest samples, one after the other
 
     @property
@@ -79,7 +79,7 @@ class StateFollowing:
 
     def change_model(self, model: StateModel) -> None:
         """Give x_hat for this G, from the next `follow` on where a backlash is known."""
-        self.model = model
+        self.model, self._learned = model, True
         self._unknown = [0.0] * model.order
         if self._before is not None:
             self._before = self._before.with_model(model)
@@ -169,7 +169,7 @@ class StateFollowing:
         noise = solution.posterior.noise_std
         exact, cov = None, None
         of_fit = fit.model is self.model
-        self._explains = of_fit or learned is self.model
+        self._explains = self._learned or of_fit or learned is self.model
         if of_fit:
             exact, cov = fit.state(solution)
         if not self._explains:

@@ -1,101 +1,161 @@
-"""How wrong G may be: G_true = G (1 + Delta) with a prior drawn from plants around G.
+"""How wrong G may be: its poles, its delay, and the first taps of its numerator.
 
-    Delta(z) = (1 - z^-1) sum_i h_i F_i(z)
+With A the polynomial of the moving poles of G, neither integrators nor delays, n of them,
 
-has no gain at rest, so that the DC gain (the velocity gain of an integrating G) stays in m. With A
-the stable poles of G, scaled to A(1) = 1, and s of them, the F_i are
+    G_true = G A(1)/A'(1) A/A' (1 + (1 - z^-1) (h_0 + h_1 z^-1)) = G (1 + Delta)
 
-    1, z^-1;  z^-j / A, j = 0 .. s-1;  z^-j / A^2, j = 0 .. s-1
+where the poles of A' are off in natural frequency, damping ratio or time constant
+(pole_places.py). Nothing has a gain at rest, so that the DC gain (the velocity gain of an
+integrating G) stays in m. To first order in xi, the unknowns in units of their deviations,
 
-The prior of h comes from plants whose natural frequencies, damping ratios, time constants and
-delay are off by a relative spread. Its scale is learned (posterior.py).
+    Delta = (1 - z^-1) sum_i h_i F_i(z),   h = L xi,   F = 1, z^-1;  z^-j A(1) / A, j = 0 .. n-1
+
+The fit moves the poles and the delay of G until first order is all there is (relabelling.py). The
+prior stays that of the G that was told; its scale is learned (posterior.py).
 """
 
 from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
+from math import log
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import FREE_TAPS, LEAK
+from backlash_ros.core.estimation.regression.pole_places import PolePlaces
 from backlash_ros.core.plant.model_check import ON_CIRCLE
 from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-DRAWN = 300  # plants that the prior is drawn from
-SEED = 1  # of the drawing: the same G has the same prior
-LONGEST_RESPONSE = 2000  # samples of the responses that are compared
-RESPONSE_LASTS = 8.0  # slowest time constants that these responses last
-MORE_TAPS = 2  # numerator taps of a G of low order beyond its moving poles: a sample of delay
-# --- guards
-NO_DIRECTION = 1e-7  # share of the largest singular value of the responses that is rounding
+FURTHEST = log(2.0)  # logarithm of a time constant that is moved by at once, at most
+ALMOST_ONE = 0.75  # samples of lag from which on it is one of the delay
+TAPS = 2  # of the numerator: with them delays by parts of a sample, and the first beyond
 
 
 class ErrorModel:
     """Filters F_i of a model G, and the prior of their coefficients.
 
-    stable: denominator A of the stable poles of G, monic; delays (poles at 0) are left out. count:
-    number K of filters, 0 where G is exact. leak: prior deviation of that of an integrator, per
-    sample. spread: factor L of the prior covariance of h at
-    scale 1, L L' = cov(h), shape (K, K).
+    model: G, which may have been moved from the one that was told. uncertainty: as told. stable:
+    A, monic. gain: A(1). taps: n. count: number K of unknowns, 0 where G is exact. leak: prior
+    deviation of that of an integrator, per sample. spread: L, shape (n + 2, K). told: xi of the G
+    that was told, which the prior is around, shape (K,).
     """
 
     def __init__(self, model: StateModel, uncertainty: float) -> None:
-        moving = _moving(model)
-        self.stable: Array = monic(moving)
-        self.gain = float(self.stable.sum())
+        self.uncertainty = uncertainty
+        self.model, self._told_model = model, model.transfer_function
+        poles = self._told_model.poles
+        moving = poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)]
+        self._places = PolePlaces(moving, uncertainty)
+        integrators = int(np.count_nonzero(np.abs(poles - 1.0) < ON_CIRCLE))
+        self._integrate = np.atleast_1d(np.poly([1.0] * integrators))
         self.taps = len(moving)
-        self.count = 2 + 2 * self.taps if uncertainty > 0.0 else 0
-        poles = model.transfer_function.poles
-        self.integrates = bool(np.any(np.abs(poles - 1.0) < ON_CIRCLE))
+        self.integrates = integrators > 0
         self.leak = LEAK * uncertainty if self.integrates else 0.0
-        self.spread: Array = np.zeros((0, 0))
-        # The same as a G of low order: spread of its taps and denominator (family.py).
-        self.low_order_spread: Array = np.zeros((0, 0))
+        self.count = TAPS + len(self._places.told) if uncertainty > 0.0 else 0
+        self.told: Array = np.zeros(self.count)
+        self.stable: Array = np.atleast_1d(np.real(np.poly(moving)))
+        self.gain = self._told_gain = float(self.stable.sum())
+        # The first tap is a lag; only that slow motion tells of it, so the second one is little.
+        lag = uncertainty * _delay(self._told_model, self.stable)
+        self._of_taps = lag * np.array([1.0, FREE_TAPS])
+        self.spread = self._spread()
+
+    def _spread(self) -> Array:
+        """L: the taps by a lag, and what the places of poles change of A."""
+        spread = np.zeros((TAPS + self.taps, self.count))
         if self.count:
-            self.spread, self.low_order_spread = _prior(model, self, moving, uncertainty)
+            spread[:TAPS, :TAPS] = np.diag(self._of_taps)
+            for column, slope in enumerate(self._places.slopes(-self.told[TAPS:]), TAPS):
+                # d ln(A(1)/A) has a zero at z = 1, which is divided out.
+                numerator = self.stable * (float(slope.sum()) / self.gain) - slope
+                spread[TAPS:, column] = np.cumsum(numerator)[:-1] / self.gain
+        return spread
 
-    def around(self, model: StateModel) -> ErrorModel:
-        """The same prior for a G of as many moving poles, in units of its own time constants.
+    def moved(self, xi: Array) -> ErrorModel:
+        """The same prior around the G with the poles at xi (K,).
 
-        Where rounding has changed their number, an integrator beside slow poles being one of them,
-        it stays as it is.
+        But no further than first order holds, and where poles would leave the unit circle all go
+        half as far.
         """
-        moving = _moving(model)
-        if len(moving) != self.taps:
+        told = self.told[TAPS:]
+        step = xi[TAPS:] * min(FURTHEST / max(self._places.distance(xi[TAPS:]), FURTHEST), 1.0)
+        denominator = self._places.denominator(step - told)
+        while denominator is None:
+            step = 0.5 * step
+            denominator = self._places.denominator(step - told)
+        apart = np.append(np.zeros(TAPS), step)
+        return self._around(denominator, self.model.transfer_function.delay, apart)
+
+    def delayed(self, xi: Array) -> ErrorModel:
+        """The same with whole samples of delay more or less, where the taps at xi (K,) want it."""
+        lag = -float(self._of_taps @ xi[:TAPS])
+        late = 0 if abs(lag) < ALMOST_ONE else max(min(round(lag), TAPS), -TAPS)
+        return self.later(max(late, 1 - self.model.transfer_function.delay))
+
+    def later(self, samples: int) -> ErrorModel:
+        """The same around the G with so many samples more of delay, TAPS at most."""
+        if samples == 0:
             return self
+        apart = np.zeros(self.count)
+        apart[0] = -samples / self._of_taps[0]
+        return self._around(self.stable, self.model.transfer_function.delay + samples, apart)
+
+    def _around(self, denominator: Array, delay: int, apart: Array) -> ErrorModel:
+        """Around another G, whose xi is `apart` (K,)."""
         other = copy(self)
-        other.stable = monic(moving)
-        other.gain = float(other.stable.sum())
+        other.stable, other.gain = denominator, float(denominator.sum())
+        other.told = self.told - apart
+        other.model = StateModel(self._transfer_function(denominator, delay, np.ones(1)))
+        other.spread = other._spread()
         return other
 
+    def low_order(self, xi: Array) -> TransferFunction | None:
+        """The G at xi (K,), of which the taps are a part; None where it is not stable."""
+        denominator = self._places.denominator(xi[TAPS:] - self.told[TAPS:])
+        if denominator is None:
+            return None
+        first, second = (self._of_taps * xi[:TAPS]).tolist()
+        taps = np.array([1.0 + first, second - first, -second])
+        return self._transfer_function(denominator, self.model.transfer_function.delay, taps)
+
+    def _transfer_function(self, stable: Array, delay: int, taps: Array) -> TransferFunction:
+        """G with these poles and this delay, its numerator times these taps."""
+        told = np.trim_zeros(self._told_model.numerator, 'fb')
+        b = np.convolve(told, taps) * (float(stable.sum()) / self._told_gain)
+        a = np.convolve(stable, self._integrate)
+        order = max(len(a) - 1, delay + len(b) - 1)
+        numerator, denominator = np.zeros(order + 1), np.zeros(order + 1)
+        numerator[delay:delay + len(b)], denominator[:len(a)] = b, a
+        return TransferFunction(numerator.tolist(), denominator.tolist())
+
     def filtered(self, direct: Array) -> Array:
-        """Responses of the F_i to signals (..., N) that were 0 before, shape (..., N, K)."""
+        """Responses of the F_i to signals (..., N) that were 0 before, shape (..., N, n + 2)."""
         once = lfilter([self.gain], self.stable, direct)
-        twice = lfilter([self.gain], self.stable, once)
         count = direct.shape[-1]
-        out = np.zeros((*direct.shape[:-1], self.count, count))  # in the order it is written in
+        # In the order it is written in.
+        out = np.zeros((*direct.shape[:-1], TAPS + self.taps, count))
         row = 0
-        for signal, delays in ((direct, 2), (once, self.taps), (twice, self.taps)):
+        for signal, delays in ((direct, TAPS), (once, self.taps)):
             for j in range(delays):
                 out[..., row, j:] = signal[..., :count - j]
                 row += 1
         return np.swapaxes(out, -1, -2)
 
     def responses(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """(1 - z^-1) F_i at the points z (M,), shape (M, K)."""
+        """Delta for each xi at the points z (M,), shape (M, K)."""
         back = 1.0 / z
         filtered = self.gain / np.polyval(self.stable[::-1], back)
         columns = [
             (1.0 - back) * factor * back**j
-            for factor, delays in ((1.0, 2), (filtered, self.taps), (filtered**2, self.taps))
-            for j in range(delays)
-        ][:self.count]
-        return np.array(columns, dtype=np.complex128).reshape(self.count, len(z)).T
+            for factor, delays in ((1.0, TAPS), (filtered, self.taps)) for j in range(delays)
+        ]
+        return np.asarray(np.array(columns, dtype=np.complex128).T @ self.spread)
 
 
 class ErrorFilter:
@@ -106,24 +166,21 @@ class ErrorFilter:
 
     def __init__(self, error: ErrorModel, signals: int) -> None:
         self._error = error
-        self._once, self._twice = np.zeros((2, signals, error.taps))
-        self._past: Array = np.zeros((3, signals, max(error.taps - 1, 1)))
+        self._once = np.zeros((signals, error.taps))
+        self._past: Array = np.zeros((2, signals, max(error.taps, TAPS) - 1))
 
     def filtered(self, direct: Array) -> Array:
-        """Responses to the next samples (S, N), shape (S, N, K)."""
+        """Responses to the next samples (S, N), shape (S, N, n + 2)."""
         error, taps = self._error, self._error.taps
-        gain = [error.gain]
+        once = direct
         if taps:
-            once, self._once = lfilter(gain, error.stable, direct, zi=self._once)
-            twice, self._twice = lfilter(gain, error.stable, once, zi=self._twice)
-        else:
-            once = twice = direct
+            once, self._once = lfilter([error.gain], error.stable, direct, zi=self._once)
         memory = self._past.shape[2]
-        longer = np.concatenate([self._past, [direct, once, twice]], axis=2)
+        longer = np.concatenate([self._past, [direct, once]], axis=2)
         self._past = longer[..., longer.shape[2] - memory:]
-        out = np.empty((len(direct), error.count, direct.shape[1]))
+        out = np.empty((len(direct), TAPS + taps, direct.shape[1]))
         row = 0
-        for signal, delays in zip(longer, (2, taps, taps), strict=True):
+        for signal, delays in zip(longer, (TAPS, taps), strict=True):
             for j in range(delays):
                 out[:, row] = signal[:, memory - j:signal.shape[1] - j]
                 row += 1
@@ -132,89 +189,14 @@ class ErrorFilter:
 
 @lru_cache(maxsize=8)
 def build_error_model(model: StateModel, uncertainty: float) -> ErrorModel:
-    """The error model of a G, remembered: drawing its prior takes some 50 ms."""
+    """The error model of a G, remembered."""
     return ErrorModel(model, uncertainty)
 
 
-def monic(roots: NDArray[np.complex128]) -> Array:
-    """Coefficients of the real polynomial with these roots, leading coefficient 1."""
-    return np.atleast_1d(np.real(np.poly(roots)))
-
-
-def _moving(model: StateModel) -> NDArray[np.complex128]:
-    """Poles that are neither integrators nor delays."""
-    poles = model.transfer_function.poles
-    return poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)]
-
-
-def _prior(
-    model: StateModel, error: ErrorModel, moving: NDArray[np.complex128], uncertainty: float,
-) -> tuple[Array, Array]:
-    """Spread of h over plants around G, from their step responses without integrators.
-
-    And that of numerator taps and denominator, shape (taps + n, ..), of the stable part.
-    """
-    rng = np.random.default_rng(SEED)
-    numerator = np.trim_zeros(model.transfer_function.numerator, 'f')
-    start = model.transfer_function.delay
-    slowest = max((-1.0 / np.log(np.abs(moving))).tolist(), default=1.0)
-    samples = int(min(RESPONSE_LASTS * slowest + 20.0, LONGEST_RESPONSE))
-    impulse = np.zeros(samples)
-    impulse[start] = 1.0
-    response = lfilter(numerator, error.stable, impulse)
-    told = np.cumsum(response)
-    delay = float(np.sum(1.0 - told / told[-1]))  # of the whole response at low frequencies
-    basis = error.filtered(response)
-    off = np.empty((samples, DRAWN))
-    taps = len(moving) + MORE_TAPS
-    coefficients = np.empty((taps + len(moving), DRAWN))
-    k = np.arange(samples, dtype=float)
-    for i in range(DRAWN):
-        stable = monic(_moved(moving, uncertainty, rng))
-        true = np.cumsum(lfilter(numerator * (stable.sum() / error.gain), stable, impulse))
-        # Faster plants are among those of the poles; none answers before it is driven.
-        lag = uncertainty * delay * abs(float(rng.standard_normal()))
-        lagged = np.interp(k - lag, k, true, left=0.0)
-        off[:, i] = lagged - told
-        coefficients[:taps, i] = _taps(lagged, stable, start, taps)
-        coefficients[taps:, i] = stable[1:]
-    told_taps = _taps(told, error.stable, start, taps)
-    coefficients -= np.append(told_taps, error.stable[1:])[:, None]
-    h = np.asarray(np.linalg.lstsq(basis, off, rcond=NO_DIRECTION)[0], dtype=np.float64)
-    # A lag by a part of a sample moves single taps in ways of its own.
-    free = uncertainty * FREE_TAPS * float(np.abs(told_taps).max())
-    taps_alone = np.eye(taps + len(moving), taps) * free
-    return _root(h), np.concatenate([_root(coefficients), taps_alone], axis=1)
-
-
-def _root(draws: Array) -> Array:
-    """L of the second moment L L' of draws (K, DRAWN)."""
-    return np.asarray(np.linalg.qr(draws.T / DRAWN**0.5, mode='r')).T
-
-
-def _taps(step: Array, stable: Array, start: int, count: int) -> Array:
-    """First numerator taps of a step response with the denominator `stable`."""
-    impulse = np.diff(step[:start + count], prepend=0.0)
-    return np.convolve(impulse, stable)[start:start + count]
-
-
-def _moved(
-    poles: NDArray[np.complex128], spread: float, rng: np.random.Generator,
-) -> NDArray[np.complex128]:
-    """Poles whose natural frequency and damping ratio are off by exp(spread N)."""
-    moved: list[complex] = []
-    for pole in poles:
-        if pole.imag < 0.0:
-            continue  # follows its conjugate
-        if pole.imag == 0.0 and pole.real < 0.0:
-            moved.append(complex(pole))  # no continuous-time pole of its own
-            continue
-        s = np.log(complex(pole))
-        frequency = abs(s) * np.exp(spread * rng.standard_normal())
-        if pole.imag == 0.0:
-            moved.append(np.exp(-frequency))
-            continue
-        damping = -s.real / abs(s) * np.exp(spread * rng.standard_normal())
-        root = np.sqrt(complex(damping**2 - 1.0))
-        moved += [np.exp(frequency * (-damping + root)), np.exp(frequency * (-damping - root))]
-    return np.asarray(moved, dtype=np.complex128)
+def _delay(model: TransferFunction, stable: Array) -> float:
+    """Delay of slow motion in G without its integrators, one sample at least [samples]."""
+    b = model.numerator
+    of_zeros, of_poles = (
+        float(np.arange(len(one)) @ one / one.sum()) if one.sum() else 0.0 for one in (b, stable)
+    )
+    return max(of_zeros - of_poles, 1.0)

@@ -121,17 +121,16 @@ class Triangle:
         return _triangular(stacked)
 
     def posterior(
-        self, base: int, slope: float, spreads: Array, told_std: float, least_scale: float,
-        most_scale: float,
+        self, base: int, slope: float, spreads: Array, told_std: float, most_scale: float,
     ) -> Posterior:
         """Posterior with the first `base` columns as b and the others as e.
 
         slope: m in the prior of e. spreads: prior deviation of each e at s = 1 and m = 1.
-        least_scale, most_scale: those that are considered; the first one counts where they
-        contradict each other. Raises LinAlgError where numbers get too large.
+        most_scale: the largest one that is considered. Raises LinAlgError where numbers get too
+        large.
         """
         of_errors = self.after(base)._of_errors(
-            abs(slope) * spreads, told_std, least_scale, most_scale
+            abs(slope) * spreads, told_std, most_scale
         )
         return self.with_first(of_errors)
 
@@ -151,7 +150,7 @@ class Triangle:
         return replace(of_last, mean=mean, root=root)
 
     def _of_errors(
-        self, weights: Array, told_std: float, least_scale: float, most_scale: float,
+        self, weights: Array, told_std: float, most_scale: float,
     ) -> Posterior:
         """Posterior of all unknowns as e. weights: prior deviation of each at s = 1."""
         r, size = self.r, len(self.r) - 1
@@ -172,11 +171,9 @@ class Triangle:
         scales2 = RATIOS * left / squares
         # The uncertainty that was told is the deviation of what s = 1 stands for.
         evidence = 0.5 * (np.log(shrink).sum(axis=1) - weight * np.log(left / weight) - scales2)
-        # Half a step of the grid beyond is the same. None at all, and the largest one, remain.
-        if least_scale > 0.0:
-            evidence[:-1][scales2[:-1] < (least_scale * SAME)**2] = -inf
+        # Half a step of the grid beyond is the same. None at all remains.
         if most_scale < inf:
-            evidence[1:][scales2[1:] > (max(most_scale, least_scale) / SAME)**2] = -inf
+            evidence[1:][scales2[1:] > (most_scale / SAME)**2] = -inf
         best = int(evidence.argmax())
         highest = float(evidence[best])
         if not isfinite(highest):

@@ -3,18 +3,19 @@
 For labels R, L (side engaged last) and H (not engaged yet) that the play operator gives for v, with
 v_a the v of the last engaged sample and p the play output,
 
-    y = F x0 + (G v_a) m - (G 1_R) m c_r - (G 1_L) m c_l + (G 1_H) u0 + sum_i (m a_i) E_i
+    y = F x0 + (G v_a) m - (G 1_R) m c_r - (G 1_L) m c_l + (G 1_H) u0 + sum_i (m xi_i) E_i
 
 is linear. F is the free response of G from the state x0 before the first sample, u0 the u held
 before the first engagement, and E the responses of (1 - z^-1) F_i G to p, in the coordinates in
-which the a_i are independent and of variance one a priori (error_model.py).
+which the xi_i are independent and of variance one a priori (error_model.py), around the G that was
+told: its error, where G has been moved from it, is part of the column of m.
 
 An integrator of G that in truth leaks, 1/(1 - (1 - l) z^-1), adds -l sum y to first order.
 
 A disturbance of u that walks is a sum of ramps, one after the other, with independent heights.
 
 Columns, in this order: x0 (n), u0, m, m c_r, m c_l, l where G integrates, the heights of the ramps
-where u walks, a (K), and once more K for the size of the first jump of p, which depends on the
+where u walks, m xi (K), and once more K for the size of the first jump of p, which depends on the
 unknown start of p.
 """
 
@@ -135,6 +136,8 @@ class Regressors:
             filtered = self._errors.filtered(answers[driven:driven + 1 + layout.jump])
             responses = self._error.spread.T @ np.swapaxes(filtered, 1, 2)
             columns[layout.base:] = responses.reshape(-1, count)
+            # The prior of the error is around the G that was told.
+            columns[n + 1] += self._error.told @ responses[0]
         return columns.T
 
     def begin_after(self, moves: Array) -> None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import PRECISE_SLOPE, REVERSALS
 from backlash_ros.core.estimation.fit.crossings import crossings_of
+from backlash_ros.core.estimation.fit.learned_error import Learned, likelier
 from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.moving_horizon.acceptance import largest_gap_std, outside_bounds
 from backlash_ros.core.estimation.protocol import Bounds
@@ -115,9 +116,9 @@ def described(
         stds = (crossings.std_m, crossings.std_c_r, crossings.std_c_l, crossings.std_gap)
     still = result.still.solution.rms
     transfer = told.transfer_function
-    learned = result.found.around.model
-    model = transfer if learned.transfer_function is transfer \
-        else with_sign(learned.transfer_function, sign)
+    told_of_sign = Learned(told, np.zeros(result.found.around.error.count), 0)
+    learned = likelier(fit, solution, told_of_sign).model
+    model = transfer if learned is told else with_sign(learned.transfer_function, sign)
     found = RecordFit(
         m=m, c_r=c_r, c_l=c_l, gap=c_r - c_l,
         std_m=stds[0], std_c_r=stds[1], std_c_l=stds[2], std_gap=stds[3],

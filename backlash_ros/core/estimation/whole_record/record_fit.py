@@ -17,11 +17,9 @@ from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
-    fitted_with_model,
     most_likely,
     motionless,
     searched,
-    with_better_model,
 )
 from backlash_ros.core.estimation.fit.solution import SMALLEST_NOISE, Around
 from backlash_ros.core.estimation.protocol import Bounds
@@ -67,7 +65,7 @@ def fit_record(
         raise ValueError(f'delays={delays!r} must name at least one, none of them negative')
     state = model if isinstance(model, StateModel) else StateModel(model)
     around = Around(
-        state, build_error_model(state, uncertainty), max(noise_std, SMALLEST_NOISE), prior
+        build_error_model(state, uncertainty), max(noise_std, SMALLEST_NOISE), prior
     )
     widest = inf if bounds is None else bounds.c_r[1] - bounds.c_l[0]
     longest = max(delays)
@@ -128,18 +126,19 @@ def _found(v: Array, y: Array, around: Around, widest: float) -> Fitted | None:
     fits = [
         drained(fitted(v, y, found.around, start, solution.m, Pace())) for start in starts
     ]
-    return drained(with_better_model(v, y, most_likely(fits), Pace()))
+    return most_likely(fits)
 
 
 def _again(v: Array, y: Array, found: Fitted) -> Fitted:
     """The fit again, from where it stands, for other y."""
-    return drained(fitted_with_model(
-        v, y, found.around, found.beginning(v), found.solution.m, Pace()
-    ))
+    return drained(
+        fitted(v, y, found.around, found.beginning(v), found.solution.m, Pace())
+    )
 
 
 def _negated(around: Around) -> Around:
-    return around.moved_to(StateModel(with_sign(around.model.transfer_function, -1.0)))
+    model = StateModel(with_sign(around.model.transfer_function, -1.0))
+    return around._replace(error=build_error_model(model, around.error.uncertainty))
 
 
 def _outliers(result: Fitted) -> NDArray[np.bool_]:
