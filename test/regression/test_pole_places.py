@@ -69,6 +69,13 @@ def test_two_equal_poles_part_either_way() -> None:
     assert slope == pytest.approx((apart - complex_pair) / 2.0, rel=0.05)
 
 
+def test_a_double_pole_that_rounding_has_split_is_a_place() -> None:
+    split = complex(0.9, 1e-10)
+    told = places([split, split.conjugate()])
+    assert np.all(np.isfinite(told.slopes(np.zeros(2))))
+    assert told.denominator(np.zeros(2)) == pytest.approx(polynomial([0.9, 0.9]), abs=1e-9)
+
+
 def test_poles_outside_of_the_unit_circle_are_no_place() -> None:
     pair = 0.9 * np.exp(0.3j)
     assert places([pair, np.conj(pair)]).denominator(np.array([0.0, -50.0])) is None

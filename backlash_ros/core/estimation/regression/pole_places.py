@@ -8,7 +8,7 @@ the other.
 
 from __future__ import annotations
 
-from math import acos, cos, exp, hypot, log, pi, sin, sqrt
+from math import atan2, cos, exp, hypot, log, pi, sin, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ class PolePlaces:
         logs = sorted(log(-log(pole.real)) for pole in poles if pole.imag == 0.0 < pole.real)
         self._fixed = [pole.real for pole in poles if pole.imag == 0.0 and pole.real <= 0.0]
         singles: list[float] = []
-        pairs = [(log(abs(np.log(pole))), -acos(_damping(pole)) ** 2) for pole in upper]
+        pairs = [(log(abs(np.log(pole))), -_angle(pole) ** 2) for pole in upper]
         scales = [(spread, _spread_of_damping(w, spread)) for _, w in pairs]
         alone = spread / sqrt(2.0)
         while logs:
@@ -71,7 +71,6 @@ class PolePlaces:
             a = np.asarray(np.convolve(a, section))
         return a
 
-
     def distance(self, xi: Array) -> float:
         """Largest move of a place, as a logarithm, for a difference xi (K,)."""
         return float(np.abs(self._scales * xi).max(initial=0.0))
@@ -102,9 +101,10 @@ def _section(omega: float, w: float) -> tuple[float, float, float] | None:
     return 1.0, -exp(-fast) - exp(-slow), exp(-fast - slow)
 
 
-def _damping(pole: complex) -> float:
+def _angle(pole: complex) -> float:
+    """Of a pole's lambda, whose cosine is the damping ratio; never 0 for a complex one."""
     s = np.log(pole)
-    return float(-s.real / abs(s))
+    return atan2(s.imag, -s.real)
 
 
 def _spread_of_damping(w: float, spread: float) -> float:
