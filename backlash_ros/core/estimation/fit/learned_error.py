@@ -32,10 +32,12 @@ def error_of(fit: WindowFit, solution: Solution) -> tuple[Array, Array]:
 
 
 def strayed(fit: WindowFit, solution: Solution) -> bool:
-    """Whether the poles of G are so far from those of the fit that first order is not enough."""
+    """Whether the samples tell poles of G for which first order around the fit is not enough."""
+    return _tells_more(fit, solution) and _beyond_first_order(fit, solution)
+
+
+def _beyond_first_order(fit: WindowFit, solution: Solution) -> bool:
     layout, error, m = fit.layout, fit.around.error, solution.m
-    if not _tells_more(fit, solution):
-        return False
     poles = error_of(fit, solution)[0][TAPS:]
     columns = slice(layout.base + TAPS, layout.base + layout.errors)
     first_order = fit.samples.triangle.r[:-1, columns] @ (poles * m)
@@ -54,7 +56,9 @@ def moved_error(fit: WindowFit, solution: Solution, share: float = 1.0) -> Error
     xi, _ = error_of(fit, solution)
     # Poles are looked for around the right delay: slower ones may pass for it.
     later = error.delayed(xi) if share == 1.0 else error
-    return later if later is not error or not strayed(fit, solution) else error.moved(share * xi)
+    if later is not error or not _beyond_first_order(fit, solution):
+        return later
+    return error.moved(share * xi)
 
 
 def _tells_more(fit: WindowFit, solution: Solution) -> bool:
