@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from records import Truth, output, resonance, swing
-from scipy.signal import lfilter
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
 from backlash_ros.core.estimation.fit.learned_error import response_std
@@ -13,7 +12,7 @@ from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.learned_model import FREQUENCIES
-from backlash_ros.core.estimation.regression.error_model import ErrorModel
+from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -35,6 +34,12 @@ def transform(response: Array) -> Array:
     return np.power.outer(POINTS, -np.arange(len(response))) @ response
 
 
+def answers(error: ErrorModel, moves: Array) -> Array:
+    """Outputs for each xi after moves of p (N,), shape (N, K)."""
+    # They are those after each move.
+    return ErrorFilter(error, 1).responses(np.append(0.0, moves[:-1])[None])[0].T
+
+
 def fit_of(true: TransferFunction, told: TransferFunction, uncertainty: float) -> Fitted:
     model = StateModel(told)
     v = swing(600)
@@ -50,7 +55,8 @@ def test_responses_of_the_error_are_those_of_its_filters(name: str) -> None:
     difference = np.zeros(LENGTH)
     difference[:2] = 1.0, -1.0
     assert error.responses(POINTS) == pytest.approx(
-        transform(error.filtered(difference) @ error.spread), rel=1e-6, abs=1e-9
+        transform(answers(error, difference)) / MODELS[name].response(POINTS)[:, None],
+        rel=1e-6, abs=1e-9,
     )
 
 
@@ -60,11 +66,9 @@ def test_deviation_is_that_of_plants_drawn_from_the_posterior() -> None:
     error, model = fit.around.error, fit.model.transfer_function
     rng = np.random.default_rng(0)
     cov = posterior.cov * posterior.noise_std**2 * solution.inflation
-    impulse = np.zeros(LENGTH)
-    impulse[0] = 1.0
-    told = lfilter(model.numerator, model.denominator, impulse)
-    moves = error.filtered(np.diff(told, prepend=0.0)) @ error.spread
-    shares = transform(moves) / transform(told)[:, None]
+    difference = np.zeros(LENGTH)
+    difference[:2] = 1.0, -1.0
+    shares = transform(answers(error, difference)) / model.response(POINTS)[:, None]
     squares = np.zeros(len(POINTS))
     draws = rng.multivariate_normal(posterior.mean, cov, 2000)
     for drawn in draws:

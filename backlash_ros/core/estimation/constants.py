@@ -26,7 +26,6 @@ AS_GOOD = 1.5  # ratio of residuals up to which another fit explains the samples
 UNDECIDED = 100  # samples after which it is said why there is no estimate yet
 NO_DATA = 20  # lost samples in a row that are worth a state
 SLOW = 100  # samples that u takes at least to walk: what is faster is motion
-FREE_TAPS = 0.2  # prior of the second tap of G, as a share of a lag, which is the first one
 LEAK = 5e-3  # prior of that of an integrator, per sample and per unit of the uncertainty
 LAGS = (1, 2, 4, 8, 16)  # samples after which a residual is compared with itself
 LINEAR = 0.5  # deviations of the noise that terms of second order in the error of G may leave

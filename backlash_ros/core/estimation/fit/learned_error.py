@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from math import inf
+from math import hypot, inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import BY_CHANCE, LINEAR
+from backlash_ros.core.estimation.constants import AS_GOOD, BY_CHANCE, LINEAR
+from backlash_ros.core.estimation.fit.prior import beyond_chance
 from backlash_ros.core.estimation.fit.solution import Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.error_model import TAPS, ErrorModel
@@ -19,6 +20,7 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
+TINY = 1e-300  # deviation of no noise
 WORTH_A_DESIGN = 1.0  # log-likelihood by which another G has to be likelier at least
 
 
@@ -37,12 +39,16 @@ def strayed(fit: WindowFit, solution: Solution) -> bool:
 
 
 def _beyond_first_order(fit: WindowFit, solution: Solution) -> bool:
-    layout, error, m = fit.layout, fit.around.error, solution.m
-    poles = error_of(fit, solution)[0][TAPS:]
-    columns = slice(layout.base + TAPS, layout.base + layout.errors)
-    first_order = fit.samples.triangle.r[:-1, columns] @ (poles * m)
-    relative = error.uncertainty * float(np.abs(poles).max(initial=0.0))
-    return relative * float(np.linalg.norm(first_order)) > LINEAR * solution.posterior.noise_std
+    xi, _ = error_of(fit, solution)
+    poles = fit.around.error.uncertainty * float(np.abs(xi[TAPS:]).max(initial=0.0))
+    return poles * _shows(fit, solution, xi) > LINEAR
+
+
+def _shows(fit: WindowFit, solution: Solution, xi: Array) -> float:
+    """Norm of what xi (K,) makes of all outputs, in deviations of the noise."""
+    columns = slice(fit.layout.base, fit.layout.base + fit.layout.errors)
+    moved = fit.samples.triangle.r[:-1, columns] @ (xi * solution.m)
+    return float(np.linalg.norm(moved)) / max(solution.posterior.noise_std, TINY)
 
 
 def moved_error(fit: WindowFit, solution: Solution, share: float = 1.0) -> ErrorModel:
@@ -73,28 +79,36 @@ def _tells_more(fit: WindowFit, solution: Solution) -> bool:
 
 
 class Learned(NamedTuple):
-    """A G of low order, its xi beside the one that was told, and how many samples told it."""
+    """A G of low order, and its xi beside the one that was told: mean (K,), covariance (K, K)."""
 
     model: StateModel
     xi: Array
-    samples: int
+    cov: Array
+
+
+def as_told(model: StateModel, count: int) -> Learned:
+    """The G that was told, its `count` xi known as well as their prior says."""
+    return Learned(model, np.zeros(count), np.eye(count))
 
 
 def likelier(fit: WindowFit, solution: Solution, present: Learned) -> Learned:
     """The G that the fit speaks for, unless the present one explains the samples as well.
 
-    More samples tell more; as many have to say more than chance does.
+    A record that tells less of G than the one before has to contradict it: by more than chance, and
+    than the errors of a sensor that come again with the motion.
     """
     error = fit.around.error
-    if not solution.m > 0.0:
+    if not solution.m > 0.0 or not error.count:
         return present
     xi, cov = error_of(fit, solution)
-    of_told = xi - error.told
-    apart = of_told - present.xi
-    less_likely = 0.5 * float(apart @ np.linalg.pinv(cov, hermitian=True) @ apart)
-    by = WORTH_A_DESIGN if fit.length > present.samples else float(error.count)
-    model = low_order(fit, solution) if less_likely > by else fit.model
-    return present if model is fit.model else Learned(model, of_told, fit.length)
+    apart = xi - error.told - present.xi
+    if np.linalg.slogdet(cov)[1] < np.linalg.slogdet(present.cov)[1]:
+        another = 0.5 * float(apart @ np.linalg.solve(cov, apart)) > WORTH_A_DESIGN
+    else:
+        left = hypot(1.0, _shows(fit, solution, apart) / sqrt(solution.count))
+        another = left > AS_GOOD and beyond_chance(apart, cov + present.cov)
+    model = low_order(fit, solution) if another else fit.model
+    return present if model is fit.model else Learned(model, xi - error.told, cov)
 
 
 def low_order(fit: WindowFit, solution: Solution) -> StateModel:

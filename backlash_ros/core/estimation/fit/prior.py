@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from backlash_ros.core.estimation.protocol import Estimate
 
 Array = NDArray[np.float64]
 
-CHI2 = 16.27  # of three variables, exceeded once in 1,000 times
+CHANCE = 1e-3  # of a difference that is no chance
 # --- guards
 SHARPEST = 1e-9  # relative deviation of an estimate that is taken for exact
 
@@ -57,5 +58,6 @@ def contradicts(one: Prior, other: Prior) -> bool:
 
 
 def beyond_chance(difference: Array, cov: Array) -> bool:
-    """Whether a difference (3,) of this covariance (3, 3) is one in 1,000 or rarer."""
-    return float(difference @ np.linalg.solve(cov, difference)) > CHI2
+    """Whether a difference (n,) of this covariance (n, n) is one in 1,000 or rarer."""
+    squares = float(difference @ np.linalg.solve(cov, difference))
+    return squares > float(chdtri(len(difference), CHANCE))

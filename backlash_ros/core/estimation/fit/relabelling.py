@@ -100,17 +100,10 @@ def fitted(
     v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
 ) -> Generator[None, None, Fitted]:
     """Fit v (N,) and y (N,), nan where lost, from labels for `start` on; yields between pieces."""
-    weights = weights_of(y)
-    extent = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
     best: Fitted | None = None
     share = 1.0
     for _ in range(RELABELLINGS):
-        fit = WindowFit(around, start, slope, extent, int(GROWTH * len(v)))
-        while fit.length < len(v):
-            part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
-            fit.samples.take(fit.columns(v[part], y[part]), y[part], weights[part])
-            yield
-        result = Fitted(fit, fit.solve())
+        result = yield from labelled(v, y, around, start, slope, pace)
         if best is not None and around.error is not best.around.error \
                 and result.evidence < best.evidence - AS_LIKELY:
             # G was moved too far.
@@ -136,6 +129,20 @@ def fitted(
         yield
     assert best is not None
     return best
+
+
+def labelled(
+    v: Array, y: Array, around: Around, start: Start, slope: float, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """The solution with the labels for this start."""
+    weights = weights_of(y)
+    extent = (float(np.nanmax(np.abs(y), initial=0.0)), float(np.abs(v).max(initial=0.0)))
+    fit = WindowFit(around, start, slope, extent, int(GROWTH * len(v)))
+    while fit.length < len(v):
+        part = slice(fit.length, fit.length + pace.pieces(fit.layout.unknowns))
+        fit.samples.take(fit.columns(v[part], y[part]), y[part], weights[part])
+        yield
+    return Fitted(fit, fit.solve())
 
 
 def searched(

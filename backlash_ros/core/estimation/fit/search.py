@@ -18,7 +18,7 @@ from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import GAPS, NO_GAP, STARTS, ZOOM
 from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.regression.error_model import ErrorModel
+from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel
 from backlash_ros.core.estimation.regression.play import plays
 from backlash_ros.core.estimation.regression.posterior import NOISE_WEIGHT, RATIOS
 from backlash_ros.core.estimation.regression.regressors import held
@@ -190,8 +190,8 @@ class Comparison:
 
     def _error_columns(self, p: Array, starts: Array) -> Array:
         """Columns of the error of G for play outputs (H, N), shape (H, K, N)."""
-        direct = self._answers(np.diff(p, prepend=starts[:, None]))
-        columns = self._error.spread.T @ np.swapaxes(self._error.filtered(direct), 1, 2)
+        moves = np.diff(p, prepend=starts[:, None])
+        columns = ErrorFilter(self._error, len(moves)).responses(moves)
         columns *= self._root
         rows = columns.reshape(-1, columns.shape[2])  # all of them at once: one product of matrices
         rows -= (rows @ self._basis) @ self._basis.T

@@ -26,7 +26,7 @@ from backlash_ros.core.estimation.constants import (
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
 from backlash_ros.core.estimation.fit.crossings import Crossings
-from backlash_ros.core.estimation.fit.learned_error import Learned, likelier
+from backlash_ros.core.estimation.fit.learned_error import Learned, as_told, likelier
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.prior import Prior, drifted
 from backlash_ros.core.estimation.fit.record import Record
@@ -106,7 +106,7 @@ class Learning:
 
     def __post_init__(self) -> None:
         error = self.told.error
-        self.learned = Learned(error.model, np.zeros(error.count), 0)
+        self.learned = as_told(error.model, error.count)
 
     @property
     def expects_changes(self) -> bool:

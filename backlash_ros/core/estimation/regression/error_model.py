@@ -1,14 +1,17 @@
-"""How wrong G may be: its poles, its delay, and the first taps of its numerator.
+"""How wrong G may be: its poles, its delay, and how its numerator spreads.
 
-With A the polynomial of the moving poles of G, neither integrators nor delays, n of them,
+With A the polynomial of the moving poles of G = b/a, neither integrators nor delays, n of them,
 
-    G_true = G A(1)/A'(1) A/A' (1 + (1 - z^-1) (h_0 + h_1 z^-1)) = G (1 + Delta)
+    G_true = A(1)/A'(1) A/A' [G (1 - (1 - z^-1) lag) + (1 - z^-1)^2 width B/a] = G (1 + Delta)
 
 where the poles of A' are off in natural frequency, damping ratio or time constant
-(pole_places.py). Nothing has a gain at rest, so that the DC gain (the velocity gain of an
-integrating G) stays in m. To first order in xi, the unknowns in units of their deviations,
+(pole_places.py), and B is b one sample shorter. What acts a part t of a sample late has the lag t
+and the width -t (1 - t) / 2: for G of second order that is all of it. Nothing has a gain at rest,
+so that the DC gain (the velocity gain of an integrating G) stays in m. To first order in xi, the
+unknowns in units of their deviations,
 
-    Delta = (1 - z^-1) sum_i h_i F_i(z),   h = L xi,   F = 1, z^-1;  z^-j A(1) / A, j = 0 .. n-1
+    Delta = (1 - z^-1) sum_i h_i F_i(z),   h = L xi,
+    F = -1, (1 - z^-1) B/b, z^-j A(1)/A for j = 0 .. n-1
 
 The fit moves the poles and the delay of G until first order is all there is (relabelling.py). The
 prior stays that of the G that was told; its scale is learned (posterior.py).
@@ -24,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.constants import FREE_TAPS, LEAK
+from backlash_ros.core.estimation.constants import LEAK
 from backlash_ros.core.estimation.regression.pole_places import PolePlaces
 from backlash_ros.core.plant.model_check import ON_CIRCLE
 from backlash_ros.core.plant.state_model import StateModel
@@ -33,8 +36,10 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 Array = NDArray[np.float64]
 
 FURTHEST = log(2.0)  # logarithm of a time constant that is moved by at once, at most
-ALMOST_ONE = 0.75  # samples of lag from which on it is one of the delay
-TAPS = 2  # of the numerator: with them delays by parts of a sample, and the first beyond
+BEYOND = 0.25  # samples by which a lag may leave those between 0 and 1 before G moves by one
+WIDEST = 0.125  # of what acts a part of a sample late, t (1 - t) / 2
+TAPS = 2  # unknowns of the numerator: lag and width
+MOST_LATE = 2  # samples of delay that G moves by at once, at most
 
 
 class ErrorModel:
@@ -43,13 +48,17 @@ class ErrorModel:
     model: G, which may have been moved from the one that was told. uncertainty: as told. stable:
     A, monic. gain: A(1). taps: n. count: number K of unknowns, 0 where G is exact. leak: prior
     deviation of that of an integrator, per sample. spread: L, shape (n + 2, K). told: xi of the G
-    that was told, which the prior is around, shape (K,).
+    that was told, which the prior is around, shape (K,). b, wide: b and (1 - z^-1) B, after a delay
+    of one sample. later: whole samples that G acts later than told.
     """
 
     def __init__(self, model: StateModel, uncertainty: float) -> None:
         self.uncertainty = uncertainty
-        self.model, self._told_model = model, model.transfer_function
-        poles = self._told_model.poles
+        self.model = model
+        transfer = model.transfer_function
+        self._told_delay = transfer.delay
+        self._told_b = np.trim_zeros(transfer.numerator, 'fb')
+        poles = transfer.poles
         moving = poles[(np.abs(poles) > ON_CIRCLE) & (np.abs(poles) < 1.0 - ON_CIRCLE)]
         self._places = PolePlaces(moving, uncertainty)
         integrators = int(np.count_nonzero(np.abs(poles - 1.0) < ON_CIRCLE))
@@ -59,132 +68,145 @@ class ErrorModel:
         self.leak = LEAK * uncertainty if self.integrates else 0.0
         self.count = TAPS + len(self._places.told) if uncertainty > 0.0 else 0
         self.told: Array = np.zeros(self.count)
+        self.later = 0
         self.stable: Array = np.atleast_1d(np.real(np.poly(moving)))
-        self.gain = self._told_gain = float(self.stable.sum())
-        # The first tap is a lag; only that slow motion tells of it, so the second one is little.
-        lag = uncertainty * _delay(self._told_model, self.stable)
-        self._of_taps = lag * np.array([1.0, FREE_TAPS])
-        self.spread = self._spread()
+        self._told_gain = float(self.stable.sum())
+        late = max(self._told_delay + _mean(self._told_b) - _mean(self.stable), 1.0)
+        self._of_taps = np.array([uncertainty * late, WIDEST])
+        self._follow()
 
-    def _spread(self) -> Array:
-        """L: the taps by a lag, and what the places of poles change of A."""
-        spread = np.zeros((TAPS + self.taps, self.count))
+    def _follow(self) -> None:
+        """Set what follows from A and what was told."""
+        self.gain = float(self.stable.sum())
+        self.b = self._told_b * (self.gain / self._told_gain)
+        shorter = np.atleast_1d(np.poly([-1.0] * max(len(self.b) - 2, 0)))
+        self.wide = np.convolve(shorter * float(self.b.sum() / shorter.sum()), (1.0, -1.0))
+        self.spread = np.zeros((TAPS + self.taps, self.count))
         if self.count:
-            spread[:TAPS, :TAPS] = np.diag(self._of_taps)
+            self.spread[:TAPS, :TAPS] = np.diag(self._of_taps)
             for column, slope in enumerate(self._places.slopes(-self.told[TAPS:]), TAPS):
                 # d ln(A(1)/A) has a zero at z = 1, which is divided out.
                 numerator = self.stable * (float(slope.sum()) / self.gain) - slope
-                spread[TAPS:, column] = np.cumsum(numerator)[:-1] / self.gain
-        return spread
+                self.spread[TAPS:, column] = np.cumsum(numerator)[:-1] / self.gain
 
     def moved(self, xi: Array) -> ErrorModel:
-        """The same prior around the G with the poles at xi (K,).
+        """The same prior around the G at xi (K,).
 
-        But no further than first order holds, and where poles would leave the unit circle all go
-        half as far.
+        But its poles no further than first order holds, and where some would leave the unit circle
+        all go half as far.
         """
         told = self.told[TAPS:]
-        step = xi[TAPS:] * min(FURTHEST / max(self._places.distance(xi[TAPS:]), FURTHEST), 1.0)
-        denominator = self._places.denominator(step - told)
+        share = min(FURTHEST / max(self._places.distance(xi[TAPS:]), FURTHEST), 1.0)
+        denominator = self._places.denominator(share * xi[TAPS:] - told)
         while denominator is None:
-            step = 0.5 * step
-            denominator = self._places.denominator(step - told)
-        apart = np.append(np.zeros(TAPS), step)
-        return self._around(denominator, self.model.transfer_function.delay, apart)
+            share *= 0.5
+            denominator = self._places.denominator(share * xi[TAPS:] - told)
+        return self._around(denominator, self.later, share * xi)
 
     def delayed(self, xi: Array) -> ErrorModel:
-        """The same with whole samples of delay more or less, where the taps at xi (K,) want it."""
-        lag = -float(self._of_taps @ xi[:TAPS])
-        late = 0 if abs(lag) < ALMOST_ONE else max(min(round(lag), TAPS), -TAPS)
-        return self.later(max(late, 1 - self.model.transfer_function.delay))
+        """The same with whole samples of delay more or less, where the lag at xi (K,) wants it.
 
-    def later(self, samples: int) -> ErrorModel:
-        """The same around the G with so many samples more of delay, TAPS at most."""
-        if samples == 0:
+        G with a delay holds all that act up to a sample later.
+        """
+        beyond = self._taps_at(xi)[0] - 0.5
+        if abs(beyond) < 0.5 + BEYOND:
+            return self
+        later = max(min(round(beyond), MOST_LATE), -MOST_LATE, 1 - self.delay)
+        if later == 0:
             return self
         apart = np.zeros(self.count)
-        apart[0] = -samples / self._of_taps[0]
-        return self._around(self.stable, self.model.transfer_function.delay + samples, apart)
+        apart[0] = later / self._of_taps[0]
+        return self._around(self.stable, self.later + later, apart)
 
-    def _around(self, denominator: Array, delay: int, apart: Array) -> ErrorModel:
+    @property
+    def delay(self) -> int:
+        """Samples after which G answers."""
+        return self._told_delay + self.later
+
+    def _taps_at(self, xi: Array) -> tuple[float, float]:
+        """Lag [samples] beside the delay, and width, of the G at xi (K,)."""
+        lag, width = (self._of_taps * (xi - self.told)[:TAPS]).tolist()
+        return lag - self.later, width
+
+    def _around(self, denominator: Array, later: int, apart: Array) -> ErrorModel:
         """Around another G, whose xi is `apart` (K,)."""
         other = copy(self)
-        other.stable, other.gain = denominator, float(denominator.sum())
+        other.stable, other.later = denominator, later
         other.told = self.told - apart
-        other.model = StateModel(self._transfer_function(denominator, delay, np.ones(1)))
-        other.spread = other._spread()
+        other._follow()
+        other.model = StateModel(other._transfer_function(*other._taps_at(np.zeros(self.count))))
         return other
 
     def low_order(self, xi: Array) -> TransferFunction | None:
-        """The G at xi (K,), of which the taps are a part; None where it is not stable."""
+        """The G at xi (K,); None where it is not stable."""
         denominator = self._places.denominator(xi[TAPS:] - self.told[TAPS:])
         if denominator is None:
             return None
-        first, second = (self._of_taps * xi[:TAPS]).tolist()
-        taps = np.array([1.0 + first, second - first, -second])
-        return self._transfer_function(denominator, self.model.transfer_function.delay, taps)
+        other = copy(self)
+        other.stable, other.told = denominator, self.told - xi
+        other._follow()
+        return other._transfer_function(*self._taps_at(xi))
 
-    def _transfer_function(self, stable: Array, delay: int, taps: Array) -> TransferFunction:
-        """G with these poles and this delay, its numerator times these taps."""
-        told = np.trim_zeros(self._told_model.numerator, 'fb')
-        b = np.convolve(told, taps) * (float(stable.sum()) / self._told_gain)
-        a = np.convolve(stable, self._integrate)
-        order = max(len(a) - 1, delay + len(b) - 1)
+    def _transfer_function(self, lag: float, width: float) -> TransferFunction:
+        """G with this lag and width."""
+        b = self.b
+        if lag or width:
+            b = np.convolve(b, (1.0 - lag, lag))
+            wide = width * np.convolve(self.wide, (1.0, -1.0))
+            b = np.pad(b, (0, len(wide) - len(b))) + wide
+        a = np.convolve(self.stable, self._integrate)
+        order = max(len(a) - 1, self.delay + len(b) - 1)
         numerator, denominator = np.zeros(order + 1), np.zeros(order + 1)
-        numerator[delay:delay + len(b)], denominator[:len(a)] = b, a
+        numerator[self.delay:self.delay + len(b)], denominator[:len(a)] = b, a
         return TransferFunction(numerator.tolist(), denominator.tolist())
-
-    def filtered(self, direct: Array) -> Array:
-        """Responses of the F_i to signals (..., N) that were 0 before, shape (..., N, n + 2)."""
-        once = lfilter([self.gain], self.stable, direct)
-        count = direct.shape[-1]
-        # In the order it is written in.
-        out = np.zeros((*direct.shape[:-1], TAPS + self.taps, count))
-        row = 0
-        for signal, delays in ((direct, TAPS), (once, self.taps)):
-            for j in range(delays):
-                out[..., row, j:] = signal[..., :count - j]
-                row += 1
-        return np.swapaxes(out, -1, -2)
 
     def responses(self, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Delta for each xi at the points z (M,), shape (M, K)."""
         back = 1.0 / z
+        moved = np.polyval(self.model.transfer_function.numerator[:self.delay - 1:-1], back)
+        lag, wide = (np.polyval(taps[::-1], back) / moved for taps in (-self.b, self.wide))
         filtered = self.gain / np.polyval(self.stable[::-1], back)
-        columns = [
-            (1.0 - back) * factor * back**j
-            for factor, delays in ((1.0, TAPS), (filtered, self.taps)) for j in range(delays)
-        ]
-        return np.asarray(np.array(columns, dtype=np.complex128).T @ self.spread)
+        columns = [lag, wide, *(filtered * back**j for j in range(self.taps))]
+        of_unknowns = np.array(columns, dtype=np.complex128).T @ self.spread
+        return np.asarray((1.0 - back)[:, None] * of_unknowns)
 
 
 class ErrorFilter:
-    """The filters F_i with their state: what comes in pieces comes out as if it were one.
+    """G F_i with their state: what comes in pieces comes out as if it were one.
 
     signals: S, how many are filtered beside each other.
     """
 
     def __init__(self, error: ErrorModel, signals: int) -> None:
         self._error = error
+        model = error.model.transfer_function
+        # Without its first sample, which is always 0, a response is that after each sample.
+        delay: Array = np.zeros(error.delay - 1)
+        numerators = [
+            np.append(delay, -error.b), np.append(delay, error.wide), model.numerator[1:],
+        ]
+        self._filters = [
+            (b, model.denominator, np.zeros((signals, max(len(b), model.order + 1) - 1)))
+            for b in numerators
+        ]
         self._once = np.zeros((signals, error.taps))
-        self._past: Array = np.zeros((2, signals, max(error.taps, TAPS) - 1))
+        self._past: Array = np.zeros((signals, max(error.taps - 1, 0)))
 
-    def filtered(self, direct: Array) -> Array:
-        """Responses to the next samples (S, N), shape (S, N, n + 2)."""
-        error, taps = self._error, self._error.taps
-        once = direct
-        if taps:
-            once, self._once = lfilter([error.gain], error.stable, direct, zi=self._once)
-        memory = self._past.shape[2]
-        longer = np.concatenate([self._past, [direct, once]], axis=2)
-        self._past = longer[..., longer.shape[2] - memory:]
-        out = np.empty((len(direct), TAPS + taps, direct.shape[1]))
-        row = 0
-        for signal, delays in zip(longer, (TAPS, taps), strict=True):
-            for j in range(delays):
-                out[:, row] = signal[:, memory - j:signal.shape[1] - j]
-                row += 1
-        return np.swapaxes(out, 1, 2)
+    def responses(self, moves: Array) -> Array:
+        """How y after each of the next moves of p (S, N) depends on every xi, shape (S, K, N)."""
+        error, memory = self._error, self._past.shape[1]
+        out = np.empty((len(moves), TAPS + error.taps, moves.shape[1]))
+        for row, (b, a, state) in enumerate(self._filters[:TAPS]):
+            out[:, row], state[:] = lfilter(b, a, moves, zi=state)
+        if error.taps:
+            b, a, state = self._filters[TAPS]
+            response, state[:] = lfilter(b, a, moves, zi=state)
+            once, self._once = lfilter([error.gain], error.stable, response, zi=self._once)
+            longer = np.concatenate([self._past, once], axis=1)
+            self._past = longer[:, longer.shape[1] - memory:]
+            for j in range(error.taps):
+                out[:, TAPS + j] = longer[:, memory - j:longer.shape[1] - j]
+        return np.asarray(error.spread.T @ out)
 
 
 @lru_cache(maxsize=8)
@@ -193,10 +215,7 @@ def build_error_model(model: StateModel, uncertainty: float) -> ErrorModel:
     return ErrorModel(model, uncertainty)
 
 
-def _delay(model: TransferFunction, stable: Array) -> float:
-    """Delay of slow motion in G without its integrators, one sample at least [samples]."""
-    b = model.numerator
-    of_zeros, of_poles = (
-        float(np.arange(len(one)) @ one / one.sum()) if one.sum() else 0.0 for one in (b, stable)
-    )
-    return max(of_zeros - of_poles, 1.0)
+def _mean(taps: Array) -> float:
+    """Delay of slow motion in taps (N,) [samples]."""
+    gain = float(taps.sum())
+    return float(np.arange(len(taps)) @ taps) / gain if gain else 0.0

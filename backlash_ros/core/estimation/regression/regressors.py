@@ -35,7 +35,7 @@ from backlash_ros.core.plant.state_model import StateModel
 Array = NDArray[np.float64]
 
 RAMPS = 12  # of a walk within a record
-SIGNALS = 6  # that drive G: 1_H, v_a, -1_R, -1_L, p(k) - p(k-1), the first jump of p
+SIGNALS = 4  # that drive G: 1_H, v_a, -1_R, -1_L
 
 
 def held(y: Array, before: float) -> Array:
@@ -121,7 +121,6 @@ class Regressors:
         signals[n], signals[n + 1] = labels.held, labels.v_a
         np.negative(labels.right, out=signals[n + 2])
         np.negative(labels.left, out=signals[n + 3])
-        signals[n + 4], signals[n + 5] = labels.moves, labels.jump
         if layout.ramps:
             signals[n + SIGNALS:] = self.ramps(self._count, count)
         self._count += count
@@ -133,8 +132,8 @@ class Regressors:
             columns[driven] = self._leak(y)
         columns[layout.walk] = answers[n + SIGNALS:]
         if layout.errors:
-            filtered = self._errors.filtered(answers[driven:driven + 1 + layout.jump])
-            responses = self._error.spread.T @ np.swapaxes(filtered, 1, 2)
+            moves = np.array([labels.moves, labels.jump] if layout.jump else [labels.moves])
+            responses = self._errors.responses(moves)
             columns[layout.base:] = responses.reshape(-1, count)
             # The prior of the error is around the G that was told.
             columns[n + 1] += self._error.told @ responses[0]
@@ -142,10 +141,7 @@ class Regressors:
 
     def begin_after(self, moves: Array) -> None:
         """Begin where the error of G still answers to these moves of p (N,), the newest last."""
-        driven = self.layout.driven
-        states: Array = self._states[driven:driven + 1]
-        answers, self._states[driven:driven + 1] = self._answers(moves[None], states)
-        self._errors.filtered(answers)
+        self._errors.responses(moves[None])
 
     def _answers(self, signals: Array, states: Array) -> tuple[Array, Array]:
         """Outputs of G after each sample of the signals (M, N), and its states after the last."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import PRECISE_SLOPE, REVERSALS
 from backlash_ros.core.estimation.fit.crossings import crossings_of
-from backlash_ros.core.estimation.fit.learned_error import Learned, likelier
+from backlash_ros.core.estimation.fit.learned_error import as_told, likelier
 from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.moving_horizon.acceptance import largest_gap_std, outside_bounds
 from backlash_ros.core.estimation.protocol import Bounds
@@ -116,8 +116,8 @@ def described(
         stds = (crossings.std_m, crossings.std_c_r, crossings.std_c_l, crossings.std_gap)
     still = result.still.solution.rms
     transfer = told.transfer_function
-    told_of_sign = Learned(told, np.zeros(result.found.around.error.count), 0)
-    learned = likelier(fit, solution, told_of_sign).model
+    present = as_told(told, result.found.around.error.count)
+    learned = likelier(fit, solution, present).model
     model = transfer if learned is told else with_sign(learned.transfer_function, sign)
     found = RecordFit(
         m=m, c_r=c_r, c_l=c_l, gap=c_r - c_l,

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import MOVED
+from backlash_ros.core.estimation.fit.learned_error import moved_error
 from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.fit.relabelling import RELABELLINGS, Fitted
+from backlash_ros.core.estimation.fit.relabelling import RELABELLINGS, Fitted, labelled
 from backlash_ros.core.estimation.fit.rounding.ascent import Place, climbed, climbed_at
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.posterior import Posterior
@@ -100,13 +101,22 @@ def with_rounding(
         most_likely = replace(known, mean=problem.unknowns(z))
         yield from _read(fit, problem, y, rounding, most_likely, pace)
         result = Fitted(fit, fit.solve(), result.decided)
-        solution = result.solution
-        # Labels that are closer than this would not be made again either.
-        if not solution.m > 0.0 or (
-            abs(solution.gap - fit.start.gap) <= 0.5 * MOVED * solution.std_gap
-        ):
+        solution, start = result.solution, result.beginning(v)
+        if not solution.m > 0.0:
             break
-        fit = fit.relabelled(result.beginning(v), solution.m)
+        error = moved_error(fit, solution)
+        if error is not fit.around.error:
+            # As intervals they tell another G than as values.
+            around = fit.around._replace(error=error)
+            fit, solution, _ = yield from labelled(v, y, around, start, solution.m, pace)
+            known = solution.posterior
+            problem = _Unknowns(fit, y, known, resolution, pace)
+            z, _, noise_std = yield from climbed(problem, problem.start, most, noise_std)
+            continue
+        # Labels that are closer than this would not be made again either.
+        if abs(solution.gap - fit.start.gap) <= 0.5 * MOVED * solution.std_gap:
+            break
+        fit = fit.relabelled(start, solution.m)
         problem.rows = yield from _columns(fit, v, y, pace)
         z, _ = yield from climbed_at(problem, z, noise_std)
     return result
