@@ -25,9 +25,8 @@ from backlash_ros.core.estimation.regression.resolution import Rounding, cells, 
 Array = NDArray[np.float64]
 
 # Noise beside the rounding that is tried, as shares of the resolution. With the first one readings
-# tell what they tell as values. With less than the last one estimates would get surer than the
-# edges of real readings are sharp.
-MOST_NOISE, LEAST_NOISE = 1.0 / 4.0, 1.0 / 16.0
+# tell what they tell as values; edges of real readings are hardly sharper than the last one.
+MOST_NOISE, LEAST_NOISE = 1.0 / 4.0, 1.0 / 64.0
 
 
 class _Unknowns:
