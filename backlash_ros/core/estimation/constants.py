@@ -33,7 +33,7 @@ LINEAR = 0.5  # deviations of the noise that terms of second order in the error 
 # --- effort
 LONGEST = 1500  # samples of the record that is fitted; beyond it the oldest third is let go
 BLOCK = (8, 64)  # samples, fewest and most, that are taken in between two solutions
-BLOCK_SHARE = 32  # ... and in between: one block for so many samples of the record
+BLOCK_SHARE = 16  # ... and in between: one block for so many samples of the record
 BEGINNING = 0.1  # share of the record that depends on where p began which is let go for good
 GROWTH = 1.4  # of the record, after which all of it is refitted
 STANDS = 0.02  # deviations that a solution of Gauss-Newton steps may still move by; p0: gaps

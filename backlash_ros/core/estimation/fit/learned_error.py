@@ -75,7 +75,7 @@ def _tells_more(fit: WindowFit, solution: Solution) -> bool:
     if not fit.layout.errors or fit.around.inherited or not solution.m > 0.0:
         return False
     xi, cov = error_of(fit, solution)
-    return float(xi @ np.linalg.pinv(cov, hermitian=True) @ xi) > 2.0 * len(xi)
+    return bool(xi.any()) and float(xi @ np.linalg.solve(cov, xi)) > 2.0 * len(xi)
 
 
 class Learned(NamedTuple):
@@ -101,6 +101,8 @@ def likelier(fit: WindowFit, solution: Solution, present: Learned) -> Learned:
     if not solution.m > 0.0 or not error.count:
         return present
     xi, cov = error_of(fit, solution)
+    if not cov.any():
+        return present  # without doubt as told
     apart = xi - error.told - present.xi
     if np.linalg.slogdet(cov)[1] < np.linalg.slogdet(present.cov)[1]:
         another = 0.5 * float(apart @ np.linalg.solve(cov, apart)) > WORTH_A_DESIGN
