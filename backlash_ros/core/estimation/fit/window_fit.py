@@ -8,6 +8,7 @@ gap, so that labels made once more with it are a Gauss-Newton step (relabelling.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from functools import lru_cache
 from math import inf, sqrt
@@ -149,6 +150,12 @@ class WindowFit:
     def relabelled(self, start: Start, slope: float) -> WindowFit:
         """A fit of the same samples around the same, with the labels for another start."""
         return WindowFit(self.around, start, slope, self.extent, self._expected)
+
+    def emptied(self) -> WindowFit:
+        """This fit after its samples, which are to be taken in once more; their columns stay."""
+        other = copy(self)
+        other.samples = WeightedSamples(self._vague(*self.extent))
+        return other
 
     def restarted(self, around: Around, start: Start) -> WindowFit:
         """A fit of samples yet to come, with the prior of `around`, after a break."""

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.constants import MOVED
+from backlash_ros.core.estimation.constants import AS_GOOD, MOVED
 from backlash_ros.core.estimation.fit.learned_error import moved_error
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.relabelling import RELABELLINGS, Fitted, labelled
@@ -84,38 +84,51 @@ class _Unknowns:
 def with_rounding(
     v: Array, y: Array, result: Fitted, pace: Pace,
 ) -> Generator[None, None, Fitted]:
-    """The fit of v (N,) and y (N,) as intervals, where y was rounded and its noise is smaller."""
-    fit, solution, _ = result
+    """The fit of v (N,) and y (N,) as intervals, where y was rounded and its noise is smaller.
+
+    That of values stays where the intervals lead astray, as few of them may, or a v that never
+    acted.
+    """
     resolution = resolution_of(y)
-    if resolution == 0.0 or not solution.m > 0.0 or fit.gap_spread > 0.0:
+    if resolution == 0.0 or not result.solution.m > 0.0 or result.fit.gap_spread > 0.0:
         return result
-    known = solution.posterior
+    of_values = result
+    for _ in range(RELABELLINGS):
+        result = yield from _as_intervals(v, y, result, resolution, pace)
+        fit, solution, decided = result
+        error = moved_error(fit, solution)
+        if error is fit.around.error or fit.samples.rounding is None:
+            break
+        # As intervals the readings tell another G than as values.
+        around, start = fit.around._replace(error=error), result.beginning(v)
+        result = yield from labelled(v, y, around, start, solution.m, pace)
+        result = result._replace(decided=decided)
+    explains = result.solution.rms <= AS_GOOD * of_values.solution.rms
+    return result if explains else of_values
+
+
+def _as_intervals(
+    v: Array, y: Array, result: Fitted, resolution: float, pace: Pace,
+) -> Generator[None, None, Fitted]:
+    """The fit by intervals around the G of a fit by values."""
+    fit, known = result.fit, result.solution.posterior
     problem = _Unknowns(fit, y, known, resolution, pace)
     most = MOST_NOISE * resolution
     z, _, noise_std = yield from climbed(problem, problem.start, most, LEAST_NOISE * resolution)
     if noise_std == most:
         return result
-    rounding = Rounding(resolution, noise_std, known.noise_std)
+    rounding, fit = Rounding(resolution, noise_std, known.noise_std), fit.emptied()
     for _ in range(RELABELLINGS):
         most_likely = replace(known, mean=problem.unknowns(z))
         yield from _read(fit, problem, y, rounding, most_likely, pace)
         result = Fitted(fit, fit.solve(), result.decided)
-        solution, start = result.solution, result.beginning(v)
-        if not solution.m > 0.0:
-            break
-        error = moved_error(fit, solution)
-        if error is not fit.around.error:
-            # As intervals they tell another G than as values.
-            around = fit.around._replace(error=error)
-            fit, solution, _ = yield from labelled(v, y, around, start, solution.m, pace)
-            known = solution.posterior
-            problem = _Unknowns(fit, y, known, resolution, pace)
-            z, _, noise_std = yield from climbed(problem, problem.start, most, noise_std)
-            continue
+        solution = result.solution
         # Labels that are closer than this would not be made again either.
-        if abs(solution.gap - fit.start.gap) <= 0.5 * MOVED * solution.std_gap:
+        if not solution.m > 0.0 or (
+            abs(solution.gap - fit.start.gap) <= 0.5 * MOVED * solution.std_gap
+        ):
             break
-        fit = fit.relabelled(start, solution.m)
+        fit = fit.relabelled(result.beginning(v), solution.m)
         problem.rows = yield from _columns(fit, v, y, pace)
         z, _ = yield from climbed_at(problem, z, noise_std)
     return result
