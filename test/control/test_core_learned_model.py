@@ -156,3 +156,24 @@ def test_samples_wait_while_there_is_no_time_for_a_fit() -> None:
     loop.controller.refine = lambda budget_s=nan: None  # type: ignore[method-assign]
     loop.run(100)
     assert law(loop).waiting >= 99 + few
+
+
+@pytest.mark.parametrize('waveform', ['triangle', 'multisine'])
+def test_a_design_may_change_only_while_no_crossing_of_the_gap_is_ahead(waveform: str) -> None:
+    loop = build_closed_loop(MOTOR.replaced({
+        'structure': 'tracking', 'waveform': waveform, 'estimator.law': 'fixed', 'fixed.doubt': 0.0,
+        'plant.uncertainty': 0.0,
+        **{f'estimator.initial.{name}': MOTOR[f'backlash.{name}'] for name in ('m', 'c_r', 'c_l')},
+    }))
+    allowed: set[int] = set()
+
+    def note(k: int) -> None:
+        if loop.controller.structure.may_change:
+            allowed.add(k)
+
+    v = loop.run(1200, note).column('v')
+    jumps = np.flatnonzero(np.abs(np.diff(v, prepend=0.0)) > 0.3)  # the gap is wider
+    ahead = {k - before for k in jumps.tolist() for before in range(5)}
+    assert len(jumps) > 4
+    assert len(allowed) > 20
+    assert not ahead & allowed

@@ -30,6 +30,7 @@ from backlash_ros.core.control.tracking.design import (
 from backlash_ros.core.control.tracking.reference_window import ReferenceWindow
 from backlash_ros.core.control.tracking.rest import OFF, TOLERANCE, Mode, Rest
 from backlash_ros.core.estimation.protocol import Estimate, StateSource, Status
+from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -44,6 +45,7 @@ TRUSTED_AFTER = 40
 # has crossed the gap with it; samples since the end of a crossing between which its last moves are
 # over and the next one is not yet to be expected; samples without any after which none is.
 SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, (5, 20), 200
+FORESEEN = 6  # samples in which u* is not to turn after another design has taken over
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
 
@@ -93,6 +95,7 @@ class Tracking:
         self._trusted_for, self._sharp_counts = 0, SHARP_COUNTS  # samples
         self._in_use_for = 0  # samples since an estimate is known
         self._engaged_for = 0  # samples since v has crossed the gap
+        self._side = Region.GAP  # that is engaged
         self._level = self._free = 0  # in the schedule, while v does not follow; samples since
         self._scheduled = 0  # place of the gain in use
         self._u_d = 0.0  # of the sample before
@@ -111,7 +114,19 @@ class Tracking:
         since, (first, last) = self._engaged_for, ENGAGED_SINCE
         return self._in_use_for >= SETTLED_AFTER and (
             first <= since <= last or since >= NO_CROSSING
-        )
+        ) and not self._turns_soon()
+
+    def _turns_soon(self) -> bool:
+        """Whether u* is about to turn, as far as the references that are known say."""
+        window, x, before = self._references.window, self._x, self._ideal
+        for _ in range(FORESEEN):
+            window = np.append(window[1:], window[-1])
+            ideal, x = self._trajectory(x, window)
+            onto = Region.RIGHT if ideal > before else Region.LEFT
+            if ideal != before and onto is not self._side:
+                return True
+            before = ideal
+        return False
 
     def _use(self, chosen: TrackingDesign) -> None:
         model, gains, feedback = chosen.model, chosen.gains, chosen.feedback.gain
@@ -142,7 +157,7 @@ class Tracking:
         if state_known:
             self._trusted_for, self._width = other._trusted_for, other._width
             self._in_use_for, self._engaged_for = other._in_use_for, other._engaged_for
-            self._asked, self._known = other._asked, other._known
+            self._asked, self._known, self._side = other._asked, other._known, other._side
             self._resumes, self._blind_for = other._resumes, other._blind_for
             self._slope = other._slope
         else:
@@ -212,7 +227,8 @@ class Tracking:
         self._ideal, self._x, self._u_d = ideal, onward, u_d
         side = inverse.side
         v = inverse.step(u_d, self._slope, *crossings)
-        crosses = inverse.taking_up or inverse.side is not side
+        self._side = inverse.side
+        crosses = inverse.taking_up or self._side is not side
         self._engaged_for = 0 if crosses else self._engaged_for + 1
         if gains.integral:
             self._integrate(window.item(0), inputs.y, x[0], trusted, bounded or inverse.limited)
