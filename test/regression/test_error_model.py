@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -65,6 +67,7 @@ def test_a_moved_model_knows_where_the_told_one_is(name: str, data: st.DataObjec
     xi = np.array(data.draw(
         st.lists(st.floats(-1.0, 1.0), min_size=error.count, max_size=error.count)
     ))
+    xi[0] = abs(xi[0]) / error.spread[0, 0]  # a lag of up to a sample
     moved = error.moved(xi)
     assert moved.told == pytest.approx(-xi)
     back = moved.low_order(moved.told)
@@ -77,22 +80,29 @@ def test_a_moved_model_knows_where_the_told_one_is(name: str, data: st.DataObjec
 
 
 @pytest.mark.parametrize('name', sorted(MODELS))
-@pytest.mark.parametrize('samples', [1.7, 2.0])
+@pytest.mark.parametrize('samples', [0.9, 1.7, 2.0])
 def test_a_delay_moves_the_model_by_whole_samples(name: str, samples: float) -> None:
     error = error_around(MODELS[name])
     xi = np.zeros(error.count)
-    xi[0] = samples / (error.spread[0, 0])
+    xi[0] = samples / error.spread[0, 0]
     moved = error.delayed(xi)
     model = moved.model.transfer_function
+    assert moved.later == round(samples)
     assert model.response(Z) == pytest.approx(MODELS[name].response(Z) * Z ** -moved.later)
-    # It is the same unknown G, seen from another one.
-    seen, before = (
-        one.low_order(one.told + xi) for one in (moved, error)
-    )
-    assert seen is not None
-    assert before is not None
-    assert moved.later in {1, 2}
-    assert error.delayed(0.5 * xi) is error
+    assert error.delayed(0.7 / samples * xi) is error
+
+
+def test_what_acts_up_to_a_sample_late_has_a_lag_from_0_to_1() -> None:
+    error = error_around(resonance())
+    xi = np.zeros(error.count)
+    for lag, later in ((0.95, 0), (1.05, 0), (1.5, 1), (2.05, 2), (-0.05, 0)):
+        xi[0] = lag / error.spread[0, 0]
+        moved = error.moved(xi)
+        assert moved.later == later
+        # It is the same G, however it is told.
+        assert off(moved.model.transfer_function, altered_plant(
+            resonance(), Alteration(lag=later)
+        )) == pytest.approx(abs(lag - later) * abs(1.0 - 1.0 / Z[2]), rel=1e-6)
 
 
 @pytest.mark.parametrize('late', [0.1, 0.5, 0.9])
@@ -152,13 +162,13 @@ def test_the_likelier_model_is_taken_up_once() -> None:
     assert likelier(result.fit, result.solution, learned) is learned
     # By less than chance it is no other one.
     same = fit_of(resonance(), around(error))
-    known = as_told(error.model, error.count)._replace(cov=1e-12 * np.eye(error.count))
+    known = as_told(error.model, error.count)._replace(log_det=-inf)
     assert likelier(same.fit, same.solution, known) is known
 
 
 def test_a_record_that_tells_less_has_to_contradict() -> None:
     error = error_around(resonance())
-    sure = as_told(error.model, error.count)._replace(cov=1e-12 * np.eye(error.count))
+    sure = as_told(error.model, error.count)._replace(log_det=-inf)
     near = fit_of(resonance(5.0003), around(error))
     assert likelier(near.fit, near.solution, sure) is sure
     far = fit_of(resonance(5.2), around(error))

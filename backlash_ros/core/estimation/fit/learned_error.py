@@ -79,16 +79,21 @@ def _tells_more(fit: WindowFit, solution: Solution) -> bool:
 
 
 class Learned(NamedTuple):
-    """A G of low order, and its xi beside the one that was told: mean (K,), covariance (K, K)."""
+    """A G of low order, and its xi beside the one that was told: mean (K,), covariance (K, K).
+
+    log_det: of that covariance, were the noise and what nothing explains 1; inf as long as nothing
+    was learned.
+    """
 
     model: StateModel
     xi: Array
     cov: Array
+    log_det: float
 
 
 def as_told(model: StateModel, count: int) -> Learned:
-    """The G that was told, its `count` xi known as well as their prior says."""
-    return Learned(model, np.zeros(count), np.eye(count))
+    """The G that was told, with `count` xi."""
+    return Learned(model, np.zeros(count), np.zeros((count, count)), inf)
 
 
 def likelier(fit: WindowFit, solution: Solution, present: Learned) -> Learned:
@@ -97,20 +102,24 @@ def likelier(fit: WindowFit, solution: Solution, present: Learned) -> Learned:
     A record that tells less of G than the one before has to contradict it: by more than chance, and
     than the errors of a sensor that come again with the motion.
     """
-    error = fit.around.error
+    layout, error = fit.layout, fit.around.error
     if not solution.m > 0.0 or not error.count:
         return present
     xi, cov = error_of(fit, solution)
     if not cov.any():
         return present  # without doubt as told
     apart = xi - error.told - present.xi
-    if np.linalg.slogdet(cov)[1] < np.linalg.slogdet(present.cov)[1]:
+    part = slice(layout.base, layout.base + layout.errors)
+    log_det = float(np.linalg.slogdet(solution.posterior.cov[part, part] / solution.m**2)[1])
+    if log_det < present.log_det:
         another = 0.5 * float(apart @ np.linalg.solve(cov, apart)) > WORTH_A_DESIGN
     else:
         left = hypot(1.0, _shows(fit, solution, apart) / sqrt(solution.count))
         another = left > AS_GOOD and beyond_chance(apart, cov + present.cov)
     model = low_order(fit, solution) if another else fit.model
-    return present if model is fit.model else Learned(model, xi - error.told, cov)
+    if model is fit.model:
+        return present
+    return Learned(model, xi - error.told, cov, log_det)
 
 
 def low_order(fit: WindowFit, solution: Solution) -> StateModel:

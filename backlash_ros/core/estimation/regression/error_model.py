@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
-from math import log
+from math import floor, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,8 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 Array = NDArray[np.float64]
 
 FURTHEST = log(2.0)  # logarithm of a time constant that is moved by at once, at most
-BEYOND = 0.25  # samples by which a lag may leave those between 0 and 1 before G moves by one
+ALMOST_ONE = 0.75  # samples of lag from which on it is one of the delay
+BEYOND = 0.1  # samples by which the lag of a moved G may be less than 0, or more than 1
 WIDEST = 0.125  # of what acts a part of a sample late, t (1 - t) / 2
 TAPS = 2  # unknowns of the numerator: lag and width
 MOST_LATE = 2  # samples of delay that G moves by at once, at most
@@ -93,7 +94,7 @@ class ErrorModel:
         """The same prior around the G at xi (K,).
 
         But its poles no further than first order holds, and where some would leave the unit circle
-        all go half as far.
+        all go half as far. What acts up to a sample late has a lag from 0 to 1.
         """
         told = self.told[TAPS:]
         share = min(FURTHEST / max(self._places.distance(xi[TAPS:]), FURTHEST), 1.0)
@@ -101,22 +102,20 @@ class ErrorModel:
         while denominator is None:
             share *= 0.5
             denominator = self._places.denominator(share * xi[TAPS:] - told)
-        return self._around(denominator, self.later, share * xi)
+        lag, _ = self._taps_at(share * xi)
+        late = 0 if abs(lag - 0.5) <= 0.5 + BEYOND else floor(lag)
+        return self._around(denominator, self.later + max(late, 1 - self.delay), share * xi)
 
     def delayed(self, xi: Array) -> ErrorModel:
-        """The same with whole samples of delay more or less, where the lag at xi (K,) wants it.
-
-        G with a delay holds all that act up to a sample later.
-        """
-        beyond = self._taps_at(xi)[0] - 0.5
-        if abs(beyond) < 0.5 + BEYOND:
-            return self
-        later = max(min(round(beyond), MOST_LATE), -MOST_LATE, 1 - self.delay)
-        if later == 0:
+        """The same with whole samples of delay more or less, where the lag at xi (K,) is one."""
+        lag = float(self._of_taps[0] * xi[0])
+        late = 0 if abs(lag) < ALMOST_ONE else max(min(round(lag), MOST_LATE), -MOST_LATE)
+        late = max(late, 1 - self.delay)
+        if late == 0:
             return self
         apart = np.zeros(self.count)
-        apart[0] = later / self._of_taps[0]
-        return self._around(self.stable, self.later + later, apart)
+        apart[0] = late / self._of_taps[0]
+        return self._around(self.stable, self.later + late, apart)
 
     @property
     def delay(self) -> int:
