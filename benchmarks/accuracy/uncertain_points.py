@@ -38,6 +38,7 @@ FAR_ERROR = 0.01
 FOLLOWING = {'median': 1.05, 'worst': 1.25}  # times the loop that is given everything
 MOVING = 0.05  # share of the samples in which v may move at rest
 NOISE_FACTORS, NOISE_RMSE = (0.1, 0.3, 3.0, 10.0), 1.15
+FEWEST_SEEDS = 100  # of an RMSE: of twelve, a ratio of two of them is uncertain by a fifth
 PAPER_NOISE, QUIET_NOISE = 1e-3, 1e-4
 WRONG_S = 1.0
 CASE_HEADER = (
@@ -175,15 +176,19 @@ class Benchmark:
             ]
         return Outcome(checks)
 
+    @property
+    def _seeds_of_rmse(self) -> Sequence[int]:
+        return range(self.seeds[0], self.seeds[0] + max(len(self.seeds), FEWEST_SEEDS))
+
     def _motor_noise(self, factor: float) -> list[Job]:
-        jobs = motor_jobs({EXACT: {}}, self.seeds, 6.0)
+        jobs = motor_jobs({EXACT: {}}, self._seeds_of_rmse, 6.0)
         return [_told(job, factor) for job in jobs]
 
     def _paper_noise(self, factor: float) -> list[Job]:
         base = effective_parameters(None).replaced({'output_noise_std': PAPER_NOISE})
         return [
             _told(Job('paper', seed, base.replaced({'seed': seed}), 601), factor)
-            for seed in self.seeds
+            for seed in self._seeds_of_rmse
         ]
 
     def other_physics(self) -> Outcome:
