@@ -20,8 +20,9 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-TINY = 1e-300  # deviation of no noise
 WORTH_A_DESIGN = 1.0  # log-likelihood by which another G has to be likelier at least
+# --- guards
+TINY = 1e-300  # deviation of the noise where there is none
 
 
 def error_of(fit: WindowFit, solution: Solution) -> tuple[Array, Array]:
