@@ -27,8 +27,7 @@ TINY = 1e-300  # deviation of the noise where there is none
 
 def error_of(fit: WindowFit, solution: Solution) -> tuple[Array, Array]:
     """xi of the true G, beside the G of the fit: mean (K,) and covariance (K, K). For m > 0."""
-    part = slice(fit.layout.base, fit.layout.base + fit.layout.errors)
-    posterior, m = solution.posterior, solution.m
+    part, posterior, m = fit.layout.error, solution.posterior, solution.m
     noise = posterior.noise_std / m  # whose square is a number, unlike that of any m
     cov = posterior.cov[part, part] * (noise * noise * solution.inflation)
     return fit.around.error.told + posterior.mean[part] / m, cov
@@ -36,19 +35,18 @@ def error_of(fit: WindowFit, solution: Solution) -> tuple[Array, Array]:
 
 def strayed(fit: WindowFit, solution: Solution) -> bool:
     """Whether the samples tell poles of G for which first order around the fit is not enough."""
-    return _tells_more(fit, solution) and _beyond_first_order(fit, solution)
+    xi = _told_by_samples(fit, solution)
+    return xi is not None and _beyond_first_order(fit, solution, xi)
 
 
-def _beyond_first_order(fit: WindowFit, solution: Solution) -> bool:
-    xi, _ = error_of(fit, solution)
+def _beyond_first_order(fit: WindowFit, solution: Solution, xi: Array) -> bool:
     poles = fit.around.error.uncertainty * float(np.abs(xi[TAPS:]).max(initial=0.0))
     return poles * _shows(fit, solution, xi) > LINEAR
 
 
 def _shows(fit: WindowFit, solution: Solution, xi: Array) -> float:
     """Norm of what xi (K,) makes of all outputs, in deviations of the noise."""
-    columns = slice(fit.layout.base, fit.layout.base + fit.layout.errors)
-    moved = fit.samples.triangle.r[:-1, columns] @ (xi * solution.m)
+    moved = fit.samples.triangle.r[:-1, fit.layout.error] @ (xi * solution.m)
     return float(np.linalg.norm(moved)) / max(solution.posterior.noise_std, TINY)
 
 
@@ -57,26 +55,26 @@ def moved_error(fit: WindowFit, solution: Solution, share: float = 1.0) -> Error
 
     share: of the way to its poles.
     """
-    error = fit.around.error
-    if not _tells_more(fit, solution):
+    error, xi = fit.around.error, _told_by_samples(fit, solution)
+    if xi is None:
         return error
-    xi, _ = error_of(fit, solution)
     # Poles are looked for around the right delay: slower ones may pass for it.
     later = error.delayed(xi) if share == 1.0 else error
-    if later is not error or not _beyond_first_order(fit, solution):
+    if later is not error or not _beyond_first_order(fit, solution, xi):
         return later
     return error.moved(share * xi)
 
 
-def _tells_more(fit: WindowFit, solution: Solution) -> bool:
-    """Whether the samples tell another G than that of the fit, beside what no G explains.
+def _told_by_samples(fit: WindowFit, solution: Solution) -> Array | None:
+    """xi (K,) where the samples tell another G than that of the fit, beside what no G explains.
 
     One that was identified with the backlash stays: it is that of this very motion.
     """
     if not fit.layout.errors or fit.around.inherited or not solution.m > 0.0:
-        return False
+        return None
     xi, cov = error_of(fit, solution)
-    return bool(xi.any()) and float(xi @ np.linalg.solve(cov, xi)) > 2.0 * len(xi)
+    tells = bool(xi.any()) and float(xi @ np.linalg.solve(cov, xi)) > 2.0 * len(xi)
+    return xi if tells else None
 
 
 class Learned(NamedTuple):
@@ -110,7 +108,7 @@ def likelier(fit: WindowFit, solution: Solution, present: Learned) -> Learned:
     if not cov.any():
         return present  # without doubt as told
     apart = xi - error.told - present.xi
-    part = slice(layout.base, layout.base + layout.errors)
+    part = layout.error
     log_det = float(np.linalg.slogdet(solution.posterior.cov[part, part] / solution.m**2)[1])
     if log_det < present.log_det:
         another = 0.5 * float(apart @ np.linalg.solve(cov, apart)) > WORTH_A_DESIGN
@@ -151,7 +149,7 @@ def response_std(
     """
     layout, posterior = fit.layout, solution.posterior
     error, m = fit.around.error, solution.m
-    part = slice(layout.base, layout.base + layout.errors)
+    part = layout.error
     by: NDArray[np.complex128] = np.zeros((len(z), layout.unknowns), dtype=np.complex128)
     responses = error.responses(z)
     if m != 0.0:
@@ -173,6 +171,6 @@ def plausible(fit: WindowFit, solution: Solution) -> bool:
     layout, most = fit.layout, fit.around.most
     if layout.errors == 0 or most == inf:
         return True
-    error = solution.posterior.mean[layout.base:layout.base + layout.errors]
+    error = solution.posterior.mean[layout.error]
     size = float(error @ error) / (most * solution.m) ** 2 if most > 0.0 else 0.0
     return size <= BY_CHANCE**2 * layout.errors

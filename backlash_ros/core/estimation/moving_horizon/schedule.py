@@ -27,7 +27,7 @@ def next_task(learning: Learning, estimate: Estimate) -> Task | None:
     length, contradicted = fit.length, learning.contradicted_from is not None
     fewest, most = BLOCK
     wanted = fewest if contradicted else min(max(length // BLOCK_SHARE, fewest), most)
-    if len(record) - length >= wanted:
+    if learning.waiting >= wanted:
         return take_block(learning)
     if contradicted:
         return reconsider(learning, estimate) if record.end >= learning.next_try else None

@@ -79,9 +79,7 @@ class ErrorModel:
     def _follow(self) -> None:
         """Set what follows from A and what was told."""
         self.gain = float(self.stable.sum())
-        self.b = self._told_b * (self.gain / self._told_gain)
-        shorter = np.atleast_1d(np.poly([-1.0] * max(len(self.b) - 2, 0)))
-        self.wide = np.convolve(shorter * float(self.b.sum() / shorter.sum()), (1.0, -1.0))
+        self.b, self.wide = self._numerators(self.gain)
         self.spread = np.zeros((TAPS + self.taps, self.count))
         if self.count:
             self.spread[:TAPS, :TAPS] = np.diag(self._of_taps)
@@ -89,6 +87,13 @@ class ErrorModel:
                 # d ln(A(1)/A) has a zero at z = 1, which is divided out.
                 numerator = self.stable * (float(slope.sum()) / self.gain) - slope
                 self.spread[TAPS:, column] = np.cumsum(numerator)[:-1] / self.gain
+
+    def _numerators(self, gain: float) -> tuple[Array, Array]:
+        """b and (1 - z^-1) B for A(1)."""
+        b = self._told_b * (gain / self._told_gain)
+        shorter = np.atleast_1d(np.poly([-1.0] * max(len(b) - 2, 0)))
+        wide = np.convolve(shorter * float(b.sum() / shorter.sum()), (1.0, -1.0))
+        return b, np.asarray(wide, dtype=np.float64)
 
     def moved(self, xi: Array) -> ErrorModel:
         """The same prior around the G at xi (K,).
@@ -133,7 +138,8 @@ class ErrorModel:
         other.stable, other.later = denominator, later
         other.told = self.told - apart
         other._follow()
-        other.model = StateModel(other._transfer_function(*other._taps_at(np.zeros(self.count))))
+        taps = other._taps_at(np.zeros(self.count))
+        other.model = StateModel(other._transfer_function(denominator, *taps))
         return other
 
     def low_order(self, xi: Array) -> TransferFunction | None:
@@ -141,19 +147,17 @@ class ErrorModel:
         denominator = self._places.denominator(xi[TAPS:] - self.told[TAPS:])
         if denominator is None:
             return None
-        other = copy(self)
-        other.stable, other.told = denominator, self.told - xi
-        other._follow()
-        return other._transfer_function(*self._taps_at(xi))
+        return self._transfer_function(denominator, *self._taps_at(xi))
 
-    def _transfer_function(self, lag: float, width: float) -> TransferFunction:
-        """G with this lag and width."""
-        b = self.b
+    def _transfer_function(self, stable: Array, lag: float, width: float) -> TransferFunction:
+        """G with these moving poles, this lag and this width."""
+        b: Array
+        b, wide = self._numerators(float(stable.sum()))
         if lag or width:
-            b = np.convolve(b, (1.0 - lag, lag))
-            wide = width * np.convolve(self.wide, (1.0, -1.0))
-            b = np.pad(b, (0, len(wide) - len(b))) + wide
-        a = np.convolve(self.stable, self._integrate)
+            late = np.convolve(b, (1.0 - lag, lag))
+            wider = width * np.convolve(wide, (1.0, -1.0))
+            b = np.pad(late, (0, len(wider) - len(late))) + wider
+        a = np.convolve(stable, self._integrate)
         order = max(len(a) - 1, self.delay + len(b) - 1)
         numerator, denominator = np.zeros(order + 1), np.zeros(order + 1)
         numerator[self.delay:self.delay + len(b)], denominator[:len(a)] = b, a

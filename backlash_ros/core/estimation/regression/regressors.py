@@ -84,6 +84,11 @@ class Layout:
         return slice(self.n + 1, self.n + 4)
 
     @cached_property
+    def error(self) -> slice:
+        """m xi, but not those of the first jump."""
+        return slice(self.base, self.base + self.errors)
+
+    @cached_property
     def unknowns(self) -> int:
         """Number p of all unknowns."""
         return self.base + self.errors * (2 if self.jump else 1)
