@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from math import inf
 from typing import TypeVar
 
 T = TypeVar('T')
 
-LARGEST, SMALLEST = 40_000, 400  # samples times alternatives in one piece
-LONG, SHORT = 0.5, 0.1  # shares of the time beyond which a piece is made smaller, or larger
+# Samples times alternatives in one piece: up to what a cache holds, down to where calls take as long
+# as their work.
+LARGEST, SMALLEST = 40_000, 4_000
+LONG = 0.5  # share of the time beyond which a piece is made smaller
 
 
 class Pace:
@@ -17,16 +18,24 @@ class Pace:
 
     def __init__(self) -> None:
         self.size = LARGEST
+        self._asked = False  # whether the piece that is under way depends on it
 
     def note(self, took_s: float, budget_s: float) -> None:
-        """Take in how long a piece took, and how long all of them may take between two samples."""
-        if budget_s == inf or took_s < SHORT * budget_s:
-            self.size = min(2 * self.size, LARGEST)
-        elif took_s > LONG * budget_s:
+        """Take in how long a piece took, and how long all of them may take between two samples.
+
+        took_s: of processor time. A piece that was held up by others would be no faster if smaller.
+        """
+        asked, self._asked = self._asked, False
+        if not asked:
+            return
+        if took_s > LONG * budget_s:
             self.size = max(self.size // 2, SMALLEST)
+        elif 2.0 * took_s < LONG * budget_s:
+            self.size = min(2 * self.size, LARGEST)
 
     def pieces(self, samples: int) -> int:
         """Alternatives over so many samples that fit into one piece."""
+        self._asked = True
         return max(self.size // max(samples, 1), 1)
 
 

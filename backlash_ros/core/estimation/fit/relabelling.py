@@ -161,8 +161,10 @@ def searched(
     # Those far away only tell whether the choice is clear. With an error of G the evidence is that
     # of the best error for each gap: too flat to tell.
     tells = around.error.count == 0
-    fits = []
+    fits: list[Fitted] = []
     for candidate in _apart(found.candidates, FAR_CANDIDATES if tells else 0):
+        if any(candidate.beside(fit.solution.gap) for fit in fits):
+            continue
         start = Start(candidate.gap, candidate.start)
         fits.append((yield from fitted(v, y, around, start, candidate.m, pace)))
     best = most_likely(fits[:CANDIDATES])

@@ -71,7 +71,7 @@ def halve(learning: Learning) -> Task:
     half = fit.length // 2
     if half < RECOVERED:
         return False
-    v, y = record.since(record.first)
+    v, y = learning.taken_since(record.first)
     around = learning.unchanged
     start = fit.start_after(v[:half]).with_gap(solution.gap, v[half:])
     newer = yield from fitted(v[half:], y[half:], around, start, solution.m, pace)

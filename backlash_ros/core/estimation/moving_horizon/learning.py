@@ -141,6 +141,15 @@ class Learning:
         """Largest gap that the bounds allow."""
         return self.bounds.c_r[1] - self.bounds.c_l[0]
 
+    def taken_since(self, number: int) -> tuple[Array, Array]:
+        """v and y of the samples from this number on that the fit has taken in.
+
+        Those that wait have not been compared with it yet, and may contradict it.
+        """
+        v, y = self.record.since(number)
+        count = len(v) - self.waiting
+        return v[:count], y[:count]
+
     @property
     def waiting(self) -> int:
         """Samples of the record that no fit has taken in yet."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import hypot, inf, nan
-from time import perf_counter
+from time import perf_counter, thread_time
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,7 @@ class MovingHorizon:
         self._learning.begin_acquisition(initial if initial.learned else None)
         self._following = StateFollowing(model, observer)
         self._task: Task | None = None
+        self._idle_until = 0  # number of the sample before which no task is due
         self._adapting = True
         self._paused = False  # whether samples are left out, as nothing moves
         self._coasts = False
@@ -218,6 +219,7 @@ class MovingHorizon:
         learning = self._learning
         learning.told_walk, learning.drift = walk_std, drift_std
         learning.around = learning.around._replace(told_std=max(noise_std, SMALLEST_NOISE))
+        self._idle_until = 0
 
     # --- at every sample ------------------------------------------------------------------------
 
@@ -254,7 +256,7 @@ class MovingHorizon:
         return True
 
     def _restart_record(self) -> None:
-        self._task = None
+        self._task, self._idle_until = None, 0
         try:
             self._learning.restart(self._following.start_of(self.estimate))
         except np.linalg.LinAlgError:
@@ -283,6 +285,7 @@ class MovingHorizon:
         """Go on with the fit, in pieces, until nothing is left to do or the time is over."""
         timed = budget_s < inf
         begun = before = perf_counter() if timed else 0.0
+        used = thread_time() if timed else 0.0
         task = self._due_task()
         if task is None:
             return
@@ -292,12 +295,12 @@ class MovingHorizon:
                 try:
                     self._go_on(task)
                 except np.linalg.LinAlgError:
-                    self._task = None
+                    self._task, self._idle_until = None, 0
                     self._search_afresh()
                     return
                 if timed:
-                    now = perf_counter()
-                    self._learning.pace.note(now - before, budget_s)
+                    now, used_before, used = perf_counter(), used, thread_time()
+                    self._learning.pace.note(used - used_before, budget_s)
                     # Another piece that takes as long must fit in as well.
                     if 2.0 * now - before - begun > budget_s:
                         return
@@ -306,16 +309,22 @@ class MovingHorizon:
 
     def _due_task(self) -> Task | None:
         """The task that is under way, or the next one."""
-        if self._task is None and self._adapting:
-            self._task = next_task(self._learning, self.estimate)
-        return self._task
+        if self._task is not None or not self._adapting \
+                or self._learning.record.end < self._idle_until:
+            return self._task
+        found = next_task(self._learning, self.estimate)
+        if isinstance(found, int):
+            self._idle_until = found
+            return None
+        self._task = found
+        return found
 
     def _go_on(self, task: Task) -> None:
         """Do another piece of the task, and publish what it leaves at its end."""
         try:
             next(task)
         except StopIteration as done:
-            self._task = None
+            self._task, self._idle_until = None, 0
             if done.value:
                 self._publish()
             self._note_coasting()

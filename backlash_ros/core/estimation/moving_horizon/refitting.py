@@ -84,7 +84,7 @@ def refit(learning: Learning) -> Task:
     current = learning.fit
     yield from _attribute(learning, current)
     around, start, first = yield from _shortened(learning, current)
-    v, y = learning.record.since(first)
+    v, y = learning.taken_since(first)
     start = start.with_gap(current.solution.gap, v)
     result = yield from fitted(v, y, around, start, current.solution.m, learning.pace)
     result = yield from with_walk(v, y, result, learning.pace)
@@ -119,13 +119,13 @@ def _shortened(
         if around.error.count:
             # Where the play began costs as many unknowns as the error of G has. What that did
             # has to die out as well.
-            v, _ = record.since(record.first)
+            v, _ = learning.taken_since(record.first)
             gone = fit.start.forgotten_after(v) + PAST * around.model.memory
             if gone <= BEGINNING * len(v):
                 return around, fit.start_after(v[:gone]), record.first + gone
         return around, fit.start, record.first
     gone = LONGEST // 3
-    v, y = record.since(record.first)
+    v, y = learning.taken_since(record.first)
     prior: Prior | None = None
     if around.inherited or (around.error.count == 0 and solution.correlation == 0.0):
         part = yield from fitted(v[:gone], y[:gone], around, fit.start, solution.m, learning.pace)

@@ -18,24 +18,31 @@ from backlash_ros.core.estimation.moving_horizon.refitting import refit, take_bl
 from backlash_ros.core.estimation.protocol import Estimate
 
 
-def next_task(learning: Learning, estimate: Estimate) -> Task | None:
-    """What is to be done next; None while nothing is. estimate: the published one."""
-    record, current = learning.record, learning.current
+def next_task(learning: Learning, estimate: Estimate) -> Task | int:
+    """What is to be done next, or the number of the sample before which nothing is.
+
+    estimate: the published one.
+    """
+    end, current = learning.record.end, learning.current
     if current is None:
-        return acquire(learning) if record.end >= learning.acquisition.next_at else None
+        next_at = learning.acquisition.next_at
+        return acquire(learning) if end >= next_at else next_at
     fit, solution, _ = current
     length, contradicted = fit.length, learning.contradicted_from is not None
     fewest, most = BLOCK
     wanted = fewest if contradicted else min(max(length // BLOCK_SHARE, fewest), most)
-    if learning.waiting >= wanted:
+    next_block = end - learning.waiting + wanted
+    if end >= next_block:
         return take_block(learning)
+    next_try = min(learning.next_try, next_block)
     if contradicted:
-        return reconsider(learning, estimate) if record.end >= learning.next_try else None
+        return reconsider(learning, estimate) if end >= next_try else next_try
     if length >= learning.refit_at or (length >= learning.moved_at and learning.strayed):
         return refit(learning)
-    aged = solution.correlation > 0.0 or learning.drifts_more(solution, length)
-    if not aged or record.end < learning.next_try:
-        return None
+    if not (solution.correlation > 0.0 or learning.drifts_more(solution, length)):
+        return next_block
+    if end < next_try:
+        return next_try
     # What contradicts may be a G that went astray: the plant has changed only where the best fit
     # of all says so.
     learning.refitted = bool(learning.around.error.count) and not learning.refitted
