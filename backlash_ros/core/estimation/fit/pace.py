@@ -7,8 +7,7 @@ from typing import TypeVar
 
 T = TypeVar('T')
 
-# Samples times alternatives in one piece: up to what a cache holds, down to where calls take as long
-# as their work.
+# Samples times alternatives in one piece: what a cache holds, and where calls take as long as work.
 LARGEST, SMALLEST = 40_000, 4_000
 LONG = 0.5  # share of the time beyond which a piece is made smaller
 

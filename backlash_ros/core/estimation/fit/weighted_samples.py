@@ -27,6 +27,7 @@ class WeightedSamples:
         self.length = 0
         self._rows: Array = np.empty((0, len(vague)))
         self._y: Array = np.empty(0)
+        self._weights: Array = np.empty(0)  # roots, by which rows and y are multiplied
 
     @property
     def rows(self) -> Array:
@@ -38,7 +39,7 @@ class WeightedSamples:
         known = np.isfinite(y)
         weight = weights * known
         root = np.sqrt(weight)
-        self._append(rows * root[:, None], np.where(known, y, 0.0) * root, weight.sum())
+        self._append(rows, np.where(known, y, 0.0), root, weight.sum())
 
     def begin_rounded(self, rounding: Rounding) -> None:
         """Begin again with all samples, to be taken in for the intervals that they tell."""
@@ -61,14 +62,16 @@ class WeightedSamples:
         # In units in which the noise is that of all readings, each tells as much as on average.
         root = sqrt(rounding.information) * rounding.together
         target = np.where(known, expected + said.score / information, 0.0)
-        self._append(rows * (root * known)[:, None], target * root, np.count_nonzero(known))
+        self._append(rows, target, root * known, np.count_nonzero(known))
         self.triangle.hold_noise(rounding.together)
 
-    def _append(self, rows: Array, y: Array, count: float) -> None:
+    def _append(self, rows: Array, y: Array, weights: Array, count: float) -> None:
         first, last = self.length, self.length + len(y)
         if last > len(self._y):
             self._grow(last)
+        rows, y = rows * weights[:, None], y * weights
         self._rows[first:last], self._y[first:last] = rows, y
+        self._weights[first:last] = weights
         self.triangle.append(rows, y, float(count))
         self.length = last
 
@@ -76,9 +79,17 @@ class WeightedSamples:
         """Make room for more samples than now, twice as many as there are."""
         more = max(2 * len(self._y), least) - len(self._y)
         self._rows = np.concatenate([self._rows, np.empty((more, len(self._vague)))])
-        self._y = np.concatenate([self._y, np.empty(more)])
+        self._y, self._weights = (
+            np.concatenate([values, np.empty(more)]) for values in (self._y, self._weights)
+        )
 
     def residual(self, posterior: Posterior, since: int = 0) -> Array:
         """Weighted y minus its fit from sample `since` on; 0 where y was lost."""
         rows, y = self._rows[since:self.length], self._y[since:self.length]
         return np.asarray(y - rows @ posterior.mean)
+
+    def unexplained(self, posterior: Posterior) -> Array:
+        """The same of all samples, in the unit of y."""
+        weights = self._weights[:self.length]
+        residual = self.residual(posterior)
+        return np.divide(residual, weights, out=np.zeros_like(residual), where=weights > 0.0)

@@ -18,7 +18,8 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.learned_error import low_order, strayed
+from backlash_ros.core.estimation.fit.attribution import attributed
+from backlash_ros.core.estimation.fit.learned_error import strayed
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
@@ -33,8 +34,6 @@ from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import PAST
 from backlash_ros.core.estimation.moving_horizon.change_detection import note_block
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
-from backlash_ros.core.estimation.observer.attribution import attributed
-from backlash_ros.core.estimation.observer.observer import Observer
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.estimation.regression.readings import weights_of
 
@@ -138,17 +137,11 @@ def _shortened(
 
 
 def _attribute(learning: Learning, current: Fitted) -> Generator[None, None, None]:
-    """Let those v have acted over the record that the estimates speak for."""
-    record, found = learning.record, current.solution.crossings
-    others = record.others(record.first)
-    if found is None or np.isnan(others).all():
+    """Let those v have acted over the record that its fit speaks for, and lose its outliers."""
+    record = learning.record
+    others = record.others(record.first)[:current.fit.length]
+    if np.isnan(others).all():
         return
-    model = low_order(current.fit, current.solution)
-    # The observer begins at rest: what it expects says nothing yet.
-    others[:model.memory] = nan
-    v, y = record.since(record.first)
-    chosen = yield from attributed(
-        v, y, others, (current.solution.start, found.gap), found.m, found.m * found.c_r,
-        Observer(model, current.solution.posterior.noise_std), learning.pace.pieces(1),
-    )
-    record.attribute(record.first, chosen)
+    found = yield from attributed(current, *learning.taken_since(record.first), others)
+    record.attribute(record.first, found.v)
+    record.lose(record.first + np.flatnonzero(found.outliers))

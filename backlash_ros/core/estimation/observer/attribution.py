@@ -1,4 +1,4 @@
-"""Which of two commands acted over an interval, where the time of its arrival leaves that open.
+"""Which of two commands acted, as soon as y shows it: the time of arrival may leave that open.
 
 With the other one, u of the interval was another by `change`, and so was the first y that shows it.
 The innovation tells the two apart where that is more than the noise: a likelihood ratio against
@@ -7,17 +7,12 @@ prior odds.
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from math import log
 
 import numpy as np
-from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import ODDS
 from backlash_ros.core.estimation.observer.observer import Observer
-from backlash_ros.core.plant.backlash import clamp
-
-Array = NDArray[np.float64]
 
 LEAST_RATIO = 2.0 * log(ODDS)
 
@@ -72,36 +67,3 @@ class Attribution:
     @property
     def _least(self) -> float:
         return LEAST_RATIO * self._observer.variance
-
-
-def attributed(
-    v: Array, y: Array, other: Array, play: tuple[float, float], slope: float, offset: float,
-    observer: Observer, piece: int,
-) -> Generator[None, None, Array]:
-    """Return v (N,) of a record with every other one (N,), nan where there is none, that acted.
-
-    play: play output before the record, and the gap. slope, offset: u = slope p - offset. Stops
-    after every `piece` samples.
-    """
-    attribution = Attribution(observer)
-    chosen = v.tolist()
-    others = other.tolist()
-    p, gap = play
-    for k, measured in enumerate(y.tolist()):
-        if k % piece == piece - 1:
-            yield
-        value, instead = chosen[k], others[k]
-        now = clamp(p, value, value + gap)
-        there = clamp(p, instead, instead + gap) if instead == instead else now
-        attribution.note(slope * (there - now))
-        expected = observer.predict(slope * now - offset)
-        if measured == measured:
-            innovation = measured - expected
-            explained, found = attribution.judge(innovation)
-            for ago in found:
-                chosen[k - ago] = others[k - ago]
-            if 0 in found:
-                now = there
-            observer.correct(innovation - explained)
-        p = now
-    return np.array(chosen)
