@@ -56,9 +56,9 @@ class Attributed(NamedTuple):
 def attributed(
     result: Fitted, v: Array, y: Array, other: Array,
 ) -> Generator[None, None, Attributed]:
-    """What a fit of v (N,) and y (N,), nan where lost, says of them. Stops between its steps.
+    """What a fit says of v (N,) and y (N,), nan where lost, that it has taken in or refused.
 
-    other: commands that may have acted instead (N,), nan where none may.
+    Stops between its steps. other: commands that may have acted instead (N,), nan where none may.
     """
     now = Attributed(v, np.zeros(len(v), dtype=np.bool_))
     model = low_order(result.fit, result.solution)
@@ -122,7 +122,8 @@ class _Search:
         self._whitening, self._gap, self._p0 = whitening, solution.gap, solution.start
         self._m, self._v, self._other = solution.m, v, other
         self._known = np.isfinite(y)
-        self._residual = fit.samples.unexplained(solution.posterior)
+        residual = fit.samples.unexplained(solution.posterior, y)
+        self._residual = np.where(self._known, residual, 0.0)
         self._told = play(v, self._gap, self._p0)[0]
         self._open: Flags = np.concatenate([np.isfinite(other), self._known])
         self._noise_std = 1.0

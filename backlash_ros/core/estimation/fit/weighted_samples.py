@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 class WeightedSamples:
-    """Rows of the regression and y, weighted, and the triangle of all of them.
+    """Rows of the regression and y, their weights, and the triangle of all of them.
 
     vague: weights of priors of the unknowns (p,) that are no information. rounding: of readings
     that are intervals, None while all are values. length: how many samples.
@@ -31,7 +31,7 @@ class WeightedSamples:
 
     @property
     def rows(self) -> Array:
-        """Weighted rows of the samples so far, shape (N, p)."""
+        """Rows of the samples so far, shape (N, p)."""
         return self._rows[:self.length]
 
     def take(self, rows: Array, y: Array, weights: Array) -> None:
@@ -69,10 +69,9 @@ class WeightedSamples:
         first, last = self.length, self.length + len(y)
         if last > len(self._y):
             self._grow(last)
-        rows, y = rows * weights[:, None], y * weights
         self._rows[first:last], self._y[first:last] = rows, y
         self._weights[first:last] = weights
-        self.triangle.append(rows, y, float(count))
+        self.triangle.append(rows * weights[:, None], y * weights, float(count))
         self.length = last
 
     def _grow(self, least: int) -> None:
@@ -85,11 +84,12 @@ class WeightedSamples:
 
     def residual(self, posterior: Posterior, since: int = 0) -> Array:
         """Weighted y minus its fit from sample `since` on; 0 where y was lost."""
-        rows, y = self._rows[since:self.length], self._y[since:self.length]
-        return np.asarray(y - rows @ posterior.mean)
+        part = slice(since, self.length)
+        left = self._y[part] - self._rows[part] @ posterior.mean
+        return np.asarray(left * self._weights[part])
 
-    def unexplained(self, posterior: Posterior) -> Array:
-        """The same of all samples, in the unit of y."""
-        weights = self._weights[:self.length]
-        residual = self.residual(posterior)
-        return np.divide(residual, weights, out=np.zeros_like(residual), where=weights > 0.0)
+    def unexplained(self, posterior: Posterior, y: Array) -> Array:
+        """The same of all samples without weights. y (N,): of those that do not count."""
+        part = slice(0, self.length)
+        y = np.where(self._weights[part] > 0.0, self._y[part], y)
+        return np.asarray(y - self._rows[part] @ posterior.mean)

@@ -12,11 +12,13 @@ from backlash_ros.core.estimation.constants import (
     AS_GOOD,
     BLOCK,
     MISFIT,
+    OUTLIER_SHARE,
     RECOVERED,
     REPLACING,
     SEARCH_GROWTH,
     SEARCHED,
 )
+from backlash_ros.core.estimation.fit.attribution import attributed
 from backlash_ros.core.estimation.fit.prior import Prior, contradicts
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
@@ -111,6 +113,9 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     bound = AS_GOOD * current.solution.posterior.noise_std
     around, end = learning.unchanged, record.end
     learning.next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
+    late = yield from _by_other_commands(learning, bound)
+    if late is not None:
+        return learning.go_on_from(late, record.first)
     # What is known from elsewhere still holds, unless the plant has changed.
     whole = yield from _best_of_all(learning, learning.around._replace(walk=0.0))
     if whole is not None and whole.solution.rms <= bound \
@@ -157,6 +162,29 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     if end - since > SEARCHED:
         learning.begin_acquisition(estimate)
     return False
+
+
+def _by_other_commands(learning: Learning, bound: float) -> Generator[None, None, Fitted | None]:
+    """The fit of the commands that may have acted instead, where that explains the samples."""
+    record, current, since = learning.record, learning.fit, learning.contradicted_from
+    (v, y), others = learning.taken_since(record.first), record.others(record.first)
+    if since is None or np.isnan(others).all():
+        return None
+    found = yield from attributed(current, v, y, others[:len(v)])
+    newest = slice(since - record.first, None)
+    known = np.count_nonzero(np.isfinite(y[newest]))
+    if np.count_nonzero(found.outliers[newest]) > OUTLIER_SHARE * known:
+        return None
+    y[found.outliers] = np.nan
+    around = learning.around._replace(walk=0.0)
+    start = current.fit.start.with_gap(current.solution.gap, found.v)
+    result = yield from fitted(found.v, y, around, start, current.solution.m, learning.pace)
+    if learning.usable(result) is None or result.solution.rms > bound \
+            or result.fit.misfit(result.solution, newest.start) > MISFIT:
+        return None
+    record.attribute(record.first, found.v)
+    record.lose(record.first + np.flatnonzero(found.outliers))
+    return result
 
 
 def _best_of_all(

@@ -41,18 +41,18 @@ class _Unknowns:
     ) -> None:
         self._known, self._resolution, self._pace = np.isfinite(y), resolution, pace
         self._y = np.where(self._known, y, 0.0)
-        weights = weights_of(y)
-        self.rows = fit.samples.rows / np.sqrt(weights)[:, None]
+        roots = np.sqrt(weights_of(y)) * self._known
+        self.rows = fit.samples.rows
         self._mean = known.mean
         # Of the correlations: the units of the unknowns differ by many orders of magnitude.
         std = np.sqrt(np.diag(known.cov))
         units = np.where(std > 0.0, std, 1.0)
         shares, axes = np.linalg.eigh(known.cov / np.outer(units, units))
         self._root = units[:, None] * axes * (np.sqrt(np.maximum(shares, 0.0)) * known.noise_std)
-        by = fit.samples.rows @ self._root / known.noise_std
+        by = (self.rows * roots[:, None]) @ self._root / known.noise_std
         shares, axes = np.linalg.eigh(np.eye(by.shape[1]) - by.T @ by)
         self._prior = (axes * np.maximum(shares, 0.0)) @ axes.T
-        left = (self._y - self.rows @ self._mean) * np.sqrt(weights) * self._known
+        left = (self._y - self.rows @ self._mean) * roots
         self._pull = by.T @ left / -known.noise_std
 
     @property
