@@ -11,9 +11,14 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 from accuracy.uncertain_cases import motor_jobs
 
+from backlash_ros.core.estimation.fit.attribution import attributed
+from backlash_ros.core.estimation.fit.pace import Pace, drained
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, labelled
+from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.observer.attribution import attributed
 from backlash_ros.core.estimation.observer.observer import Observer
+from backlash_ros.core.estimation.regression.error_model import build_error_model
+from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -65,25 +70,27 @@ def test_late_commands_cost_little_where_they_may_be_told(structure: str, delay:
 
 @pytest.mark.parametrize('delay', [1, 2])
 def test_what_acted_is_found_in_a_record(delay: int) -> None:
-    model = TransferFunction([0.5], [1.0, -0.5, *[0.0] * (delay - 1)])
+    model = StateModel(TransferFunction([0.5], [1.0, -0.5, *[0.0] * (delay - 1)]))
     rng = np.random.default_rng(3)
     sent = 5.0 * np.sin(0.1 * np.arange(400))
     before = np.append(0.0, sent[:-1])
     acted = np.where(rng.random(400) < 0.2, before, sent)
-    p, y, state = 0.0, [], Observer(StateModel(model), NOISE)
+    p, y, state = 0.0, [], Observer(model, NOISE)
     for value in acted.tolist():
         p = min(max(p, value), value + C_R - C_L)
         y.append(state.predict(M * (p - C_R)))
     measured = np.array(y) + NOISE * rng.standard_normal(400)
-    pieces = attributed(
-        sent, measured, before, (0.0, C_R - C_L), M, M * C_R, Observer(StateModel(model), NOISE),
-        10**6,
-    )
-    with pytest.raises(StopIteration) as ended:
-        next(pieces)
+    measured[[50, 200, 201, 350]] += 0.1
+    measured[300] = np.nan
+    around = Around(build_error_model(model, 0.2), NOISE)
+    start = Start(C_R - C_L, 0.0)
+    # The parameters of the plant with every command as it was sent.
+    true = drained(fitted(acted, np.array(y), around, start, M, Pace()))
+    sent_fit = drained(labelled(sent, measured, around, true.fit.start, M, Pace())).fit
+    found = drained(attributed(Fitted(sent_fit, true.solution), sent, measured, before))
     # While v turns, or is in the gap, one acts like the other.
     tells = np.abs(sent - before) > 0.2
-    tells[:20] = False
-    wrong = np.count_nonzero((ended.value.value != acted) & tells)
+    wrong = np.count_nonzero((found.v != acted) & tells)
     assert np.count_nonzero((sent != acted) & tells) > 40
     assert wrong <= 4
+    assert np.flatnonzero(found.outliers).tolist() == [50, 200, 201, 350]

@@ -14,6 +14,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCH_GROWTH,
     UNDECIDED,
 )
+from backlash_ros.core.estimation.fit.attribution import Attributed, attributed
 from backlash_ros.core.estimation.fit.learned_error import plausible
 from backlash_ros.core.estimation.fit.prior import contradicts, prior_of
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, motionless, searched
@@ -54,6 +55,9 @@ def acquire(learning: Learning) -> Task:
             learning.reason = Status.INCONSISTENT
             return False
     before, search.candidate = search.candidate, None
+    commands = None
+    if found is not None and not np.isnan(record.others(first)).all():
+        found, commands = yield from _with_other_commands(learning, found, v, y)
     if found is None or learning.usable(found) is None:
         _explain(learning, found)
         return False
@@ -63,10 +67,24 @@ def acquire(learning: Learning) -> Task:
     again = before is not None and not contradicts(search.candidate, before)
     often = learning.reversed_often(found.fit)
     if again and found.decided and found.fit.reversals > 0 and often:
+        if commands is not None:
+            record.attribute(first, commands.v)
+            record.lose(first + np.flatnonzero(commands.outliers))
         return learning.go_on_from(found, first)
     if again and not often and search.inherited is None:
         search.one_sided = found.fit.start
     return False
+
+
+def _with_other_commands(
+    learning: Learning, found: Fitted, v: Array, y: Array,
+) -> Generator[None, None, tuple[Fitted, Attributed]]:
+    """A fit of the newest v (N,) and y (N,) once it says which commands acted, and those."""
+    others = learning.record.others(learning.record.end - len(v))[:len(v)]
+    commands = yield from attributed(found, v, y, others)
+    v, y = commands.v, np.where(commands.outliers, np.nan, y)
+    start, slope = found.beginning(v), found.solution.m
+    return (yield from fitted(v, y, found.around, start, slope, learning.pace)), commands
 
 
 def confirmed(
