@@ -35,7 +35,10 @@ def acquire(learning: Learning) -> Task:
     first = max(record.first, end - learning.searched)
     v, y = record.since(first)
     waiting = search.one_sided if end < search.again_at and first == record.first else None
-    if waiting is not None and not learning.reversed_often(waiting.labels(v)):
+    one_sided = waiting is not None and not learning.reversed_often(waiting.labels(v))
+    if one_sided or (
+        search.inherited is None and end < UNDECIDED and not learning.may_have_reversed(v)
+    ):
         search.next_at = end + BLOCK[0]
         return False
     search.next_at = search.again_at = end + max(int(len(record) * (SEARCH_GROWTH - 1.0)), BLOCK[0])

@@ -169,6 +169,12 @@ class Learning:
         """Whether the engaged side has changed so often that no lag passes for a gap."""
         return self.around.error.count == 0 or fit.reversals >= REVERSALS
 
+    def may_have_reversed(self, v: Array) -> bool:
+        """The same, as far as v (N,) itself has turned so often."""
+        moves = np.sign(np.diff(v))
+        turns = np.count_nonzero(np.diff(moves[moves != 0.0]))
+        return self.around.error.count == 0 or turns >= REVERSALS
+
     def usable(self, result: Fitted, share: float = 1.0) -> Crossings | None:
         """The crossings of a fit that is precise enough, see acceptance.py."""
         return usable(result, self.bounds, share)

@@ -24,6 +24,7 @@ from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
+    labelled,
     most_likely,
     searched,
     with_other_gaps,
@@ -85,7 +86,9 @@ def refit(learning: Learning) -> Task:
     around, start, first = yield from _shortened(learning, current)
     v, y = learning.taken_since(first)
     start = start.with_gap(current.solution.gap, v)
-    result = yield from fitted(v, y, around, start, current.solution.m, learning.pace)
+    # The values of readings that tell intervals are only where these begin.
+    fit = fitted if current.fit.samples.rounding is None else labelled
+    result = yield from fit(v, y, around, start, current.solution.m, learning.pace)
     result = yield from with_walk(v, y, result, learning.pace)
     if len(v) <= SEARCHED:
         result = yield from _beside_other_gaps(learning, v, y, result)
