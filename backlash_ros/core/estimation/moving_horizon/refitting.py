@@ -25,7 +25,6 @@ from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
     labelled,
-    most_likely,
     searched,
     with_other_gaps,
     with_walk,
@@ -104,11 +103,12 @@ def _beside_other_gaps(
     prior = learning.around.prior
     if prior is not None:
         return (yield from with_other_gaps(v, y, result, prior, learning.pace))
-    other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
-    if other is None:
+    best = yield from searched(v, y, learning.around, learning.widest, learning.pace, (result,))
+    if best is None:
         return result
-    result = result.with_gap_spread(other.fit.gap_spread)
-    return result if learning.usable(other) is None else most_likely([result, other])
+    if best.fit is not result.fit and learning.usable(best) is None:
+        return result.with_gap_spread(best.fit.gap_spread)
+    return best
 
 
 def _shortened(

@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 
@@ -58,8 +59,8 @@ def climbed_at(
     """The most likely x (p,) for this noise, beginning with this one, and its log-posterior."""
     here = yield from posterior.at(x, noise_std)
     for _ in range(NEWTON_STEPS):
-        step = np.linalg.solve(here.precision, here.gradient)
-        if not here.gradient @ step > GAIN:
+        _, step, failed = lapack.dposv(here.precision, here.gradient)
+        if failed or not here.gradient @ step > GAIN:
             break
         length = 1.0
         there = yield from posterior.at(x + step, noise_std)
