@@ -29,7 +29,9 @@ from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import GATE, ODDS
 from backlash_ros.core.estimation.fit.learned_error import low_order
-from backlash_ros.core.estimation.fit.relabelling import Fitted
+from backlash_ros.core.estimation.fit.pace import Pace
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
+from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import NO_RESIDUAL
 from backlash_ros.core.estimation.observer.observer import RATIOS, gain_of
 from backlash_ros.core.estimation.regression.play import play
@@ -51,6 +53,19 @@ class Attributed(NamedTuple):
 
     v: Array
     outliers: Flags
+
+
+def with_other_commands(
+    result: Fitted, v: Array, y: Array, other: Array, around: Around, pace: Pace,
+) -> Generator[None, None, tuple[Fitted, Attributed]]:
+    """The fit around this with the commands that another one says have acted, and these.
+
+    result: fit of v (N,) and y (N,) that says so. other: see `attributed`.
+    """
+    found = yield from attributed(result, v, y, other)
+    start, slope = result.beginning(found.v), result.solution.m
+    known = np.where(found.outliers, np.nan, y)
+    return (yield from fitted(found.v, known, around, start, slope, pace)), found
 
 
 def attributed(
@@ -122,7 +137,7 @@ class _Search:
         self._whitening, self._gap, self._p0 = whitening, solution.gap, solution.start
         self._m, self._v, self._other = solution.m, v, other
         self._known = np.isfinite(y)
-        residual = fit.samples.unexplained(solution.posterior, y)
+        residual = fit.samples.unweighted_residual(solution.posterior, y)
         self._residual = np.where(self._known, residual, 0.0)
         self._told = play(v, self._gap, self._p0)[0]
         self._open: Flags = np.concatenate([np.isfinite(other), self._known])

@@ -49,12 +49,16 @@ class Record:
         """What may have acted instead of v, from this number on."""
         return self._other[self._begin + number - self.first:self._end].copy()
 
-    def attribute(self, number: int, v: Array) -> None:
-        """From this number on these v acted, the ones before them may have been it instead."""
+    def attribute(self, number: int, v: Array) -> int:
+        """From this number on these v acted, the ones before them may have been it instead.
+
+        Returns how many are others.
+        """
         part = slice(self._begin + number - self.first, self._begin + number - self.first + len(v))
         changed = v != self._v[part]
         self._other[part][changed] = self._v[part][changed]
         self._v[part] = v
+        return int(np.count_nonzero(changed))
 
     def exchange(self, number: int) -> None:
         """The other v acted over this interval."""

@@ -88,7 +88,7 @@ class WeightedSamples:
         left = self._y[part] - self._rows[part] @ posterior.mean
         return np.asarray(left * self._weights[part])
 
-    def unexplained(self, posterior: Posterior, y: Array) -> Array:
+    def unweighted_residual(self, posterior: Posterior, y: Array) -> Array:
         """The same of all samples without weights. y (N,): of those that do not count."""
         part = slice(0, self.length)
         y = np.where(self._weights[part] > 0.0, self._y[part], y)

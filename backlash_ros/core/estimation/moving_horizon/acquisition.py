@@ -14,7 +14,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCH_GROWTH,
     UNDECIDED,
 )
-from backlash_ros.core.estimation.fit.attribution import Attributed, attributed
+from backlash_ros.core.estimation.fit.attribution import Attributed, with_other_commands
 from backlash_ros.core.estimation.fit.learned_error import plausible
 from backlash_ros.core.estimation.fit.prior import contradicts, prior_of
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, motionless, searched
@@ -45,7 +45,7 @@ def acquire(learning: Learning) -> Task:
     search.one_sided = None
     record.forget_before(first)
     around = learning.free._replace(walk=learning.told_walk)
-    found = yield from searched(v, y, around, learning.widest, learning.pace)
+    found, commands = yield from searched_with_commands(learning, first, v, y, around)
     if search.inherited is not None:
         for begin in (0, len(v) // 2):
             kept = yield from confirmed(
@@ -58,9 +58,6 @@ def acquire(learning: Learning) -> Task:
             learning.reason = Status.INCONSISTENT
             return False
     before, search.candidate = search.candidate, None
-    commands = None
-    if found is not None and not np.isnan(record.others(first)).all():
-        found, commands = yield from _with_other_commands(learning, found, v, y)
     if found is None or learning.usable(found) is None:
         _explain(learning, found)
         return False
@@ -70,24 +67,22 @@ def acquire(learning: Learning) -> Task:
     again = before is not None and not contradicts(search.candidate, before)
     often = learning.reversed_often(found.fit)
     if again and found.decided and found.fit.reversals > 0 and often:
-        if commands is not None:
-            record.attribute(first, commands.v)
-            record.lose(first + np.flatnonzero(commands.outliers))
+        learning.believe(commands, first)
         return learning.go_on_from(found, first)
     if again and not often and search.inherited is None:
         search.one_sided = found.fit.start
     return False
 
 
-def _with_other_commands(
-    learning: Learning, found: Fitted, v: Array, y: Array,
-) -> Generator[None, None, tuple[Fitted, Attributed]]:
-    """A fit of the newest v (N,) and y (N,) once it says which commands acted, and those."""
-    others = learning.record.others(learning.record.end - len(v))[:len(v)]
-    commands = yield from attributed(found, v, y, others)
-    v, y = commands.v, np.where(commands.outliers, np.nan, y)
-    start, slope = found.beginning(v), found.solution.m
-    return (yield from fitted(v, y, found.around, start, slope, learning.pace)), commands
+def searched_with_commands(
+    learning: Learning, first: int, v: Array, y: Array, around: Around,
+) -> Generator[None, None, tuple[Fitted | None, Attributed]]:
+    """What a search finds in v (N,) and y (N,) from sample `first` on, and which commands acted."""
+    found = yield from searched(v, y, around, learning.widest, learning.pace)
+    others = learning.record.others(first)[:len(v)]
+    if found is None or np.isnan(others).all():
+        return found, Attributed(v, np.zeros(len(v), dtype=np.bool_))
+    return (yield from with_other_commands(found, v, y, others, found.around, learning.pace))
 
 
 def confirmed(

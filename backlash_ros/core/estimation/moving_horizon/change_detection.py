@@ -18,7 +18,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCH_GROWTH,
     SEARCHED,
 )
-from backlash_ros.core.estimation.fit.attribution import attributed
+from backlash_ros.core.estimation.fit.attribution import with_other_commands
 from backlash_ros.core.estimation.fit.prior import Prior, contradicts
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
@@ -27,7 +27,11 @@ from backlash_ros.core.estimation.fit.relabelling import (
     searched,
 )
 from backlash_ros.core.estimation.fit.solution import Around
-from backlash_ros.core.estimation.moving_horizon.acquisition import confirmed, fitted_around
+from backlash_ros.core.estimation.moving_horizon.acquisition import (
+    confirmed,
+    fitted_around,
+    searched_with_commands,
+)
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.protocol import Estimate, Status
 
@@ -130,7 +134,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
         if end - first < RECOVERED:
             continue
         v, y = record.since(first)
-        found = yield from searched(v, y, around, learning.widest, learning.pace)
+        found, commands = yield from searched_with_commands(learning, first, v, y, around)
         if found is not None:
             changes.append(found)
             if (learning.reversed_often(found.fit) or not around.inherited) \
@@ -141,6 +145,7 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
                 # As a first estimate, one that nobody expects is to be found twice.
                 again = before is not None and not contradicts(theta, before)
                 if again or learning.expects_changes:
+                    learning.believe(commands, first)
                     return learning.go_on_from(found, first, changed=True)
         # The same backlash, but something has moved the plant meanwhile.
         kept = yield from confirmed(learning, v, y, estimate, found)
@@ -170,20 +175,16 @@ def _by_other_commands(learning: Learning, bound: float) -> Generator[None, None
     (v, y), others = learning.taken_since(record.first), record.others(record.first)
     if since is None or np.isnan(others).all():
         return None
-    found = yield from attributed(current, v, y, others[:len(v)])
+    result, found = yield from with_other_commands(
+        current, v, y, others[:len(v)], learning.around._replace(walk=0.0), learning.pace
+    )
     newest = slice(since - record.first, None)
-    known = np.count_nonzero(np.isfinite(y[newest]))
-    if np.count_nonzero(found.outliers[newest]) > OUTLIER_SHARE * known:
-        return None
-    y[found.outliers] = np.nan
-    around = learning.around._replace(walk=0.0)
-    start = current.fit.start.with_gap(current.solution.gap, found.v)
-    result = yield from fitted(found.v, y, around, start, current.solution.m, learning.pace)
+    outliers, known = found.outliers[newest], np.isfinite(y[newest])
     if learning.usable(result) is None or result.solution.rms > bound \
-            or result.fit.misfit(result.solution, newest.start) > MISFIT:
+            or result.fit.misfit(result.solution, newest.start) > MISFIT \
+            or np.count_nonzero(outliers) > OUTLIER_SHARE * np.count_nonzero(known):
         return None
-    record.attribute(record.first, found.v)
-    record.lose(record.first + np.flatnonzero(found.outliers))
+    learning.believe(found, record.first)
     return result
 
 

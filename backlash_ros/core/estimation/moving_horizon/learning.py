@@ -25,6 +25,7 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
+from backlash_ros.core.estimation.fit.attribution import Attributed
 from backlash_ros.core.estimation.fit.crossings import Crossings
 from backlash_ros.core.estimation.fit.learned_error import Learned, as_told, likelier
 from backlash_ros.core.estimation.fit.pace import Pace
@@ -77,7 +78,8 @@ class Learning:
     merely do not deny it; supported: whether they alone are precise enough to speak for it.
     contradiction: fit of samples that nothing explains, around what was known; None while there are
     none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before. learned: the G
-    of low order that explains y.
+    of low order that explains y. reattributed, outliers: commands that turned out to be others, and
+    readings that were left out, so far.
     """
 
     bounds: Bounds
@@ -102,6 +104,8 @@ class Learning:
     supported: bool = False
     contradiction: Fitted | None = None
     held: Array | None = None
+    reattributed: int = 0
+    outliers: int = 0
     learned: Learned = field(init=False)
 
     def __post_init__(self) -> None:
@@ -149,6 +153,12 @@ class Learning:
         v, y = self.record.since(number)
         count = len(v) - self.waiting
         return v[:count], y[:count]
+
+    def believe(self, found: Attributed, first: int) -> None:
+        """Let these commands have acted from sample `first` on, and lose the outliers."""
+        self.reattributed += self.record.attribute(first, found.v)
+        self.outliers += int(np.count_nonzero(found.outliers))
+        self.record.lose(first + np.flatnonzero(found.outliers))
 
     @property
     def waiting(self) -> int:

@@ -114,12 +114,12 @@ class MovingHorizon:
     @property
     def outliers(self) -> int:
         """Readings so far that were taken for none."""
-        return self._following.outliers
+        return self._following.outliers + self._learning.outliers
 
     @property
     def reattributed(self) -> int:
         """Intervals so far over which another v acted than was said."""
-        return self._following.reattributed
+        return self._following.reattributed + self._learning.reattributed
 
     @property
     def proposal(self) -> StateModel | None:

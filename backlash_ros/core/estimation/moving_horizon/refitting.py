@@ -61,6 +61,7 @@ def take_block(learning: Learning) -> Task:
     outliers &= valid
     if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
         valid &= ~outliers
+        learning.outliers += int(np.count_nonzero(outliers))
         record.lose(number + np.flatnonzero(outliers))
     misfit = float(squares[valid].mean()) if valid.any() else 0.0
     fits = misfit <= MISFIT
@@ -146,5 +147,4 @@ def _attribute(learning: Learning, current: Fitted) -> Generator[None, None, Non
     if np.isnan(others).all():
         return
     found = yield from attributed(current, *learning.taken_since(record.first), others)
-    record.attribute(record.first, found.v)
-    record.lose(record.first + np.flatnonzero(found.outliers))
+    learning.believe(found, record.first)
