@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import partial
-from math import isnan, nan, sqrt
+from math import inf, isnan, nan, sqrt
 from operator import mul, sub
 
 import numpy as np
@@ -44,8 +45,8 @@ TRUSTED_AFTER = 40
 # A better design takes over when v does not move much: samples after the first estimate, by then v
 # has crossed the gap with it; samples since the end of a crossing between which its last moves are
 # over and the next one is not yet to be expected; samples without any after which none is.
-SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, (5, 20), 200
-FORESEEN = 6  # samples in which u* is not to turn after another design has taken over
+SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, (5, 20), 100
+FORESEEN = 6  # samples in which u* is neither to turn nor to hurry when another design takes over
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
 
@@ -84,6 +85,7 @@ class Tracking:
         self._q = 0.0
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
+        self._moves = deque([0.0], maxlen=NO_CROSSING)  # by which it moved of late, as sizes
         self._asked = 0.0  # largest |u*| so far
         self._scale = 0.0  # that, or the u that the gap takes
         self._bounded_before = False  # whether feedback has met its bound the sample before
@@ -112,21 +114,24 @@ class Tracking:
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
         since, (first, last) = self._engaged_for, ENGAGED_SINCE
-        return self._in_use_for >= SETTLED_AFTER and (
-            first <= since <= last or since >= NO_CROSSING
-        ) and not self._turns_soon()
+        if self._in_use_for < SETTLED_AFTER:
+            return False
+        if first <= since <= last:
+            # The crossing was the largest move for long.
+            return self._goes_on(inf)
+        return since >= NO_CROSSING and self._goes_on(max(self._moves))
 
-    def _turns_soon(self) -> bool:
-        """Whether u* is about to turn, as far as the references that are known say."""
+    def _goes_on(self, fastest: float) -> bool:
+        """Whether u* goes on as it does, no faster than that, as far as known references say."""
         window, x, before = self._references.window, self._x, self._ideal
         for _ in range(FORESEEN):
             window = np.append(window[1:], window[-1])
             ideal, x = self._trajectory(x, window)
-            onto = Region.RIGHT if ideal > before else Region.LEFT
-            if ideal != before and onto is not self._side:
-                return True
+            move = (ideal - before) * self._side
+            if not 0.0 <= move <= fastest:
+                return False
             before = ideal
-        return False
+        return True
 
     def _use(self, chosen: TrackingDesign) -> None:
         model, gains, feedback = chosen.model, chosen.gains, chosen.feedback.gain
@@ -151,6 +156,7 @@ class Tracking:
             self._rest.use(self._design)
         self._references, self._x, self._q = other._references, other._x, other._q
         self._integral, self._ideal, self._u_d = other._integral, other._ideal, other._u_d
+        self._moves = other._moves
         self._level, self._free, self._scheduled = other._level, other._free, other._scheduled
         self._handover, self._sharp_counts = other._handover, other._sharp_counts
         self._rest.go_on_from(other._rest)
@@ -224,6 +230,7 @@ class Tracking:
         reach = most if self._trusted_for > 0 else LARGEST_IN_ACQUISITION * self._scale
         reach += abs(handed_over)
         u_d = min(max(u_d, ideal - reach), ideal + reach)
+        self._moves.append(abs(ideal - self._ideal))
         self._ideal, self._x, self._u_d = ideal, onward, u_d
         side = inverse.side
         v = inverse.step(u_d, self._slope, *crossings)
