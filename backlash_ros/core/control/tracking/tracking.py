@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from functools import partial
-from math import inf, isnan, nan, sqrt
+from math import isnan, nan, sqrt
 from operator import mul, sub
 
 import numpy as np
@@ -85,7 +85,7 @@ class Tracking:
         self._q = 0.0
         self._integral = 0.0
         self._ideal = 0.0  # u* of the sample before
-        self._moves = deque([0.0], maxlen=NO_CROSSING)  # by which it moved of late, as sizes
+        self._moves = deque([0.0], maxlen=NO_CROSSING)  # by which v moved of late, as sizes
         self._asked = 0.0  # largest |u*| so far
         self._scale = 0.0  # that, or the u that the gap takes
         self._bounded_before = False  # whether feedback has met its bound the sample before
@@ -114,15 +114,16 @@ class Tracking:
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
         since, (first, last) = self._engaged_for, ENGAGED_SINCE
-        if self._in_use_for < SETTLED_AFTER:
-            return False
-        if first <= since <= last:
-            # The crossing was the largest move for long.
-            return self._goes_on(inf)
-        return since >= NO_CROSSING and self._goes_on(max(self._moves))
+        return self._in_use_for >= SETTLED_AFTER and (
+            first <= since <= last or since >= NO_CROSSING
+        ) and self._goes_on()
 
-    def _goes_on(self, fastest: float) -> bool:
-        """Whether u* goes on as it does, no faster than that, as far as known references say."""
+    def _goes_on(self) -> bool:
+        """Whether u* neither turns soon nor asks for larger moves of v than those of late.
+
+        As far as the references that are known say.
+        """
+        fastest = self._slope * max(self._moves)
         window, x, before = self._references.window, self._x, self._ideal
         for _ in range(FORESEEN):
             window = np.append(window[1:], window[-1])
@@ -230,10 +231,10 @@ class Tracking:
         reach = most if self._trusted_for > 0 else LARGEST_IN_ACQUISITION * self._scale
         reach += abs(handed_over)
         u_d = min(max(u_d, ideal - reach), ideal + reach)
-        self._moves.append(abs(ideal - self._ideal))
         self._ideal, self._x, self._u_d = ideal, onward, u_d
-        side = inverse.side
+        side, before_v = inverse.side, inverse.v
         v = inverse.step(u_d, self._slope, *crossings)
+        self._moves.append(abs(v - before_v))
         self._side = inverse.side
         crosses = inverse.taking_up or self._side is not side
         self._engaged_for = 0 if crosses else self._engaged_for + 1
