@@ -1,6 +1,6 @@
 """Learning from the example driver while other processes take the processor.
 
-    python benchmarks/loaded_machine.py [--runs 3] [--seconds 10]
+    python benchmarks/loaded_machine.py [--runs 3] [--seconds 10] [--write]
 
 Controller, reference and examples/motor_driver.py run as processes of their own with
 config/geared_motor.yaml, in real time; beside them a busy loop for every processor takes 50 and
@@ -35,7 +35,15 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from real_time.node_processes import NODES, processes
-from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
+from reporting import (
+    CHECK_HEADER,
+    ROOT,
+    Check,
+    machine,
+    markdown_table,
+    processors,
+    text_table,
+)
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
@@ -45,6 +53,7 @@ from backlash_ros.middleware.loopback import prefer_loopback
 Array = NDArray[np.float64]
 
 CONFIG = ROOT / 'config' / 'geared_motor.yaml'
+DOCUMENT = ROOT / 'docs' / 'results' / 'loaded_machine.md'
 BUSY_LOOP = ROOT / 'benchmarks' / 'real_time' / 'busy_loop.py'
 DRIVER = ROOT / 'examples' / 'motor_driver.py'
 PERIOD_S = 0.005  # of both
@@ -188,12 +197,32 @@ def parse_arguments() -> argparse.Namespace:
                         help=f'instead of {LOADS}; 0 is none; may be repeated')
     parser.add_argument('--use', action='append', choices=sorted(LIMITS),
                         help='estimator.use_applied_control instead of both; may be repeated')
+    parser.add_argument('--write', action='store_true',
+                        help=f'write {DOCUMENT.relative_to(ROOT)}; needs all loads and both uses')
     arguments = parser.parse_args()
     if arguments.runs < 1 or not arguments.seconds > BOUND_S:
         parser.error(f'--runs must be >= 1 and --seconds > {BOUND_S:g}')
     if not all(0.0 <= load < 1.0 for load in arguments.load or ()):
         parser.error('--load must be >= 0 and < 1')
+    if arguments.write and (arguments.load or arguments.use):
+        parser.error('--write needs all loads and uses: leave out --load and --use')
     return arguments
+
+
+def write_document(checks: Sequence[Check], rows: Sequence[Sequence[str]], seconds: float) -> None:
+    """Write the results as Markdown."""
+    DOCUMENT.write_text('\n\n'.join([
+        '# Learning on a busy machine',
+        f'Written by `python benchmarks/loaded_machine.py --write` on: {machine()}. '
+        '[examples/motor_driver.py](../../examples/motor_driver.py) runs beside the controller '
+        f'with config/geared_motor.yaml for {seconds:g} s, while a busy loop for every processor '
+        'takes a share of it.',
+        markdown_table(CHECK_HEADER, [check.row for check in checks]),
+        '*reports*: `estimator.use_applied_control`. *error at the end*: the larger one of c_r '
+        'and c_l, relative. *deviations*: the same over its published deviation. *not answered*: '
+        'outputs of the driver without a command.',
+        markdown_table(RUN_HEADER, rows),
+    ]) + '\n', encoding='utf-8')
 
 
 def main() -> int:
@@ -208,6 +237,9 @@ def main() -> int:
     print(text_table(RUN_HEADER, rows))
     print()
     print(text_table(CHECK_HEADER, [check.row for check in checks]))
+    if arguments.write:
+        write_document(checks, rows, arguments.seconds)
+        print(f'wrote {DOCUMENT.relative_to(ROOT)}')
     return 0 if all(check.holds for check in checks) else 1
 
 

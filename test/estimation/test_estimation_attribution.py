@@ -16,7 +16,9 @@ from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, labelled
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation.moving_horizon.refitting import refit
 from backlash_ros.core.estimation.observer.observer import Observer
+from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.plant.state_model import StateModel
@@ -66,6 +68,44 @@ def test_late_commands_cost_little_where_they_may_be_told(structure: str, delay:
     assert none == 0
     assert found > 0.5 * LATE * SECONDS / 0.005
     assert right < 2e-3 < misled
+
+
+def tracking_while_late(seed: int) -> float:
+    """Share of the first 3 s with status TRACKING, where one command in ten is late, and told."""
+    [job] = motor_jobs({'late': {}}, [seed], 3.0)
+    loop = build_closed_loop(job.parameters)
+    controller, plant = loop.controller, loop.plant
+    rng = np.random.default_rng(seed)
+    before, tracking = 0.0, 0
+    instead: tuple[float, ...] = ()
+    for k in range(job.samples):
+        y_m = loop.reference(k * loop.sample_period)
+        v = controller.step(plant.measure(), y_m, alternatives=instead).v
+        controller.refine()
+        plant.step(before if rng.random() < 0.1 else v)
+        instead, before = (before,), v
+        tracking += controller.estimator.estimate.status is Status.TRACKING
+    return tracking / job.samples
+
+
+def test_late_commands_explain_samples_that_contradict() -> None:
+    assert np.mean([tracking_while_late(seed) for seed in range(101, 117)]) > 0.68
+
+
+def test_a_refit_takes_in_no_sample_that_was_not_compared_with_the_fit() -> None:
+    [job] = motor_jobs({'right': {}}, [1], 3.0)
+    loop = build_closed_loop(job.parameters)
+    loop.run(400)
+    estimator = loop.controller.estimator
+    assert isinstance(estimator, MovingHorizon)
+    learning = estimator._learning
+    for y in (1.0, -1.0, 2.0):
+        learning.record.append(0.0, y)
+    waiting, length = learning.waiting, learning.fit.fit.length
+    assert waiting >= 3
+    drained(refit(learning))
+    assert (learning.fit.fit.length, learning.waiting) == (length, waiting)
+    assert learning.fit.solution.rms < 2e-4
 
 
 @pytest.mark.parametrize('delay', [1, 2])
