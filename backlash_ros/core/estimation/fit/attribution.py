@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import GATE, ODDS
-from backlash_ros.core.estimation.fit.learned_error import low_order
 from backlash_ros.core.estimation.fit.pace import Pace
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.solution import Around
@@ -46,6 +45,7 @@ AGAINST_ANOTHER = log(ODDS)  # log-likelihood
 AGAINST_AN_OUTLIER = 0.5 * GATE**2
 WHITE = RATIOS[len(RATIOS) // 2]  # noise on u that innovations are whitened for
 MEDIAN = 0.6745  # of |e| for e ~ N(0, 1)
+FILLED = 3  # times that lost outputs are replaced by what was expected: those in a row
 
 
 class Attributed(NamedTuple):
@@ -60,9 +60,12 @@ def with_other_commands(
 ) -> Generator[None, None, tuple[Fitted, Attributed]]:
     """The fit around this with the commands that another one says have acted, and these.
 
-    result: fit of v (N,) and y (N,) that says so. other: see `attributed`.
+    result: fit of v (N,) and y (N,) that says so; it stays where it says nothing. other: see
+    `attributed`.
     """
     found = yield from attributed(result, v, y, other)
+    if not found.outliers.any() and np.array_equal(found.v, v):
+        return result, found
     start, slope = result.beginning(found.v), result.solution.m
     known = np.where(found.outliers, np.nan, y)
     return (yield from fitted(found.v, known, around, start, slope, pace)), found
@@ -76,24 +79,26 @@ def attributed(
     Stops between its steps. other: commands that may have acted instead (N,), nan where none may.
     """
     now = Attributed(v, np.zeros(len(v), dtype=np.bool_))
-    model = low_order(result.fit, result.solution)
+    model = result.fit.model
     gain = gain_of(model, WHITE)
     if result.solution.crossings is None or gain is None or not np.isfinite(y).any():
         return now
+    yield
     search = _Search(result, _Whitening(model, gain.gain), v, y, other)
-    e = search.innovations(now)
+    here = search.beginning
     while True:
-        places = search.likely(now, e)
+        yield
+        places = search.likely(now, here)
         if not len(places):
             return now
         yield
-        tried = search.exchanged(now, places)
-        after = search.innovations(tried)
-        refused = search.refused(places, e, after)
-        now, e = tried, after
+        before, now = here, search.exchanged(now, places)
+        here = search.at(now)
+        refused = search.refused(places, before.e, here.e)
         if len(refused):
+            yield
             now = search.exchanged(now, refused)
-            e = search.innovations(now)
+            here = search.at(now)
 
 
 class _Whitening:
@@ -113,21 +118,28 @@ class _Whitening:
 
     def innovations(self, residual: Array, change: Array, known: Flags) -> Array:
         """e (N,) where u is another one by `change` (N,); 0 where y is not known."""
-        r = residual - lfilter(self._b, self._a, change)
-        e, state, first = np.zeros(len(r)), np.zeros(len(self._a) - 1), 0
-        for lost in np.flatnonzero(~known).tolist():
-            e[first:lost], state = lfilter(self._a, self._w, r[first:lost], zi=state)
-            # What is lost is what was expected.
-            _, state = lfilter(self._a, self._w, -state[:1], zi=state)
-            first = lost + 1
-        e[first:], _ = lfilter(self._a, self._w, r[first:], zi=state)
-        return e
+        r: Array = residual - lfilter(self._b, self._a, change)
+        r[~known] = 0.0
+        e: Array = lfilter(self._a, self._w, r)
+        for _ in range(FILLED):
+            # What is lost is what was expected: then its innovation is 0.
+            r[~known] -= e[~known]
+            e = lfilter(self._a, self._w, r)
+        return np.where(known, e, 0.0)
+
+
+class _Place(NamedTuple):
+    """Play output (N,) and innovations (N,) in units of their deviation, for some commands."""
+
+    p: Array
+    e: Array
 
 
 class _Search:
     """Looks for places where another command acted, or where y is an outlier.
 
-    Numbers below N stand for commands, from N on for readings.
+    Numbers below N stand for commands, from N on for readings. beginning: what follows from those
+    that were told.
     """
 
     def __init__(
@@ -141,22 +153,24 @@ class _Search:
         self._residual = np.where(self._known, residual, 0.0)
         self._told = play(v, self._gap, self._p0)[0]
         self._open: Flags = np.concatenate([np.isfinite(other), self._known])
-        self._noise_std = 1.0
-        e = self.innovations(Attributed(v, ~self._known))[self._known]
+        e = whitening.innovations(self._residual, np.zeros(len(v)), self._known)
         self._noise_std = max(
-            float(np.median(np.abs(e))) / MEDIAN, resolution_of(y) / sqrt(12.0),
+            float(np.median(np.abs(e[self._known]))) / MEDIAN, resolution_of(y) / sqrt(12.0),
             NO_RESIDUAL * fit.extent[0],
         )
+        self.beginning = _Place(self._told, e / self._noise_std)
 
-    def innovations(self, of: Attributed) -> Array:
-        """In units of their deviation, shape (N,)."""
-        change = self._m * (play(of.v, self._gap, self._p0)[0] - self._told)
-        known = self._known & ~of.outliers
-        return self._whitening.innovations(self._residual, change, known) / self._noise_std
+    def at(self, of: Attributed) -> _Place:
+        """What follows from these commands and outliers."""
+        p = play(of.v, self._gap, self._p0)[0]
+        change, known = self._m * (p - self._told), self._known & ~of.outliers
+        return _Place(
+            p, self._whitening.innovations(self._residual, change, known) / self._noise_std
+        )
 
-    def likely(self, now: Attributed, e: Array) -> Places:
+    def likely(self, now: Attributed, here: _Place) -> Places:
         """Places where that is likely, no two so close that one tells of the other."""
-        p, of_u, of_y = play(now.v, self._gap, self._p0)[0], *self._whitening.signatures
+        (p, e), (of_u, of_y) = here, self._whitening.signatures
         # Without what the play output remembers of it: `refused` looks at that as well.
         there = np.clip(np.append(self._p0, p[:-1]), self._other, self._other + self._gap)
         move = (there - p) * (self._m / self._noise_std)

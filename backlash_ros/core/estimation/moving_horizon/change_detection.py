@@ -178,6 +178,8 @@ def _by_other_commands(learning: Learning, bound: float) -> Generator[None, None
     result, found = yield from with_other_commands(
         current, v, y, others[:len(v)], learning.around._replace(walk=0.0), learning.pace
     )
+    if result is current:
+        return None
     newest = slice(since - record.first, None)
     outliers, known = found.outliers[newest], np.isfinite(y[newest])
     if learning.usable(result) is None or result.solution.rms > bound \
