@@ -146,9 +146,9 @@ def labelled(
 
 
 def searched(
-    v: Array, y: Array, around: Around, widest: float, pace: Pace, known: Sequence[Fitted] = (),
+    v: Array, y: Array, around: Around, widest: float, pace: Pace,
 ) -> Generator[None, None, Fitted | None]:
-    """Search the gap and fit around the best candidates, unless one that is known is beside them.
+    """Search the gap and fit around the best candidates.
 
     None where a constant u explains y as well: v never engaged.
     """
@@ -161,13 +161,11 @@ def searched(
     # Those far away only tell whether the choice is clear. With an error of G the evidence is that
     # of the best error for each gap: too flat to tell.
     tells = around.error.count == 0
-    fits = list(known)
+    fits = []
     for candidate in _apart(found.candidates, FAR_CANDIDATES if tells else 0):
-        if any(candidate.beside(fit.solution.gap) for fit in fits):
-            continue
         start = Start(candidate.gap, candidate.start)
         fits.append((yield from fitted(v, y, around, start, candidate.m, pace)))
-    best = most_likely(fits[:len(known) + CANDIDATES])
+    best = most_likely(fits[:CANDIDATES])
     if tells:
         best = best._replace(decided=not any(_rivals(best, other) for other in fits))
     assert found.comparison is not None

@@ -40,11 +40,6 @@ class Candidate(NamedTuple):
     start: float
     m: float
 
-    def beside(self, gap: float) -> bool:
-        """Whether this gap is no further away than the next one that is compared."""
-        width, count = ZOOM
-        return abs(self.gap - gap) <= 2.0 * width / (count - 1) * self.gap
-
 
 class Found(NamedTuple):
     """Candidates, best first, and the evidence that v never engaged.

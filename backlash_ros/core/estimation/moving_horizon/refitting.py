@@ -25,6 +25,7 @@ from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
     fitted,
     labelled,
+    most_likely,
     searched,
     with_other_gaps,
     with_walk,
@@ -104,12 +105,11 @@ def _beside_other_gaps(
     prior = learning.around.prior
     if prior is not None:
         return (yield from with_other_gaps(v, y, result, prior, learning.pace))
-    best = yield from searched(v, y, learning.around, learning.widest, learning.pace, (result,))
-    if best is None:
+    other = yield from searched(v, y, learning.around, learning.widest, learning.pace)
+    if other is None:
         return result
-    if best.fit is not result.fit and learning.usable(best) is None:
-        return result.with_gap_spread(best.fit.gap_spread)
-    return best
+    result = result.with_gap_spread(other.fit.gap_spread)
+    return result if learning.usable(other) is None else most_likely([result, other])
 
 
 def _shortened(
