@@ -14,7 +14,7 @@ from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
-from backlash_ros.core.estimation.regression.whiteness import largest_correlation
+from backlash_ros.core.estimation.regression.residuals import largest_correlation
 from backlash_ros.core.plant.state_model import StateModel
 
 NOISE = 1e-3

@@ -34,6 +34,7 @@ from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import NO_RESIDUAL
 from backlash_ros.core.estimation.observer.observer import RATIOS, gain_of
 from backlash_ros.core.estimation.regression.play import play
+from backlash_ros.core.estimation.regression.residuals import bulk_std
 from backlash_ros.core.estimation.regression.resolution import resolution_of
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -44,7 +45,6 @@ Places = NDArray[np.intp]
 AGAINST_ANOTHER = log(ODDS)  # log-likelihood
 AGAINST_AN_OUTLIER = 0.5 * GATE**2
 WHITE = RATIOS[len(RATIOS) // 2]  # noise on u that innovations are whitened for
-MEDIAN = 0.6745  # of |e| for e ~ N(0, 1)
 FILLED = 3  # times that lost outputs are replaced by what was expected: those in a row
 
 
@@ -155,8 +155,7 @@ class _Search:
         self._open: Flags = np.concatenate([np.isfinite(other), self._known])
         e = whitening.innovations(self._residual, np.zeros(len(v)), self._known)
         self._noise_std = max(
-            float(np.median(np.abs(e[self._known]))) / MEDIAN, resolution_of(y) / sqrt(12.0),
-            NO_RESIDUAL * fit.extent[0],
+            bulk_std(e[self._known]), resolution_of(y) / sqrt(12.0), NO_RESIDUAL * fit.extent[0]
         )
         self.beginning = _Place(self._told, e / self._noise_std)
 

@@ -29,7 +29,7 @@ from backlash_ros.core.estimation.regression.posterior import (
     with_zero,
 )
 from backlash_ros.core.estimation.regression.regressors import RAMPS, Regressors
-from backlash_ros.core.estimation.regression.whiteness import largest_correlation
+from backlash_ros.core.estimation.regression.residuals import largest_correlation
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.constants import GATE, OUTLIER_SHARE
+from backlash_ros.core.estimation.regression.residuals import bulk_std
 
 Array = NDArray[np.float64]
 
 SEARCHED_AT_MOST = 6000  # samples of a record that the search for the gap looks at
-NORMAL_MAD = 1.4826  # standard deviation of a normal distribution with a median of |x| of 1
 
 
 def check_record(v: Array, y: Array) -> None:
@@ -39,6 +39,6 @@ def outliers(residual: Array, least_std: float) -> NDArray[np.bool_]:
     """
     size = np.abs(residual)
     known = size[np.isfinite(size)]
-    typical = NORMAL_MAD * float(np.median(known)) if len(known) else 0.0
+    typical = bulk_std(known) if len(known) else 0.0
     wild = size > GATE * max(typical, least_std)
     return wild if np.count_nonzero(wild) <= OUTLIER_SHARE * len(known) else np.zeros_like(wild)
