@@ -42,8 +42,8 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
 
-AGAINST_ANOTHER = log(ODDS)  # log-likelihood
-AGAINST_AN_OUTLIER = 0.5 * GATE**2
+AGAINST_ANOTHER = log(ODDS)  # log-likelihood that the other command has to gain
+AGAINST_AN_OUTLIER = 0.5 * GATE**2  # log-likelihood that an outlier has to gain
 WHITE = RATIOS[len(RATIOS) // 2]  # noise on u that innovations are whitened for
 FILLED = 3  # times that lost outputs are replaced by what was expected: those in a row
 
