@@ -11,13 +11,13 @@ import pytest
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / 'benchmarks'))
 from accuracy.uncertain_cases import motor_jobs
 
-from backlash_ros.core.estimation.fit.attribution import attributed
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, labelled
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.estimation.moving_horizon.refitting import refit
 from backlash_ros.core.estimation.observer.observer import Observer
+from backlash_ros.core.estimation.observer.record_attribution import attributed
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start

@@ -14,12 +14,12 @@ from backlash_ros.core.estimation.constants import (
     SEARCH_GROWTH,
     UNDECIDED,
 )
-from backlash_ros.core.estimation.fit.attribution import Attributed, with_other_commands
 from backlash_ros.core.estimation.fit.learned_error import plausible
 from backlash_ros.core.estimation.fit.prior import contradicts, prior_of
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, motionless, searched
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
+from backlash_ros.core.estimation.observer.record_attribution import Attributed, with_other_commands
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
 

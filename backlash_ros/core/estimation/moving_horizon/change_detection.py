@@ -18,7 +18,6 @@ from backlash_ros.core.estimation.constants import (
     SEARCH_GROWTH,
     SEARCHED,
 )
-from backlash_ros.core.estimation.fit.attribution import with_other_commands
 from backlash_ros.core.estimation.fit.prior import Prior, contradicts
 from backlash_ros.core.estimation.fit.relabelling import (
     Fitted,
@@ -33,6 +32,7 @@ from backlash_ros.core.estimation.moving_horizon.acquisition import (
     searched_with_commands,
 )
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
+from backlash_ros.core.estimation.observer.record_attribution import with_other_commands
 from backlash_ros.core.estimation.protocol import Estimate, Status
 
 Array = NDArray[np.float64]

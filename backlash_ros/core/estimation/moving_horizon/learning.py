@@ -25,7 +25,6 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.attribution import Attributed
 from backlash_ros.core.estimation.fit.crossings import Crossings
 from backlash_ros.core.estimation.fit.learned_error import Learned, as_told, likelier
 from backlash_ros.core.estimation.fit.pace import Pace
@@ -35,6 +34,7 @@ from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.moving_horizon.acceptance import usable
+from backlash_ros.core.estimation.observer.record_attribution import Attributed
 from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.regression.play import Labels, Start
 

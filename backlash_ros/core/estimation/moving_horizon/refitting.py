@@ -18,7 +18,6 @@ from backlash_ros.core.estimation.constants import (
     SEARCHED,
 )
 from backlash_ros.core.estimation.fit.arrival import arrival
-from backlash_ros.core.estimation.fit.attribution import attributed
 from backlash_ros.core.estimation.fit.learned_error import strayed
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
@@ -35,6 +34,7 @@ from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import PAST
 from backlash_ros.core.estimation.moving_horizon.change_detection import note_block
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
+from backlash_ros.core.estimation.observer.record_attribution import attributed
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.estimation.regression.readings import weights_of
 
