@@ -7,8 +7,10 @@ from typing import TypeVar
 
 T = TypeVar('T')
 
-# Samples times alternatives in one piece: what a cache holds, and where calls take as long as work.
-LARGEST, SMALLEST = 40_000, 4_000
+LARGEST = 40_000  # samples times alternatives in one piece: what a cache holds
+# Of them per second of the time there is, which are done at once whatever they take: in smaller
+# pieces the calls would take longer than the work.
+SLOWEST = 2.5e6
 LONG = 0.5  # share of the time beyond which a piece is made smaller
 
 
@@ -28,7 +30,7 @@ class Pace:
         if not asked:
             return
         if took_s > LONG * budget_s:
-            self.size = max(self.size // 2, SMALLEST)
+            self.size = max(self.size // 2, int(SLOWEST * budget_s))
         elif 2.0 * took_s < LONG * budget_s:
             self.size = min(2 * self.size, LARGEST)
 
