@@ -34,6 +34,11 @@ class WeightedSamples:
         """Rows of the samples so far, shape (N, p)."""
         return self._rows[:self.length]
 
+    @property
+    def weights(self) -> Array:
+        """Roots of what the samples so far count for, 0 where y was lost, shape (N,)."""
+        return self._weights[:self.length]
+
     def take(self, rows: Array, y: Array, weights: Array) -> None:
         """Take in y (N,) after each of these v, nan where lost, counting as much as the weights."""
         known = np.isfinite(y)
@@ -90,6 +95,5 @@ class WeightedSamples:
 
     def unweighted_residual(self, posterior: Posterior, y: Array) -> Array:
         """The same of all samples without weights. y (N,): of those that do not count."""
-        part = slice(0, self.length)
-        y = np.where(self._weights[part] > 0.0, self._y[part], y)
-        return np.asarray(y - self._rows[part] @ posterior.mean)
+        y = np.where(self.weights > 0.0, self._y[:self.length], y)
+        return np.asarray(y - self.rows @ posterior.mean)

@@ -79,9 +79,9 @@ def searched_with_commands(
 ) -> Generator[None, None, tuple[Fitted | None, Attributed]]:
     """What a search finds in v (N,) and y (N,) from sample `first` on, and which commands acted."""
     found = yield from searched(v, y, around, learning.widest, learning.pace)
+    if found is None:
+        return None, Attributed(v, np.zeros(len(v), dtype=np.bool_))
     others = learning.record.others(first)[:len(v)]
-    if found is None or np.isnan(others).all():
-        return found, Attributed(v, np.zeros(len(v), dtype=np.bool_))
     return (yield from with_other_commands(found, v, y, others, found.around, learning.pace))
 
 

@@ -117,13 +117,12 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     bound = AS_GOOD * current.solution.posterior.noise_std
     around, end = learning.unchanged, record.end
     learning.next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
-    late = yield from _by_other_commands(learning, bound)
+    late = yield from _by_other_commands(learning, since, bound)
     if late is not None:
         return learning.go_on_from(late, record.first)
     # What is known from elsewhere still holds, unless the plant has changed.
     whole = yield from _best_of_all(learning, learning.around._replace(walk=0.0))
-    if whole is not None and whole.solution.rms <= bound \
-            and whole.fit.misfit(whole.solution, since - record.first) <= MISFIT:
+    if whole is not None and _explains(whole, since - record.first, bound):
         return learning.go_on_from(whole, record.first)
     # What is known from elsewhere may have changed before the record began.
     earliest = [record.first] if learning.around.prior is not None else []
@@ -169,21 +168,25 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     return False
 
 
-def _by_other_commands(learning: Learning, bound: float) -> Generator[None, None, Fitted | None]:
+def _explains(result: Fitted, newest: int, bound: float) -> bool:
+    """Whether a fit explains the samples from number `newest` of it on; bound: on its residual."""
+    return result.solution.rms <= bound and result.fit.misfit(result.solution, newest) <= MISFIT
+
+
+def _by_other_commands(
+    learning: Learning, since: int, bound: float,
+) -> Generator[None, None, Fitted | None]:
     """The fit of the commands that may have acted instead, where that explains the samples."""
-    record, current, since = learning.record, learning.fit, learning.contradicted_from
+    record, current = learning.record, learning.fit
     (v, y), others = learning.taken_since(record.first), record.others(record.first)
-    if since is None or np.isnan(others).all():
-        return None
     result, found = yield from with_other_commands(
         current, v, y, others[:len(v)], learning.around._replace(walk=0.0), learning.pace
     )
     if result is current:
         return None
-    newest = slice(since - record.first, None)
-    outliers, known = found.outliers[newest], np.isfinite(y[newest])
-    if learning.usable(result) is None or result.solution.rms > bound \
-            or result.fit.misfit(result.solution, newest.start) > MISFIT \
+    newest = since - record.first
+    outliers, known = found.outliers[newest:], np.isfinite(y[newest:])
+    if learning.usable(result) is None or not _explains(result, newest, bound) \
             or np.count_nonzero(outliers) > OUTLIER_SHARE * np.count_nonzero(known):
         return None
     learning.believe(found, record.first)

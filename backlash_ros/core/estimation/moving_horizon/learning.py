@@ -157,8 +157,12 @@ class Learning:
     def believe(self, found: Attributed, first: int) -> None:
         """Let these commands have acted from sample `first` on, and lose the outliers."""
         self.reattributed += self.record.attribute(first, found.v)
-        self.outliers += int(np.count_nonzero(found.outliers))
-        self.record.lose(first + np.flatnonzero(found.outliers))
+        self.leave_out(first, found.outliers)
+
+    def leave_out(self, first: int, outliers: NDArray[np.bool_]) -> None:
+        """Count these of the y from sample `first` on as outliers, and as lost."""
+        self.outliers += int(np.count_nonzero(outliers))
+        self.record.lose(first + np.flatnonzero(outliers))
 
     @property
     def waiting(self) -> int:

@@ -256,7 +256,7 @@ class MovingHorizon:
         return True
 
     def _restart_record(self) -> None:
-        self._task, self._idle_until = None, 0
+        self._end_task()
         try:
             self._learning.restart(self._following.start_of(self.estimate))
         except np.linalg.LinAlgError:
@@ -295,7 +295,7 @@ class MovingHorizon:
                 try:
                     self._go_on(task)
                 except np.linalg.LinAlgError:
-                    self._task, self._idle_until = None, 0
+                    self._end_task()
                     self._search_afresh()
                     return
                 if timed:
@@ -319,12 +319,16 @@ class MovingHorizon:
         self._task = found
         return found
 
+    def _end_task(self) -> None:
+        """Let no task be under way; another one may be due at once."""
+        self._task, self._idle_until = None, 0
+
     def _go_on(self, task: Task) -> None:
         """Do another piece of the task, and publish what it leaves at its end."""
         try:
             next(task)
         except StopIteration as done:
-            self._task, self._idle_until = None, 0
+            self._end_task()
             if done.value:
                 self._publish()
             self._note_coasting()

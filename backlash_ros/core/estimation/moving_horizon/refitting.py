@@ -62,8 +62,7 @@ def take_block(learning: Learning) -> Task:
     outliers &= valid
     if np.count_nonzero(outliers) <= OUTLIER_SHARE * np.count_nonzero(valid):
         valid &= ~outliers
-        learning.outliers += int(np.count_nonzero(outliers))
-        record.lose(number + np.flatnonzero(outliers))
+        learning.leave_out(number, outliers)
     misfit = float(squares[valid].mean()) if valid.any() else 0.0
     fits = misfit <= MISFIT
     taken = np.where(valid & fits, y, nan)
@@ -142,9 +141,7 @@ def _shortened(
 
 def _attribute(learning: Learning, current: Fitted) -> Generator[None, None, None]:
     """Let those v have acted over the record that its fit speaks for, and lose its outliers."""
-    record = learning.record
-    others = record.others(record.first)[:current.fit.length]
-    if np.isnan(others).all():
-        return
-    found = yield from attributed(current, *learning.taken_since(record.first), others)
-    learning.believe(found, record.first)
+    first = learning.record.first
+    v, y = learning.taken_since(first)
+    found = yield from attributed(current, v, y, learning.record.others(first)[:len(v)])
+    learning.believe(found, first)

@@ -76,12 +76,15 @@ def attributed(
 ) -> Generator[None, None, Attributed]:
     """What a fit says of v (N,) and y (N,), nan where lost, that it has taken in or refused.
 
-    Stops between its steps. other: commands that may have acted instead (N,), nan where none may.
+    Stops between its steps. other: commands that may have acted instead (N,), nan where none may;
+    where there is none at all, it says nothing.
     """
     now = Attributed(v, np.zeros(len(v), dtype=np.bool_))
+    if not (np.isfinite(other).any() and np.isfinite(y).any()):
+        return now
     model = result.fit.model
     gain = gain_of(model, WHITE)
-    if result.solution.crossings is None or gain is None or not np.isfinite(y).any():
+    if result.solution.crossings is None or gain is None:
         return now
     yield
     search = _Search(result, _Whitening(model, gain.gain), v, y, other)

@@ -19,7 +19,6 @@ from backlash_ros.core.estimation.fit.relabelling import RELABELLINGS, Fitted, l
 from backlash_ros.core.estimation.fit.rounding.ascent import Place, climbed, climbed_at
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.regression.posterior import Posterior
-from backlash_ros.core.estimation.regression.readings import weights_of
 from backlash_ros.core.estimation.regression.resolution import Rounding, cells, resolution_of
 
 Array = NDArray[np.float64]
@@ -41,18 +40,17 @@ class _Unknowns:
     ) -> None:
         self._known, self._resolution, self._pace = np.isfinite(y), resolution, pace
         self._y = np.where(self._known, y, 0.0)
-        roots = np.sqrt(weights_of(y)) * self._known
-        self.rows = fit.samples.rows
+        self.rows, weights = fit.samples.rows, fit.samples.weights
         self._mean = known.mean
         # Of the correlations: the units of the unknowns differ by many orders of magnitude.
         std = np.sqrt(np.diag(known.cov))
         units = np.where(std > 0.0, std, 1.0)
         shares, axes = np.linalg.eigh(known.cov / np.outer(units, units))
         self._root = units[:, None] * axes * (np.sqrt(np.maximum(shares, 0.0)) * known.noise_std)
-        by = (self.rows * roots[:, None]) @ self._root / known.noise_std
+        by = (self.rows * weights[:, None]) @ self._root / known.noise_std
         shares, axes = np.linalg.eigh(np.eye(by.shape[1]) - by.T @ by)
         self._prior = (axes * np.maximum(shares, 0.0)) @ axes.T
-        left = (self._y - self.rows @ self._mean) * roots
+        left = (self._y - self.rows @ self._mean) * weights
         self._pull = by.T @ left / -known.noise_std
 
     @property
