@@ -19,7 +19,11 @@ from backlash_ros.core.estimation.fit.prior import contradicts, prior_of
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, motionless, searched
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
-from backlash_ros.core.estimation.observer.record_attribution import Attributed, with_other_commands
+from backlash_ros.core.estimation.observer.record_attribution import (
+    Attributed,
+    as_told,
+    with_other_commands,
+)
 from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
 
@@ -80,7 +84,7 @@ def searched_with_commands(
     """What a search finds in v (N,) and y (N,) from sample `first` on, and which commands acted."""
     found = yield from searched(v, y, around, learning.widest, learning.pace)
     if found is None:
-        return None, Attributed(v, np.zeros(len(v), dtype=np.bool_))
+        return None, as_told(v)
     others = learning.record.others(first)[:len(v)]
     return (yield from with_other_commands(found, v, y, others, found.around, learning.pace))
 

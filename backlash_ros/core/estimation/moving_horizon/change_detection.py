@@ -52,9 +52,10 @@ def note_block(learning: Learning, fits: bool, number: int, squares: Array) -> N
             learning.record.lose(np.arange(since, number + count - learning.consistent))
             learning.contradicted_from = learning.contradiction = None
         return
-    learning.consistent = 0
     if learning.contradicted_from is None:
+        learning.agreed = learning.consistent
         learning.contradicted_from = learning.next_try = number + change(squares)
+    learning.consistent = 0
 
 
 def change(squares: Array) -> int:
@@ -119,6 +120,8 @@ def reconsider(learning: Learning, estimate: Estimate) -> Task:
     learning.next_try = end + max(int((end - since) * (SEARCH_GROWTH - 1.0)), BLOCK[0])
     late = yield from _by_other_commands(learning, since, bound)
     if late is not None:
+        # There was no contradiction.
+        learning.consistent = learning.agreed + end - learning.waiting - since
         return learning.go_on_from(late, record.first)
     # What is known from elsewhere still holds, unless the plant has changed.
     whole = yield from _best_of_all(learning, learning.around._replace(walk=0.0))
@@ -185,9 +188,9 @@ def _by_other_commands(
     if result is current:
         return None
     newest = since - record.first
-    outliers, known = found.outliers[newest:], np.isfinite(y[newest:])
+    unforeseen, known = (found.outliers | found.unknown)[newest:], np.isfinite(y[newest:])
     if learning.usable(result) is None or not _explains(result, newest, bound) \
-            or np.count_nonzero(outliers) > OUTLIER_SHARE * np.count_nonzero(known):
+            or np.count_nonzero(unforeseen) > OUTLIER_SHARE * np.count_nonzero(known):
         return None
     learning.believe(found, record.first)
     return result

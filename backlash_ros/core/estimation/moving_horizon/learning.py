@@ -72,10 +72,11 @@ class Learning:
     refit_at: length of the record at which all of it is refitted; moved_at: from which it is
     reason to do so that gap or poles of G have `strayed` from those that the fit was made around.
     contradicted_from: sample from which the fit does not hold;
-    consistent: samples that do fit since then; next_try: sample at which to look for an explanation
-    again. changed: what theta seems to have become. refitted: whether it was refitted since the
-    record contradicts itself. unconfirmed: whether the estimate was learned before, and the samples
-    merely do not deny it; supported: whether they alone are precise enough to speak for it.
+    consistent: samples that do fit since then; agreed: those before it; next_try: sample at which
+    to look for an explanation again. changed: what theta seems to have become. refitted: whether it
+    was refitted since the record contradicts itself. unconfirmed: whether the estimate was learned
+    before, and the samples merely do not deny it; supported: whether they alone are precise enough
+    to speak for it.
     contradiction: fit of samples that nothing explains, around what was known; None while there are
     none. held: covariance (3, 3) of the m, c_r, c_l that are published, None before. learned: the G
     of low order that explains y. reattributed, outliers: commands that turned out to be others, and
@@ -97,6 +98,7 @@ class Learning:
     strayed: bool = False
     contradicted_from: int | None = None
     consistent: int = 0
+    agreed: int = 0
     next_try: int = 0
     refitted: bool = False
     changed: Prior | None = None

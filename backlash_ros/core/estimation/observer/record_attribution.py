@@ -5,11 +5,13 @@ again, and y moves by what G makes of that. An outlier moves one y alone. Both l
 in the innovations e of the fit, whitened as by an observer:
 
     gain in log-likelihood = (s.e - s.s / 2) / sigma^2         another command: s is known
-                             (s.e)^2 / (2 s.s sigma^2)         an outlier: its size is free
+                             (s.e)^2 / (2 s.s sigma^2)         a command that nobody knows of, or
+                                                               an outlier: its size is free
 
 Where that is more than the odds against it, and remains so once all follows from it, it is
 believed; the largest first, until there is none. sigma is told by the median of |e|: what is looked
-for does not widen it.
+for does not widen it. A fit that has taken in many wrong commands is wrong itself, and so fit and
+commands are found in turn.
 
 References: A. S. Willsky, H. L. Jones, A generalized likelihood ratio approach to the detection and
 estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1976) 108-112; C. Chen,
@@ -29,7 +31,7 @@ from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import GATE, ODDS
 from backlash_ros.core.estimation.fit.pace import Pace
-from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
+from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, labelled
 from backlash_ros.core.estimation.fit.solution import Around
 from backlash_ros.core.estimation.fit.window_fit import NO_RESIDUAL
 from backlash_ros.core.estimation.observer.observer import RATIOS, gain_of
@@ -42,29 +44,58 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Places = NDArray[np.intp]
 
-AGAINST_ANOTHER = log(ODDS)  # log-likelihood that the other command has to gain
-AGAINST_AN_OUTLIER = 0.5 * GATE**2  # log-likelihood that an outlier has to gain
-WHITE = RATIOS[len(RATIOS) // 2]  # noise on u that innovations are whitened for
+TOLD, OTHER, UNKNOWN = range(3)  # rows of the commands that may have acted over an interval
+SURPRISE = -0.5 * GATE**2  # log-odds of what nothing but y speaks for: an outlier is one as well
+LOG_ODDS: Array = np.array([0.0, -log(ODDS), SURPRISE])  # of these rows
+# Noise on u that innovations are whitened for, the likelier of these: the more of it, the shorter
+# the signatures, but those of neighbours become alike.
+WHITE = RATIOS[len(RATIOS) // 2:][:2]
 FILLED = 3  # times that lost outputs are replaced by what was expected: those in a row
+ROUNDS = 12  # fits, at most, that are made in turn with the choice of commands
 
 
 class Attributed(NamedTuple):
-    """v (N,) that acted over a record, and which y (N,) are outliers."""
+    """v (N,) that acted over a record, and which y (N,) are outliers.
+
+    unknown: intervals (N,) over which a command acted that nobody knows of.
+    """
 
     v: Array
     outliers: Flags
+    unknown: Flags
+
+
+class _Choice(NamedTuple):
+    """Which command acted over each interval (N,), by its row, and which y (N,) are outliers."""
+
+    row: Places
+    outliers: Flags
+
+
+def as_told(v: Array) -> Attributed:
+    """Nothing but what was told acted."""
+    none = np.zeros(len(v), dtype=np.bool_)
+    return Attributed(v, none, none)
 
 
 def with_other_commands(
     result: Fitted, v: Array, y: Array, other: Array, around: Around, pace: Pace,
 ) -> Generator[None, None, tuple[Fitted, Attributed]]:
-    """The fit around this with the commands that another one says have acted, and these.
+    """The fit around this with the commands that it says have acted, and these.
 
-    result: fit of v (N,) and y (N,) that says so; it stays where it says nothing. other: see
-    `attributed`.
+    Commands and fit in turn, until both stand. result: fit of v (N,) and y (N,); it stays where it
+    says nothing. other: see `attributed`.
     """
-    found = yield from attributed(result, v, y, other)
-    if not found.outliers.any() and np.array_equal(found.v, v):
+    commands, now = _alternatives(v, other), _told(v)
+    for _ in range(ROUNDS):
+        before, now = now, (yield from _chosen(result, commands, now, y))
+        if np.array_equal(now.row, before.row) and np.array_equal(now.outliers, before.outliers):
+            break
+        acted, known = _acted(commands, now.row), np.where(now.outliers, np.nan, y)
+        start = result.beginning(acted)
+        result = yield from labelled(acted, known, around, start, result.solution.m, pace)
+    found = _attributed(commands, now)
+    if not (found.outliers.any() or now.row.any()):
         return result, found
     start, slope = result.beginning(found.v), result.solution.m
     known = np.where(found.outliers, np.nan, y)
@@ -79,28 +110,54 @@ def attributed(
     Stops between its steps. other: commands that may have acted instead (N,), nan where none may;
     where there is none at all, it says nothing.
     """
-    now = Attributed(v, np.zeros(len(v), dtype=np.bool_))
-    if not (np.isfinite(other).any() and np.isfinite(y).any()):
+    commands = _alternatives(v, other)
+    return _attributed(commands, (yield from _chosen(result, commands, _told(v), y)))
+
+
+def _alternatives(v: Array, other: Array) -> Array:
+    """Commands that may have acted over each interval, shape (3, N); unknown ones are set later."""
+    return np.stack([v, other, v])
+
+
+def _told(v: Array) -> _Choice:
+    return _Choice(np.full(len(v), TOLD, dtype=np.intp), np.zeros(len(v), dtype=np.bool_))
+
+
+def _acted(commands: Array, row: Places) -> Array:
+    return np.asarray(commands[row, np.arange(len(row))])
+
+
+def _attributed(commands: Array, choice: _Choice) -> Attributed:
+    return Attributed(_acted(commands, choice.row), choice.outliers, choice.row == UNKNOWN)
+
+
+def _chosen(
+    result: Fitted, commands: Array, now: _Choice, y: Array,
+) -> Generator[None, None, _Choice]:
+    """The likeliest choice, from the one that the fit has taken in on."""
+    if not (np.isfinite(commands[OTHER]).any() and np.isfinite(y).any()):
         return now
     model = result.fit.model
-    gain = gain_of(model, WHITE)
-    if result.solution.crossings is None or gain is None:
+    gains = [gain.gain for ratio in WHITE if (gain := gain_of(model, ratio)) is not None]
+    if result.solution.crossings is None or not gains:
         return now
-    yield
-    search = _Search(result, _Whitening(model, gain.gain), v, y, other)
-    here = search.beginning
+    # What was an outlier for another fit has to be one for this one as well.
+    now = now._replace(outliers=np.zeros(len(y), dtype=np.bool_))
+    searches = [_Search(result, _Whitening(model, gain), commands, now.row, y) for gain in gains]
+    search = min(searches, key=lambda each: each.at(now).noise_std)
+    here = search.at(now)
     while True:
         yield
         places = search.likely(now, here)
         if not len(places):
             return now
         yield
-        before, now = here, search.exchanged(now, places)
-        here = search.at(now)
-        refused = search.refused(places, before.e, here.e)
+        before, now = now, search.exchanged(now, places)
+        expected, here = here, search.at(now)
+        refused = search.refused(before, places, expected, here.e) % len(y)
         if len(refused):
             yield
-            now = search.exchanged(now, refused)
+            now.row[refused], now.outliers[refused] = before.row[refused], before.outliers[refused]
             here = search.at(now)
 
 
@@ -132,83 +189,94 @@ class _Whitening:
 
 
 class _Place(NamedTuple):
-    """Play output (N,) and innovations (N,) in units of their deviation, for some commands."""
+    """Play output (N,), innovations (N,) and their deviation, for some choice."""
 
     p: Array
     e: Array
+    noise_std: float
 
 
 class _Search:
     """Looks for places where another command acted, or where y is an outlier.
 
-    Numbers below N stand for commands, from N on for readings. beginning: what follows from those
-    that were told.
+    Place `row N + k` stands for a command of interval k, and behind all of them there is one for
+    each reading. taken: rows of the commands that the fit has taken in (N,).
     """
 
     def __init__(
-        self, result: Fitted, whitening: _Whitening, v: Array, y: Array, other: Array,
+        self, result: Fitted, whitening: _Whitening, commands: Array, taken: Places, y: Array,
     ) -> None:
         fit, solution, _ = result
         self._whitening, self._gap, self._p0 = whitening, solution.gap, solution.start
-        self._m, self._v, self._other = solution.m, v, other
+        self._m, self._commands = solution.m, commands
         self._known = np.isfinite(y)
         residual = fit.samples.unweighted_residual(solution.posterior, y)
         self._residual = np.where(self._known, residual, 0.0)
-        self._told = play(v, self._gap, self._p0)[0]
-        self._open: Flags = np.concatenate([np.isfinite(other), self._known])
-        e = whitening.innovations(self._residual, np.zeros(len(v)), self._known)
-        self._noise_std = max(
-            bulk_std(e[self._known]), resolution_of(y) / sqrt(12.0), NO_RESIDUAL * fit.extent[0]
-        )
-        self.beginning = _Place(self._told, e / self._noise_std)
+        self._taken = self._play(taken)
+        self._least_std = max(resolution_of(y) / sqrt(12.0), NO_RESIDUAL * fit.extent[0])
+        self._open: Flags = np.append(np.isfinite(commands).ravel(), self._known)
 
-    def at(self, of: Attributed) -> _Place:
-        """What follows from these commands and outliers."""
-        p = play(of.v, self._gap, self._p0)[0]
-        change, known = self._m * (p - self._told), self._known & ~of.outliers
-        return _Place(
-            p, self._whitening.innovations(self._residual, change, known) / self._noise_std
-        )
+    def at(self, choice: _Choice) -> _Place:
+        """What follows from this choice."""
+        p = self._play(choice.row)
+        change, known = self._m * (p - self._taken), self._known & ~choice.outliers
+        e = self._whitening.innovations(self._residual, change, known)
+        return _Place(p, e, max(bulk_std(e[known]), self._least_std))
 
-    def likely(self, now: Attributed, here: _Place) -> Places:
+    def _play(self, row: Places) -> Array:
+        return play(_acted(self._commands, row), self._gap, self._p0)[0]
+
+    def likely(self, now: _Choice, here: _Place) -> Places:
         """Places where that is likely, no two so close that one tells of the other."""
-        (p, e), (of_u, of_y) = here, self._whitening.signatures
-        # Without what the play output remembers of it: `refused` looks at that as well.
-        there = np.clip(np.append(self._p0, p[:-1]), self._other, self._other + self._gap)
-        move = (there - p) * (self._m / self._noise_std)
+        (p, e, noise_std), (of_u, of_y) = here, self._whitening.signatures
+        count, reach, e = len(e), len(of_u), e / noise_std
         seen = (self._known & ~now.outliers).astype(np.float64)
-        gains = np.concatenate([
-            move * _ahead(e, of_u) - 0.5 * move**2 * _ahead(seen, of_u**2) - AGAINST_ANOTHER,
-            0.5 * _ahead(e, of_y)**2 / float(of_y @ of_y) - AGAINST_AN_OUTLIER,
-        ])
+        towards, squares = _ahead(e, of_u), _ahead(seen, of_u**2)
+        # Without what the play output remembers of it: `refused` looks at that as well.
+        held = np.append(self._p0, p[:-1])
+        there = np.clip(held, self._commands, self._commands + self._gap)
+        move = (there - p) * (self._m / noise_std)
+        move[UNKNOWN] = np.divide(towards, squares, out=np.zeros(count), where=squares > 0.0)
+        of_commands = move * towards - 0.5 * move**2 * squares
+        of_outliers = 0.5 * _ahead(e, of_y)**2 / float(of_y @ of_y)
+        gains = np.append(of_commands.ravel(), of_outliers) - self._against(now)
+        # Those that act; but an unknown one may turn out to be yet another one.
+        self._open[now.row * count + np.arange(count)] &= now.row == UNKNOWN
         likely = np.flatnonzero(self._open & (gains > 0.0))
         places: list[int] = []
-        free, count, reach = np.ones(len(e), dtype=np.bool_), len(e), len(of_u)
+        free = np.ones(count, dtype=np.bool_)
         for place in likely[np.argsort(-gains[likely])].tolist():
             k = place % count
             if free[k]:
                 places.append(place)
                 free[max(k - reach + 1, 0):k + reach] = False
         self._open[places] = False
+        leads = p + move[UNKNOWN] * (noise_std / self._m)
+        for k in (place % count for place in places if place // count == UNKNOWN):
+            self._commands[UNKNOWN, k] = leads[k] if leads[k] > held[k] else leads[k] - self._gap
         return np.array(sorted(places, key=lambda place: place % count), dtype=np.intp)
 
-    def exchanged(self, now: Attributed, places: Places) -> Attributed:
-        """The same but for these places, where it is the other way round."""
-        v, outliers, count = now.v.copy(), now.outliers.copy(), len(now.v)
-        commands, readings = places[places < count], places[places >= count] - count
-        told, other = self._v[commands], self._other[commands]
-        v[commands] = np.where(v[commands] == told, other, told)
-        outliers[readings] ^= True
-        return Attributed(v, outliers)
+    @staticmethod
+    def _against(now: _Choice) -> Array:
+        """Log-likelihood that each place has to gain."""
+        against = LOG_ODDS[now.row] - LOG_ODDS[:, None]
+        return np.append(against.ravel(), np.full(len(now.row), -SURPRISE))
 
-    def refused(self, places: Places, e: Array, after: Array) -> Places:
+    def exchanged(self, now: _Choice, places: Places) -> _Choice:
+        """The same but for these places."""
+        row, outliers, count = now.row.copy(), now.outliers.copy(), len(now.row)
+        of_commands = places < self._commands.size
+        commands, readings = places[of_commands], places[~of_commands]
+        row[commands % count], outliers[readings % count] = commands // count, True
+        return _Choice(row, outliers)
+
+    def refused(self, now: _Choice, places: Places, here: _Place, after: Array) -> Places:
         """Those of these places at which e became no smaller by so much as was expected."""
-        count, reach = len(e), len(self._whitening.signatures[0])
+        e, count, reach = here.e, len(after), len(self._whitening.signatures[0])
         begins = places % count
         ends = np.minimum(begins + reach, np.append(begins[1:], count))
-        less = np.append(0.0, np.cumsum(0.5 * (e**2 - after**2)))
-        against = np.where(places < count, AGAINST_ANOTHER, AGAINST_AN_OUTLIER)
-        return np.asarray(places[less[ends] - less[begins] <= against])
+        less = np.append(0.0, np.cumsum(0.5 * (e**2 - after**2) / here.noise_std**2))
+        return np.asarray(places[less[ends] - less[begins] <= self._against(now)[places]])
 
 
 def _ahead(values: Array, signature: Array) -> Array:
