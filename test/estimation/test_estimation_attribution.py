@@ -109,28 +109,38 @@ def test_a_refit_takes_in_no_sample_that_was_not_compared_with_the_fit() -> None
 
 
 @pytest.mark.parametrize('delay', [1, 2])
-def test_what_acted_is_found_in_a_record(delay: int) -> None:
+@pytest.mark.parametrize(('outliers', 'unknown'), [([50, 200, 201, 350], []), ([], [120, 270])])
+def test_what_acted_is_found_in_a_record(
+    outliers: list[int], unknown: list[int], delay: int,
+) -> None:
     model = StateModel(TransferFunction([0.5], [1.0, -0.5, *[0.0] * (delay - 1)]))
     rng = np.random.default_rng(3)
     sent = 5.0 * np.sin(0.1 * np.arange(400))
     before = np.append(0.0, sent[:-1])
     acted = np.where(rng.random(400) < 0.2, before, sent)
+    acted[unknown] = 0.5
     p, y, state = 0.0, [], Observer(model, NOISE)
     for value in acted.tolist():
         p = min(max(p, value), value + C_R - C_L)
         y.append(state.predict(M * (p - C_R)))
     measured = np.array(y) + NOISE * rng.standard_normal(400)
-    measured[[50, 200, 201, 350]] += 0.1
+    measured[outliers] += 0.1
     measured[300] = np.nan
     around = Around(build_error_model(model, 0.2), NOISE)
     start = Start(C_R - C_L, 0.0)
     # The parameters of the plant with every command as it was sent.
     true = drained(fitted(acted, np.array(y), around, start, M, Pace()))
     sent_fit = drained(labelled(sent, measured, around, true.fit.start, M, Pace())).fit
-    found = drained(attributed(Fitted(sent_fit, true.solution), sent, measured, before))
+    found = drained(attributed(
+        Fitted(sent_fit, true.solution), sent, measured, before, Pace()
+    ))
     # While v turns, or is in the gap, one acts like the other.
     tells = np.abs(sent - before) > 0.2
+    tells[unknown] = False
     wrong = np.count_nonzero((found.v != acted) & tells)
     assert np.count_nonzero((sent != acted) & tells) > 40
     assert wrong <= 4
-    assert np.flatnonzero(found.outliers).tolist() == [50, 200, 201, 350]
+    assert np.flatnonzero(found.outliers).tolist() == outliers
+    # Commands that are neither of the two.
+    assert np.flatnonzero(found.unknown).tolist() == unknown
+    assert np.allclose(found.v[unknown], acted[unknown], atol=0.02)

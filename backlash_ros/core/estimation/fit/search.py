@@ -64,7 +64,7 @@ def search(
         return Found([], 0.0)
     comparison = Comparison(v, y, weights, model, error, told_std)
     null = comparison.null
-    gaps: Array = np.append(0.0, np.geomspace(NO_GAP * swing, top, GAPS))
+    gaps: Array = np.append(0.0, np.geomspace(min(NO_GAP * swing, top), top, GAPS))
     coarse = yield from comparison.best_per_gap(gaps, STARTS, pace)
     best = max(coarse)
     width, count = ZOOM

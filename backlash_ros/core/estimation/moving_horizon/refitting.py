@@ -143,5 +143,6 @@ def _attribute(learning: Learning, current: Fitted) -> Generator[None, None, Non
     """Let those v have acted over the record that its fit speaks for, and lose its outliers."""
     first = learning.record.first
     v, y = learning.taken_since(first)
-    found = yield from attributed(current, v, y, learning.record.others(first)[:len(v)])
+    others = learning.record.others(first)[:len(v)]
+    found = yield from attributed(current, v, y, others, learning.pace)
     learning.believe(found, first)

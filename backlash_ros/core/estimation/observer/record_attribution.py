@@ -81,21 +81,13 @@ def as_told(v: Array) -> Attributed:
 def with_other_commands(
     result: Fitted, v: Array, y: Array, other: Array, around: Around, pace: Pace,
 ) -> Generator[None, None, tuple[Fitted, Attributed]]:
-    """The fit around this with the commands that it says have acted, and these.
+    """The fit around this with the commands that another one says have acted, and these.
 
-    Commands and fit in turn, until both stand. result: fit of v (N,) and y (N,); it stays where it
-    says nothing. other: see `attributed`.
+    result: fit of v (N,) and y (N,) that says so; it stays where it says nothing. other: see
+    `attributed`.
     """
-    commands, now = _alternatives(v, other), _told(v)
-    for _ in range(ROUNDS):
-        before, now = now, (yield from _chosen(result, commands, now, y))
-        if np.array_equal(now.row, before.row) and np.array_equal(now.outliers, before.outliers):
-            break
-        acted, known = _acted(commands, now.row), np.where(now.outliers, np.nan, y)
-        start = result.beginning(acted)
-        result = yield from labelled(acted, known, around, start, result.solution.m, pace)
-    found = _attributed(commands, now)
-    if not (found.outliers.any() or now.row.any()):
+    found = yield from attributed(result, v, y, other, pace)
+    if not found.outliers.any() and np.array_equal(found.v, v):
         return result, found
     start, slope = result.beginning(found.v), result.solution.m
     known = np.where(found.outliers, np.nan, y)
@@ -103,32 +95,27 @@ def with_other_commands(
 
 
 def attributed(
-    result: Fitted, v: Array, y: Array, other: Array,
+    result: Fitted, v: Array, y: Array, other: Array, pace: Pace,
 ) -> Generator[None, None, Attributed]:
     """What a fit says of v (N,) and y (N,), nan where lost, that it has taken in or refused.
 
     Stops between its steps. other: commands that may have acted instead (N,), nan where none may;
     where there is none at all, it says nothing.
     """
-    commands = _alternatives(v, other)
-    return _attributed(commands, (yield from _chosen(result, commands, _told(v), y)))
-
-
-def _alternatives(v: Array, other: Array) -> Array:
-    """Commands that may have acted over each interval, shape (3, N); unknown ones are set later."""
-    return np.stack([v, other, v])
-
-
-def _told(v: Array) -> _Choice:
-    return _Choice(np.full(len(v), TOLD, dtype=np.intp), np.zeros(len(v), dtype=np.bool_))
+    commands = np.stack([v, other, v])  # the unknown ones are still to be found
+    now = _Choice(np.full(len(v), TOLD, dtype=np.intp), np.zeros(len(v), dtype=np.bool_))
+    for _ in range(ROUNDS):
+        before, now = now, (yield from _chosen(result, commands, now, y))
+        if np.array_equal(now.row, before.row) and np.array_equal(now.outliers, before.outliers):
+            break
+        acted, known = _acted(commands, now.row), np.where(now.outliers, np.nan, y)
+        start, slope = result.beginning(acted), result.solution.m
+        result = yield from labelled(acted, known, result.around, start, slope, pace)
+    return Attributed(_acted(commands, now.row), now.outliers, now.row == UNKNOWN)
 
 
 def _acted(commands: Array, row: Places) -> Array:
     return np.asarray(commands[row, np.arange(len(row))])
-
-
-def _attributed(commands: Array, choice: _Choice) -> Attributed:
-    return Attributed(_acted(commands, choice.row), choice.outliers, choice.row == UNKNOWN)
 
 
 def _chosen(
@@ -141,8 +128,6 @@ def _chosen(
     gains = [gain.gain for ratio in WHITE if (gain := gain_of(model, ratio)) is not None]
     if result.solution.crossings is None or not gains:
         return now
-    # What was an outlier for another fit has to be one for this one as well.
-    now = now._replace(outliers=np.zeros(len(y), dtype=np.bool_))
     searches = [_Search(result, _Whitening(model, gain), commands, now.row, y) for gain in gains]
     search = min(searches, key=lambda each: each.at(now).noise_std)
     here = search.at(now)
@@ -150,7 +135,7 @@ def _chosen(
         yield
         places = search.likely(now, here)
         if not len(places):
-            return now
+            return search.without_expected(now)
         yield
         before, now = now, search.exchanged(now, places)
         expected, here = here, search.at(now)
@@ -209,6 +194,7 @@ class _Search:
         fit, solution, _ = result
         self._whitening, self._gap, self._p0 = whitening, solution.gap, solution.start
         self._m, self._commands = solution.m, commands
+        self._least, self._most = np.nanmin(commands[:UNKNOWN]), np.nanmax(commands[:UNKNOWN])
         self._known = np.isfinite(y)
         residual = fit.samples.unweighted_residual(solution.posterior, y)
         self._residual = np.where(self._known, residual, 0.0)
@@ -223,6 +209,12 @@ class _Search:
         e = self._whitening.innovations(self._residual, change, known)
         return _Place(p, e, max(bulk_std(e[known]), self._least_std))
 
+    def without_expected(self, now: _Choice) -> _Choice:
+        """The same without outliers that this fit expects: they were none."""
+        all_known = self.at(now._replace(outliers=np.zeros_like(now.outliers)))
+        expected = np.abs(all_known.e) < GATE * self.at(now).noise_std
+        return now._replace(outliers=now.outliers & ~expected)
+
     def _play(self, row: Places) -> Array:
         return play(_acted(self._commands, row), self._gap, self._p0)[0]
 
@@ -236,12 +228,19 @@ class _Search:
         held = np.append(self._p0, p[:-1])
         there = np.clip(held, self._commands, self._commands + self._gap)
         move = (there - p) * (self._m / noise_std)
-        move[UNKNOWN] = np.divide(towards, squares, out=np.zeros(count), where=squares > 0.0)
+        wanted = np.divide(towards, squares, out=np.zeros(count), where=squares > 0.0)
+        leads = p + wanted * (noise_std / self._m)
+        # It was sent some time: no further than those that are known.
+        leads = np.clip(
+            leads, np.minimum(held, self._least + self._gap), np.maximum(held, self._most)
+        )
+        move[UNKNOWN] = (leads - p) * (self._m / noise_std)
         of_commands = move * towards - 0.5 * move**2 * squares
         of_outliers = 0.5 * _ahead(e, of_y)**2 / float(of_y @ of_y)
         gains = np.append(of_commands.ravel(), of_outliers) - self._against(now)
         # Those that act; but an unknown one may turn out to be yet another one.
         self._open[now.row * count + np.arange(count)] &= now.row == UNKNOWN
+        self._open[-count:] &= ~now.outliers
         likely = np.flatnonzero(self._open & (gains > 0.0))
         places: list[int] = []
         free = np.ones(count, dtype=np.bool_)
@@ -251,7 +250,6 @@ class _Search:
                 places.append(place)
                 free[max(k - reach + 1, 0):k + reach] = False
         self._open[places] = False
-        leads = p + move[UNKNOWN] * (noise_std / self._m)
         for k in (place % count for place in places if place // count == UNKNOWN):
             self._commands[UNKNOWN, k] = leads[k] if leads[k] > held[k] else leads[k] - self._gap
         return np.array(sorted(places, key=lambda place: place % count), dtype=np.intp)
