@@ -20,8 +20,6 @@ CONFIG = Path('geared_motor.yaml')
 SECONDS, LEARNED_S = 4.0, 3.0
 
 
-# Without the commands that nobody knows of, or without a fit of those that were found before others
-# are looked for, 3 and 11 take longer than that.
 @pytest.mark.parametrize('use', ['false', 'auto'])
 @pytest.mark.parametrize('seed', [3, 11])
 def test_late_commands_and_outputs_do_not_keep_it_from_learning(seed: int, use: str) -> None:
