@@ -121,7 +121,7 @@ def _acted(commands: Array, row: Places) -> Array:
 def _chosen(
     result: Fitted, commands: Array, now: _Choice, y: Array,
 ) -> Generator[None, None, _Choice]:
-    """The likeliest choice, from the one that the fit has taken in on."""
+    """The likeliest choice, starting from the one that the fit has taken in."""
     if not (np.isfinite(commands[OTHER]).any() and np.isfinite(y).any()):
         return now
     model = result.fit.model
