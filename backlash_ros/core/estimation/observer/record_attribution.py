@@ -102,6 +102,8 @@ def attributed(
     Stops between its steps. other: commands that may have acted instead (N,), nan where none may;
     where there is none at all, it says nothing.
     """
+    if not (np.isfinite(other).any() and np.isfinite(y).any()):
+        return as_told(v)
     commands = np.stack([v, other, v])  # the unknown ones are still to be found
     now = _Choice(np.full(len(v), TOLD, dtype=np.intp), np.zeros(len(v), dtype=np.bool_))
     for _ in range(ROUNDS):
@@ -122,20 +124,19 @@ def _chosen(
     result: Fitted, commands: Array, now: _Choice, y: Array,
 ) -> Generator[None, None, _Choice]:
     """The likeliest choice, starting from the one that the fit has taken in."""
-    if not (np.isfinite(commands[OTHER]).any() and np.isfinite(y).any()):
-        return now
     model = result.fit.model
     gains = [gain.gain for ratio in WHITE if (gain := gain_of(model, ratio)) is not None]
     if result.solution.crossings is None or not gains:
         return now
     searches = [_Search(result, _Whitening(model, gain), commands, now.row, y) for gain in gains]
-    search = min(searches, key=lambda each: each.at(now).noise_std)
-    here = search.at(now)
+    search, here = min(
+        ((each, each.at(now)) for each in searches), key=lambda pair: pair[1].noise_std
+    )
     while True:
         yield
         places = search.likely(now, here)
         if not len(places):
-            return search.without_expected(now)
+            return search.without_expected(now, here)
         yield
         before, now = now, search.exchanged(now, places)
         expected, here = here, search.at(now)
@@ -209,10 +210,10 @@ class _Search:
         e = self._whitening.innovations(self._residual, change, known)
         return _Place(p, e, max(bulk_std(e[known]), self._least_std))
 
-    def without_expected(self, now: _Choice) -> _Choice:
+    def without_expected(self, now: _Choice, here: _Place) -> _Choice:
         """The same without outliers that this fit expects: they were none."""
         all_known = self.at(now._replace(outliers=np.zeros_like(now.outliers)))
-        expected = np.abs(all_known.e) < GATE * self.at(now).noise_std
+        expected = np.abs(all_known.e) < GATE * here.noise_std
         return now._replace(outliers=now.outliers & ~expected)
 
     def _play(self, row: Places) -> Array:
