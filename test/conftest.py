@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 # Before numpy reads it, as `make test` has it: the workers would take the processors from each
@@ -13,9 +13,12 @@ import pytest
 from bringup_processes import Session, bringup_sessions
 from hypothesis import HealthCheck, settings
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from scheduling import FromBothEnds, give_way, starts_processes
+from scheduling import FromBothEnds, give_way, starts_processes, waits_for_processes
+from standstill import LOOK_BACK_S, Standstill, excuse
 from undrawn import leave_out
 from xdist.remote import Producer
+
+STANDSTILL = Standstill()
 
 settings.register_profile(
     'repeatable', derandomize=True, database=None, deadline=None, max_examples=60,
@@ -34,6 +37,7 @@ def pytest_configure() -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     give_way()
+    STANDSTILL.start()
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -52,6 +56,25 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if starts_processes(item.path):
             item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out a test against the clock while the machine itself stands still."""
+    if starts_processes(item.path) and (reason := STANDSTILL.reason(LOOK_BACK_S)):
+        pytest.skip(reason)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(
+    item: pytest.Item, call: pytest.CallInfo[None],
+) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """The same for one that has waited in vain while the machine stood still."""
+    report = yield
+    if report.failed and waits_for_processes(item.path):
+        reason = STANDSTILL.reason(max(call.duration, LOOK_BACK_S))
+        if reason:
+            excuse(report, reason)
+    return report
 
 
 @pytest.fixture

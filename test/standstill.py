@@ -1,0 +1,67 @@
+"""Whether the machine runs at all: what a test with processes needs, and cannot bring about.
+
+A virtual machine may be held back by its host for a second at once, whatever runs on it. A loop of
+5 ms does not exist there, and a test of it tells of the host, not of the package.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+import pytest
+
+TICK_S = 0.01
+STALL_S = 0.1  # two busy workers with their processes delay a thread that wakes by far less
+TOLERATED = 0.25  # share of the time that stalls may take
+LOOK_BACK_S = 5.0  # before a test, and at least for one that has failed
+KEPT = 10_000  # stalls: the last quarter of an hour, were there nothing else
+
+
+class Standstill:
+    """Hears its own timer tick, and keeps when it did not: (begin, end) of each stall [s]."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._since = self._heard = clock()
+        self._stalls: deque[tuple[float, float]] = deque(maxlen=KEPT)
+
+    def start(self) -> None:
+        """Listen from now on, until the process ends."""
+        threading.Thread(target=self._listen, name='standstill', daemon=True).start()
+
+    def _listen(self) -> None:
+        while True:
+            time.sleep(TICK_S)
+            self.tick()
+
+    def tick(self) -> None:
+        """Take note of the time that has passed since the last tick."""
+        now = self._clock()
+        if now - self._heard > STALL_S:
+            self._stalls.append((self._heard, now))
+        self._heard = now
+
+    def share(self, seconds: float) -> float:
+        """Share of the last seconds that stalls took, 0 to 1."""
+        now = self._clock()
+        begin = max(now - seconds, self._since)
+        if now <= begin:
+            return 0.0
+        return sum(max(0.0, end - max(start, begin)) for start, end in self._stalls) / (now - begin)
+
+    def reason(self, seconds: float) -> str | None:
+        """Why a test with processes says nothing about the last seconds, or None."""
+        share = self.share(seconds)
+        if share <= TOLERATED:
+            return None
+        return f'the machine stood still for {share:.0%} of {seconds:.0f} s: nothing is timely here'
+
+
+def excuse(report: pytest.TestReport, reason: str) -> None:
+    """Turn the report of a failure into that of a test that was skipped."""
+    path, line, _ = report.location
+    report.outcome = 'skipped'
+    report.longrepr = path, line or 0, f'Skipped: {reason}'
