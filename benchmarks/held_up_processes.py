@@ -15,12 +15,14 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from itertools import product
+from math import inf
 from pathlib import Path
 from typing import NamedTuple
 
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
+from accuracy.motor_crossings import BOUND_S, LIMITS, crossing_error
 from accuracy.simulated_processes import WAITS, HeldUpProcesses
 from reporting import (
     CHECK_HEADER,
@@ -31,7 +33,6 @@ from reporting import (
     processors,
     text_table,
 )
-from simulated_motor import C_L, C_R
 
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.tools.config.configuration import effective_parameters
@@ -40,8 +41,6 @@ CONFIG = Path('geared_motor.yaml')
 DOCUMENT = ROOT / 'docs' / 'results' / 'held_up_processes.md'
 SEEDS, SECONDS = 12, 6.0
 LOADS = (0.4, 1.0)
-LIMITS = {'auto': 0.01, 'false': 0.03}  # relative error, by estimator.use_applied_control
-BOUND_S = 5.0
 MOST_OFF = 5.0  # deviations of a wrong estimate
 
 
@@ -73,18 +72,15 @@ def run(job: tuple[Case, int], seconds: float) -> Run:
     p = effective_parameters(CONFIG, [f'estimator.use_applied_control={case.use}'])
     processes = HeldUpProcesses(p, case.load, seed, reports=case.use != 'false')
     heard = processes.run(seconds)
-    settled_s, wrong, error = 0.0, 0, 0.0
+    settled_s, wrong, at_end = 0.0, 0, inf
     for time_s, e in heard:
-        off = abs(e.c_r - C_R), abs(e.c_l - C_L)
-        error = max(off[0] / C_R, off[1] / -C_L)
-        if not error <= LIMITS[case.use]:
+        at_end, off = crossing_error(e.c_r, e.c_l, e.std_c_r, e.std_c_l)
+        if not at_end <= LIMITS[case.use]:
             settled_s = time_s
-        wrong += e.status is Status.TRACKING and (
-            off[0] > MOST_OFF * e.std_c_r or off[1] > MOST_OFF * e.std_c_l
-        )
+        wrong += e.status is Status.TRACKING and off > MOST_OFF
     loop, samples = processes.loop, seconds / processes.period
     return Run(
-        settled_s, error, wrong * processes.period, loop.commands.late / len(heard),
+        settled_s, at_end, wrong * processes.period, loop.commands.late / len(heard),
         loop.statistics.lost / samples,
     )
 

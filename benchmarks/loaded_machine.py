@@ -20,16 +20,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import product
 from math import inf
-from pathlib import Path
 
 # Before rclpy reads it, and before numpy is imported.
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 os.environ.setdefault('OMP_NUM_THREADS', '1')
-sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
 
 import numpy as np
 import rclpy
-import simulated_motor
+from accuracy.motor_crossings import BOUND_S, LIMITS, CrossingError, crossing_error
 from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -57,10 +55,7 @@ DOCUMENT = ROOT / 'docs' / 'results' / 'loaded_machine.md'
 BUSY_LOOP = ROOT / 'benchmarks' / 'real_time' / 'busy_loop.py'
 DRIVER = ROOT / 'examples' / 'motor_driver.py'
 PERIOD_S = 0.005  # of both
-TRUTH = simulated_motor.C_R, simulated_motor.C_L
 LOADS = (0.5, 0.8)
-LIMITS = {'auto': 0.01, 'false': 0.03}  # relative error, by estimator.use_applied_control
-BOUND_S = 5.0
 START_S = 30.0  # for the processes to begin
 SLOWEST = 3.0  # times as long as the run is to last, at most
 KEPT = 100  # messages that may wait for the listener
@@ -73,8 +68,7 @@ class Run:
     latencies_s: from y to v.
     """
 
-    errors: dict[int, float] = field(default_factory=dict)  # largest relative one of c_r, c_l
-    off: dict[int, float] = field(default_factory=dict)  # the same over its deviation
+    errors: dict[int, CrossingError] = field(default_factory=dict)
     states: Counter[Status] = field(default_factory=Counter)
     latencies_s: list[float] = field(default_factory=list)
 
@@ -85,7 +79,7 @@ class Run:
 
     def settled_s(self, limit: float) -> float:
         """Time from which on the error stays within the limit [s]; inf if it does not."""
-        beyond = [k for k, error in self.errors.items() if not error <= limit]
+        beyond = [k for k, error in self.errors.items() if not error.relative <= limit]
         since = min((k for k in self.errors if k > max(beyond, default=-1)), default=None)
         return inf if since is None else (since - min(self.errors)) * PERIOD_S
 
@@ -96,18 +90,14 @@ class Listener(Node):
     def __init__(self, context: Context) -> None:
         super().__init__('listener', context=context)
         self.run = Run()
-        self._sample = topics.ESTIMATE_LABELS.index('sample')
         self.create_subscription(Float64MultiArray, topics.ESTIMATES, self._on_estimates, KEPT)
         self.create_subscription(Float64MultiArray, topics.SIGNALS, self._on_signals, KEPT)
 
     def _on_estimates(self, message: Float64MultiArray) -> None:
         values = dict(zip(topics.ESTIMATE_LABELS, message.data, strict=True))
-        errors = [
-            abs(values[name] - truth) for name, truth in zip(('c_r', 'c_l'), TRUTH, strict=True)
-        ]
-        k = int(values['sample'])
-        self.run.errors[k] = max(e / abs(true) for e, true in zip(errors, TRUTH, strict=True))
-        self.run.off[k] = max(errors[0] / values['std_c_r'], errors[1] / values['std_c_l'])
+        self.run.errors[int(values['sample'])] = crossing_error(
+            *(values[name] for name in ('c_r', 'c_l', 'std_c_r', 'std_c_l'))
+        )
 
     def _on_signals(self, message: Float64MultiArray) -> None:
         values = dict(zip(topics.SIGNAL_LABELS, message.data, strict=True))
@@ -177,10 +167,10 @@ RUN_HEADER = (
 
 def row(load: float, use: str, number: int, run: Run) -> list[str]:
     """Cells of the table of runs."""
-    answered, newest = sum(run.states.values()), max(run.errors)
+    answered, at_end = sum(run.states.values()), run.errors[max(run.errors)]
     p50, p99 = 1e3 * np.quantile(run.latencies_s, [0.5, 0.99])
     return [
-        f'{load:.0%}', use, str(number), f'{run.errors[newest]:.3%}', f'{run.off[newest]:.1f}',
+        f'{load:.0%}', use, str(number), f'{at_end.relative:.3%}', f'{at_end.deviations:.1f}',
         f'{run.states[Status.TRACKING] / answered:.0%}',
         f'{run.states[Status.INCONSISTENT] / answered:.0%}',
         f'{1.0 - answered / run.samples:.0%}', f'{p50:.1f}', f'{p99:.1f}',

@@ -21,6 +21,7 @@ from real_time.loop_latency import LATENCY_HEADER, RATES_HZ
 from real_time.step_times import LAWS, MISSING, STEP_HEADER
 from reporting import CHECK_HEADER, ROOT, Check, machine, markdown_table, text_table
 
+from backlash_ros.core.control.controller import REFINE_SHARE
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.tools.config.configuration import load_config
@@ -68,7 +69,7 @@ def measure_steps(_: float) -> list[Section]:
     growth.rows = [timing.row for timing in step_times.order_timings()]
     after = Section(
         'Fits after the command',
-        f'`refine`, which may take {step_times.BUDGET:.0%} of a sample period: the mean per '
+        f'`refine`, which may take {REFINE_SHARE:.0%} of a sample period: the mean per '
         'sample, and the longest call.', step_times.REFINE_HEADER,
     )
     after.rows = step_times.refine_rows()

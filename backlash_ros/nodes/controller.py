@@ -15,7 +15,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, warnings_of
-from backlash_ros.core.control.controller import ControlStep
+from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.storage import load_estimate, worth_saving
 from backlash_ros.core.loop.command_history import REMEMBERED
@@ -50,7 +50,6 @@ from backlash_ros.nodes.runtime.spin import run
 # Share of a period for which the controller sleeps after the command: on a busy processor the
 # driver, woken by the command, would have to wait for it otherwise.
 POST_COMMAND_SLEEP = 0.05
-REFINE_SHARE = 0.3  # of a sample period for fits, after the command
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
 
 

@@ -21,6 +21,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 import simulated_motor
 
 from backlash_ros.core.assembly import build_reference
+from backlash_ros.core.control.controller import REFINE_SHARE
 from backlash_ros.core.estimation.moving_horizon import moving_horizon
 from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.loop.control_loop import ControlLoop
@@ -35,7 +36,6 @@ TRANSPORT_S = (5e-5, 2e-4)  # shortest and longest time that a message is under 
 CALL_S = 3e-5  # to read or to publish
 ANSWER_S, NOTE_S = 3e-4, 1.2e-3  # from y to v, and for what is done about the sample after that
 PIECE_S = 4e-4  # of a fit
-REFINE_SHARE = 0.3  # of a sample period for fits, as in the controller node
 
 
 class Heard(NamedTuple):

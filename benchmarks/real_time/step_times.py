@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from reporting import Check
 
 from backlash_ros.core.assembly import law_fits
+from backlash_ros.core.control.controller import REFINE_SHARE
 from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -36,7 +37,6 @@ MEDIAN_LIMITS = {
     (DEFAULT, 'proportional'): 0.5, (DEFAULT, 'tracking'): 1.5, ('lms', 'proportional'): 0.5,
 }
 P99_LIMIT = 4.0  # of the default law
-BUDGET = 0.3  # share of a sample period that refine may take
 REFERENCE_STATES = 6
 NOISE = 1e-3
 MISSING = 'filterpy is not installed: steps are not compared with it (pip install filterpy)'
@@ -232,7 +232,7 @@ def refine_rows() -> list[list[str]]:
             parameters = Parameters({
                 'structure': structure, 'output_noise_std': NOISE, 'plant.uncertainty': uncertainty,
             })
-            budget_s = BUDGET * parameters.get_float('sample_period')
+            budget_s = REFINE_SHARE * parameters.get_float('sample_period')
             sampled = Sampled(parameters, budget_s=budget_s)
             done = 0
             for until in (ACQUISITION, STEADY_FROM, STEADY_FROM + TIMED):

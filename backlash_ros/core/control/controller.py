@@ -20,6 +20,7 @@ from backlash_ros.core.plant.state_model import StateModel
 LONGEST_WAIT = 200
 # Lost outputs in a row that are stepped over; after more nothing is left to predict from them.
 LONGEST_GAP = 1000
+REFINE_SHARE = 0.3  # of a sample period for `refine`, after the command
 LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 
 
