@@ -209,7 +209,6 @@ class MovingHorizon:
             self._following.follow(
                 learning.current, self.estimate, learning.record, self.learned_model
             )
-            return
 
     def set_noise(self, noise_std: float, walk_std: float, drift_std: Array) -> None:
         """Take another first guess of the noise and the walk; whatever was learned stays.
