@@ -18,9 +18,9 @@ IMPORT = re.compile(rf'^from ({HELPERS})[. ]', re.MULTILINE)
 WAITING = re.compile(r'^import (subprocess|multiprocessing)$', re.MULTILINE)
 # Their tests look at the same runs, so one worker makes these for all of them.
 SHARE_RUNS = {
-    'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify', 'test_live',
-    'test_packaging', 'test_replay', 'test_report', 'test_report_figures', 'test_report_sections',
-    'test_two_hosts',
+    'test_actuator_fit', 'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify',
+    'test_live', 'test_packaging', 'test_physics', 'test_replay', 'test_report',
+    'test_report_figures', 'test_report_sections', 'test_rounding', 'test_two_hosts',
 }
 NICENESS = 10  # of what only computes: processes that are late would fail
 
