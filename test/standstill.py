@@ -50,7 +50,8 @@ class Standstill:
         begin = max(now - seconds, self._since)
         if now <= begin:
             return 0.0
-        return sum(max(0.0, end - max(start, begin)) for start, end in self._stalls) / (now - begin)
+        stalls = list(self._stalls)  # the thread may add to them meanwhile
+        return sum(max(0.0, end - max(start, begin)) for start, end in stalls) / (now - begin)
 
     def reason(self, seconds: float) -> str | None:
         """Why a test with processes says nothing about the last seconds, or None."""
