@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -14,18 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rosbags.highlevel import AnyReader
+from waiting import DEADLINE_S as DEADLINE_S
+from waiting import wait_until as wait_until
 
 from backlash_ros.tools.bringup import command as bringup
 
 UNDRAWN = Path(__file__).with_name('undrawn.py')
-DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
-
-
-def wait_until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
-        time.sleep(0.02)
 
 
 def marked_processes(mark: str) -> dict[int, str]:

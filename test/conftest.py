@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from bringup_processes import Session, bringup_sessions
 from hypothesis import HealthCheck, settings
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from scheduling import FromBothEnds, give_way, starts_processes, waits_for_processes
+from scheduling import FromBothEnds, give_way, starts_processes
 from standstill import LOOK_BACK_S, Standstill, excuse
 from undrawn import leave_out
 from xdist.remote import Producer
@@ -68,12 +69,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None],
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """The same for one that has waited in vain while the machine stood still."""
+    """The same for one that has failed meanwhile, or any that has waited in vain."""
     report = yield
-    if report.failed and waits_for_processes(item.path):
-        reason = STANDSTILL.reason(max(call.duration, LOOK_BACK_S))
-        if reason:
-            excuse(report, reason)
+    if report.failed and call.excinfo is not None and (
+        starts_processes(item.path)
+        or call.excinfo.errisinstance((TimeoutError, subprocess.TimeoutExpired))
+    ) and (reason := STANDSTILL.reason(max(call.duration, LOOK_BACK_S))):
+        excuse(report, reason)
     return report
 
 

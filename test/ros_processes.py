@@ -25,6 +25,8 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from waiting import DEADLINE_S as DEADLINE_S
+from waiting import wait_until as wait_until
 
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.tools.bringup.domains import free_domain
@@ -32,7 +34,6 @@ from backlash_ros.tools.bringup.environment import child_environment
 
 prefer_loopback(os.environ)  # the nodes of the tests themselves
 
-DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
 # Nodes begin where the imports have been done: a start costs 0.05 s, not 1 s. A process that has
 # imported everything, and has no node yet, is forked. What differs from python -m is the start of
 # the interpreter and its end; the tests of bringup and of the installation see both.
@@ -41,14 +42,6 @@ FORKING = multiprocessing.get_context('forkserver')
 FORKING.set_forkserver_preload([
     f'{PACKAGE}.{name}' for name in ('controller', 'plant', 'reference', 'recorder')
 ])
-
-
-def wait_until(condition: Callable[[], object], what: str, wait: Callable[[], None]) -> None:
-    """Return once condition holds; wait() passes a moment."""
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
-        wait()
 
 
 class ForkedNode:

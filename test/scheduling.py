@@ -15,7 +15,6 @@ HELPERS = '|'.join([
     'bringup_processes', r'drivers\.paced_driver', 'hosts', 'live_pages', 'ros_processes',
 ])
 IMPORT = re.compile(rf'^from ({HELPERS})[. ]', re.MULTILINE)
-WAITING = re.compile(r'^import (subprocess|multiprocessing)$', re.MULTILINE)
 # Their tests look at the same runs, so one worker makes these for all of them.
 SHARE_RUNS = {
     'test_actuator_fit', 'test_bag_repair', 'test_combinations', 'test_compare', 'test_identify',
@@ -29,12 +28,6 @@ NICENESS = 10  # of what only computes: processes that are late would fail
 def starts_processes(file: Path) -> bool:
     """Whether tests of this file start processes that keep to a time."""
     return IMPORT.search(file.read_text()) is not None
-
-
-@cache
-def waits_for_processes(file: Path) -> bool:
-    """Whether tests of this file give processes of any kind so much time and no more."""
-    return starts_processes(file) or WAITING.search(file.read_text()) is not None
 
 
 def only_computes(worker: str) -> bool:

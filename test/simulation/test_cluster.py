@@ -7,12 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.simulate import cluster as tools_cluster
@@ -20,16 +20,8 @@ from backlash_ros.tools.simulate.command import SEEDS, main
 
 HERE = '127.0.0.1'
 RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
-DEADLINE_S = 60.0
 # Nothing listens beyond this machine; the port for HTTP is open without a dashboard as well.
 QUIET = ['--host', HERE, '--no-dashboard', '--dashboard-address', f'{HERE}:0']
-
-
-def wait_for(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f'not within {DEADLINE_S:g} s: {what}'
-        time.sleep(0.02)
 
 
 class Cluster:
@@ -41,8 +33,8 @@ class Cluster:
         self.scheduler = self._start(
             'dask_scheduler', *QUIET, '--port', '0', '--scheduler-file', str(file)
         )
-        wait_for(file.exists, 'scheduler')
-        wait_for(lambda: file.read_text().endswith('}'), 'address of the scheduler')
+        wait_until(file.exists, 'scheduler')
+        wait_until(lambda: file.read_text().endswith('}'), 'address of the scheduler')
         self.address: str = json.loads(file.read_text())['address']
         # Without a nanny, which would start a killed worker anew.
         self.workers = {
@@ -71,6 +63,12 @@ class Cluster:
             if connection.status == psutil.CONN_LISTEN
         }
 
+    def is_whole(self) -> bool:
+        """Whether every worker is there."""
+        from distributed import Client
+        with Client(self.address, set_as_default=False) as client:
+            return len(client.scheduler_info()['workers']) == len(self.workers)
+
     def runs_of(self, name: str) -> list[str]:
         """What the worker has to do at present."""
         from distributed import Client
@@ -97,7 +95,7 @@ def test_killed_worker_loses_no_run_and_no_bit(cluster: Cluster, tmp_path: Path)
         env=with_source(os.environ), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )
     try:
-        wait_for(lambda: cluster.runs_of('first'), 'runs of the worker')
+        wait_until(lambda: cluster.runs_of('first'), 'runs of the worker')
         assert cluster.addresses() == {HERE}
         os.kill(cluster.workers['first'].pid, signal.SIGKILL)
         assert main([*RUNS, '--out', str(local)]) == 0
@@ -112,6 +110,7 @@ def test_killed_worker_loses_no_run_and_no_bit(cluster: Cluster, tmp_path: Path)
 def test_worker_with_other_libraries_is_refused(
     cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
+    wait_until(cluster.is_whole, 'the workers')  # simulate does so for 10 s only
     monkeypatch.setattr(tools_cluster, 'NUMERICS', ('numpy',))
     assert main([*RUNS, '--cluster', cluster.address]) == 2
     assert 'install the same versions' in capsys.readouterr().err

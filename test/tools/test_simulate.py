@@ -8,12 +8,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from math import inf, isnan, nan
 from pathlib import Path
 
 import pytest
+from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -28,7 +27,6 @@ from backlash_ros.tools.simulate.statistics import statistics
 
 ROOT = Path(__file__).resolve().parents[2]
 NOISY = ['--set', 'output_noise_std=1e-3', '--set', 'estimator.law=lms']
-DEADLINE_S = 60.0
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -262,13 +260,6 @@ def test_single_run_that_breaks_off_is_one_line(
 def test_bad_combination_is_refused_before_anything_runs() -> None:
     with pytest.raises(ParameterError, match=r'backlash\.c_l'):
         batch.make_jobs(Parameters(), [{'seed': 1}, {'backlash.c_l': 5.0}], [1], 1e9)
-
-
-def wait_until(condition: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline, f'{what} did not happen within {DEADLINE_S} s'
-        time.sleep(0.05)
 
 
 def is_gone(group: int) -> bool:

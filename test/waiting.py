@@ -1,0 +1,24 @@
+"""Waiting on a condition: once, for all tests."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
+
+
+def pause() -> None:
+    """Pass a moment."""
+    time.sleep(0.02)
+
+
+def wait_until(
+    condition: Callable[[], object], what: str, wait: Callable[[], None] = pause,
+) -> None:
+    """Return once condition holds; wait() passes a moment. Raises TimeoutError."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        if time.monotonic() >= deadline:
+            raise TimeoutError(f'not within {DEADLINE_S:g} s: {what}')
+        wait()
