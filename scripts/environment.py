@@ -28,6 +28,8 @@ DISTRO = 'jazzy'
 WHEELS = 'wheels'
 WHEEL_PYTHONS = [f'3.{minor}' for minor in range(10, 14)]
 FILES = {'run': ['run.txt'], 'dev': ['run.txt', 'dev.txt']}
+# Packages' own tests, and large ones of which the others need only commands or data.
+NEVER_IMPORTED = '/(tests|OpenGL|docutils|fontTools|mypyc?|pip|lexers)/'
 OFFLINE = re.compile('NewConnectionError|NameResolutionError|ConnectTimeout|ProxyError|SSLError')
 
 
@@ -201,9 +203,9 @@ def provide(level: str, keep_python: bool) -> None:
     print(f'installing into .venv: {source}, {", ".join(files)}; takes about a minute', flush=True)
     run_pip(pip_arguments(ros, files))
     run_pip(['--no-deps', '--no-build-isolation', '--editable', str(ROOT)])
-    # On all cores and without the packages' own tests it takes half as long as with pip. A file
-    # that does not compile is an error for whoever imports it.
-    compiler = [str(VENV_PYTHON), '-m', 'compileall', '-q', '-j', '0', '-x', '/tests/']
+    # Not left to pip, which uses one core and compiles everything. A file that does not compile
+    # is an error for whoever imports it.
+    compiler = [str(VENV_PYTHON), '-m', 'compileall', '-q', '-j', '0', '-x', NEVER_IMPORTED]
     subprocess.run([*compiler, str(VENV / 'lib')], capture_output=True)
     noted = {**identity, 'level': level, 'fingerprint': fingerprint(level)}
     STAMP.write_text(json.dumps(noted, indent=2) + '\n')

@@ -6,10 +6,11 @@ A virtual machine may be held back by its host for a second at once, whatever ru
 
 from __future__ import annotations
 
+import subprocess
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import pytest
 
@@ -18,6 +19,9 @@ STALL_S = 0.1  # two busy workers with their processes delay a thread that wakes
 TOLERATED = 0.25  # share of the time that stalls may take
 LOOK_BACK_S = 5.0  # before a test, and at least for one that has failed
 KEPT = 10_000  # stalls: the last quarter of an hour, were there nothing else
+SUITE_S = 3300.0  # for `make test` as a whole: nine times what it takes where the machine runs
+BEGAN = 'MAKE_TEST_BEGAN'  # environment: when `make test` did, by time.time()
+OVERDUE = f'NOT RUN: the machine stands still, and {SUITE_S / 60.0:.0f} min of make test are over'
 
 
 class Standstill:
@@ -59,6 +63,18 @@ class Standstill:
         if share <= TOLERATED:
             return None
         return f'the machine stood still for {share:.0%} of {seconds:.0f} s: nothing is timely here'
+
+
+def is_overdue(environment: Mapping[str, str], now: float) -> bool:
+    """Whether `make test` has taken more than SUITE_S; now: as of time.time()."""
+    return now - float(environment.get(BEGAN, now)) > SUITE_S
+
+
+def ran_out_of_time(error: BaseException) -> bool:
+    """Whether a test failed for nothing but the time that it took."""
+    return isinstance(error, (TimeoutError, subprocess.TimeoutExpired)) or (
+        isinstance(error, pytest.fail.Exception) and 'from pytest-timeout' in str(error)
+    )
 
 
 def excuse(report: pytest.TestReport, reason: str) -> None:

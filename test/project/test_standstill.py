@@ -1,7 +1,18 @@
 """Tests of what the tests think of the machine."""
 
+import subprocess
+
 import pytest
-from standstill import STALL_S, TICK_S, Standstill, excuse
+from standstill import (
+    BEGAN,
+    STALL_S,
+    SUITE_S,
+    TICK_S,
+    Standstill,
+    excuse,
+    is_overdue,
+    ran_out_of_time,
+)
 
 
 class Clock:
@@ -40,6 +51,23 @@ def test_a_machine_that_is_held_back_is_told_of() -> None:
     reason = listened([0.01, 0.69] * 10).reason(5.0)
     assert reason is not None
     assert '99%' in reason
+
+
+def test_only_a_suite_that_make_began_long_ago_is_overdue() -> None:
+    assert not is_overdue({}, 1e9)
+    assert not is_overdue({BEGAN: '1e9'}, 1e9 + SUITE_S - 1.0)
+    assert is_overdue({BEGAN: '1e9'}, 1e9 + SUITE_S + 1.0)
+
+
+@pytest.mark.parametrize(('error', 'of_time'), [
+    (TimeoutError('not within 60 s'), True),
+    (subprocess.TimeoutExpired('bringup', 60.0), True),
+    (pytest.fail.Exception('Timeout (>600.0s) from pytest-timeout.'), True),
+    (pytest.fail.Exception('DID NOT RAISE'), False),
+    (AssertionError('Timeout'), False),
+])
+def test_a_wait_in_vain_is_told_from_any_other_failure(error: Exception, of_time: bool) -> None:
+    assert ran_out_of_time(error) is of_time
 
 
 def test_an_excused_failure_is_a_skipped_test_with_its_reason() -> None:
