@@ -15,6 +15,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -159,10 +160,17 @@ def install(ros: str, arguments: list[str]) -> None:
     uv = shutil.which('uv')
     if uv and ros == WHEELS and not PIP_INDEX & os.environ.keys():
         command = [uv, 'pip', 'install', '--python', str(VENV_PYTHON), *arguments]
-        with LOG.open('a') as log:
-            if subprocess.run(command, cwd=ROOT, stdout=log, stderr=log).returncode == 0:
-                return
+        if run_logged(command, os.environ) == 0:
+            return
     run_pip(arguments)
+
+
+def run_logged(command: list[str], environment: Mapping[str, str]) -> int:
+    """Run a command with its output in .venv/install.log, and return its exit code."""
+    with LOG.open('a') as log:
+        return subprocess.run(
+            command, cwd=ROOT, env=environment, stdout=log, stderr=log
+        ).returncode
 
 
 def run_pip(arguments: list[str]) -> None:
@@ -173,15 +181,12 @@ def run_pip(arguments: list[str]) -> None:
     options = ['--no-input', '--no-compile', '--progress-bar', 'off']
     command = [str(VENV_PYTHON), '-m', 'pip', 'install', *options]
     environment = {**os.environ, 'PIP_DISABLE_PIP_VERSION_CHECK': '1', 'PIP_USER': '0'}
-    with LOG.open('a') as log:
-        done = subprocess.run(
-            [*command, *arguments], cwd=ROOT, env=environment, stdout=log, stderr=log
-        )
-    if done.returncode == 0:
+    code = run_logged([*command, *arguments], environment)
+    if code == 0:
         return
     text = LOG.read_text(errors='replace')
     errors = re.findall('^ERROR: (.*)$', text, re.MULTILINE)
-    reason = errors[-1] if errors else f'exit code {done.returncode}'
+    reason = errors[-1] if errors else f'exit code {code}'
     if OFFLINE.search(text):
         cure = 'connect to the network (PyPI, or a mirror by PIP_INDEX_URL) and call make again'
     elif 'distribution found for ros-' in reason:

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rosbags.highlevel import AnyReader
-from waiting import DEADLINE_S as DEADLINE_S
-from waiting import wait_until as wait_until
+from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.tools.bringup import command as bringup
 

@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing.context import ForkServerProcess
@@ -25,8 +24,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from waiting import DEADLINE_S as DEADLINE_S
-from waiting import wait_until as wait_until
+from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.tools.bringup.domains import free_domain
@@ -156,7 +154,7 @@ class NodeProcess:
         """The first event of this kind."""
         wait_until(
             lambda: self.events(kind) or self.process.poll() is not None,
-            f'{kind} of {self.executable}', lambda: time.sleep(0.02),
+            f'{kind} of {self.executable}',
         )
         events = self.events(kind)
         assert events, f'{self.executable} ended without {kind}:\n{self.stderr}'

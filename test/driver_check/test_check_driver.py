@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 from drivers.made_up_driver import LIMITS, PERIOD_S, parameters
-from ros_processes import ForkedNode, Probe, wait_until
+from ros_processes import ForkedNode, Probe
 from std_msgs.msg import Float64
+from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.nodes.check_driver import main
 from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
@@ -25,7 +26,6 @@ from backlash_ros.tools.bringup.environment import child_environment
 
 HERE = Path(__file__).resolve().parents[1]
 DURATION_S = 6.0
-DEADLINE_S = 60.0
 # A machine under load may hold the driver up: then the check is right to find fault with it, and
 # a run that ends otherwise than it should says nothing.
 HELD_UP, ATTEMPTS = 0.3, 5
@@ -159,9 +159,7 @@ def test_a_topic_of_another_name_is_pointed_out(tmp_path: Path) -> None:
     with bench(tmp_path, 'delay') as beside:
         process = beside.start('--wait', str(DEADLINE_S))
         try:
-            wait_until(
-                lambda: '/motor/plant_output' in process.stdout, 'a hint', lambda: time.sleep(0.02)
-            )
+            wait_until(lambda: '/motor/plant_output' in process.stdout, 'a hint')
             assert ' '.join(REMAP) in process.stdout
         finally:
             process.kill()
@@ -320,7 +318,7 @@ def test_a_controller_that_discovery_has_not_found_is_not_disturbed(tmp_path: Pa
             closing(Presence(beside.domain, '/control', 'f' * 32)) as hidden:
         process = beside.start('--drive')
         # Who comes after it knows of it likewise.
-        wait_until(hidden.others, 'its presence', lambda: time.sleep(0.02))
+        wait_until(hidden.others, 'its presence')
         err = process.communicate()[1]
     assert process.returncode == 2
     assert '/control is published by a controller of this machine' in err

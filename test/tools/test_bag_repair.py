@@ -29,7 +29,6 @@ from backlash_ros.bags.repair import repair, repair_command
 from backlash_ros.bags.writer import STORAGE, Bag
 
 ROOT = Path(__file__).resolve().parents[2]
-DEADLINE_S = 60.0
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 CDR = b'\x00\x01\x00\x00'
 MESSAGES, PER_FLUSH = 400, 40
