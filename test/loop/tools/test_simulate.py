@@ -1,0 +1,312 @@
+"""`simulate`: one run, many seeds, sweeps; deterministic whatever the number of processes."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from math import inf, isnan, nan
+from pathlib import Path
+
+import pytest
+from places import ROOT
+from waiting import DEADLINE_S, wait_until
+
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.tools.cli.command_line import number_of_samples, whole_samples
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.simulate import batch
+from backlash_ros.tools.simulate.batch import Outcome, Sweep
+from backlash_ros.tools.simulate.command import main
+from backlash_ros.tools.simulate.simulation import run_loop
+from backlash_ros.tools.simulate.statistics import statistics
+
+NOISY = ['--set', 'output_noise_std=1e-3', '--set', 'estimator.law=lms']
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def noisy(changes: dict[str, object] | None = None) -> Parameters:
+    return Parameters({'output_noise_std': 1e-3, 'estimator.law': 'lms', **(changes or {})})
+
+
+@pytest.fixture
+def one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No further processes, which take longer to start than these runs last."""
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0}, raising=False)
+
+
+def test_run_writes_its_results_and_prints_a_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(['--duration', '0.5', '--out', str(tmp_path)]) == 0
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files >= {'report.html', 'samples.csv', 'summary.json', 'parameters.yaml'}
+    assert json.loads((tmp_path / 'summary.json').read_text())['samples'] == 50
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:4]] == ['m', 'c_r', 'c_l']
+    assert lines[-1] == f'report: {tmp_path / "report.html"}'
+
+
+@pytest.mark.usefixtures('one_processor')
+def test_sweep_over_true_plants_that_differ_from_the_known_one(tmp_path: Path) -> None:
+    sweep = ['--sweep', 'truth.scale_frequency=0.8,1,1.2', '--set', 'estimator.law=lms']
+    arguments = ['--duration', '1', '--config', 'geared_motor.yaml', *sweep]
+    assert main([*arguments, '--out', str(tmp_path)]) == 0
+    rows = rows_of(tmp_path / 'sweep.csv')
+    assert [float(row['truth.scale_frequency']) for row in rows] == [0.8, 1.0, 1.2]
+    assert len({row['tracking_error_rms'] for row in rows}) == 3
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_true_plant_of_a_file_is_simulated(tmp_path: Path) -> None:
+    text = '/plant: {ros__parameters: {truth: {numerator: [0.5], denominator: [1.0, -0.5]}}}'
+    (tmp_path / 'my.yaml').write_text(text)
+    arguments = ['--duration', '1', '--set', 'estimator.law=fixed']
+    assert main([*arguments, '--config', str(tmp_path / 'my.yaml'), '--out', str(tmp_path)]) == 0
+    rows = rows_of(tmp_path / 'samples.csv')
+    y, u = ([float(row[name]) for row in rows] for name in ('y', 'u'))
+    assert max(map(abs, u)) > 1.0
+    # u is what the backlash lets through, y what the true plant makes of it.
+    assert y[1:] == pytest.approx([0.5 * a + 0.5 * b for a, b in zip(y, u, strict=True)][:-1])
+
+
+def test_seed_decides_every_sample() -> None:
+    def final(seed: int) -> Outcome:
+        [job] = batch.make_jobs(noisy(), [{}], [seed], 0.5)
+        return batch.run_job(job)
+    assert repr(final(1)) == repr(final(1))  # repr, as nan differs from itself
+    assert final(1).final != final(2).final
+
+
+def test_parallel_runs_equal_serial_ones_and_leave_the_environment_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('OMP_NUM_THREADS', '7')
+    monkeypatch.delenv('MKL_NUM_THREADS', raising=False)
+    jobs = batch.make_jobs(noisy({'output_loss': 0.1}), [{}], range(5, 9), 0.8)
+    serial = batch.run_jobs(jobs, workers=1)
+    assert repr(batch.run_jobs(jobs, workers=2)) == repr(serial)
+    assert len({outcome.final for outcome in serial}) == len(jobs)
+    assert os.environ['OMP_NUM_THREADS'] == '7'
+    assert 'MKL_NUM_THREADS' not in os.environ
+
+
+@pytest.mark.usefixtures('one_processor')
+def test_seeds_give_a_table_and_a_row_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = [*NOISY, '--seeds', '3', '--seed', '10', '--duration', '0.7']
+    assert main([*arguments, '--out', str(tmp_path)]) == 0
+    rows = rows_of(tmp_path / 'seeds.csv')
+    assert [row['seed'] for row in rows] == ['10', '11', '12']
+    jobs = batch.make_jobs(noisy(), [{}], [10, 11, 12], 0.7)
+    expected = [batch.run_job(job) for job in jobs]
+    assert [float(row['c_r']) for row in rows] == [outcome.final[1] for outcome in expected]
+    out = capsys.readouterr().out
+    rmse = statistics(expected)['m'].rmse
+    assert out.splitlines()[1].split()[:3][2] == f'{rmse:.3g}'
+    assert 'not within 1 % at the end: 3 runs, seed 10, 11, 12' in out
+
+
+def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
+    arguments = ['--sweep', 'output_noise_std=1e-4,1e-3', '--sweep', 'estimator.law=lms,printed',
+                 '--seeds', '2', '--duration', '0.5', '--out', str(tmp_path)]
+    assert main(arguments) == 0
+    rows = rows_of(tmp_path / 'sweep.csv')
+    assert [(row['output_noise_std'], row['estimator.law'], row['seed']) for row in rows] == [
+        (noise, law, seed)
+        for noise in ('0.0001', '0.001') for law in ('lms', 'printed') for seed in ('1', '2')
+    ]
+    assert (tmp_path / 'sweep.png').read_bytes().startswith(b'\x89PNG')
+
+
+def test_swept_seed_and_sample_period_take_effect() -> None:
+    changes = batch.combinations([Sweep('seed', (3, 4)), Sweep('sample_period', (0.01, 0.02))])
+    jobs = batch.make_jobs(noisy(), changes, [1], 1.0)
+    assert [(job.values['seed'], job.samples) for job in jobs] == [
+        (3, 100), (3, 50), (4, 100), (4, 50)
+    ]
+
+
+def test_file_as_reference_is_followed(tmp_path: Path) -> None:
+    path = tmp_path / 'y_m.csv'
+    path.write_text('t,y_m\n' + ''.join(f'{k * 0.01!r},{k / 8}\n' for k in range(40)))
+    loop = build_closed_loop(noisy({'waveform': 'file', 'file': str(path), 'amplitude': 1.0}))
+    assert run_loop(loop, 40).column('y_m').tolist() == [k / 8 for k in range(40)]
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--set', 'sed=1'], 'did you mean seed?'),
+        (['--set', 'estimator.bounds.m=[2, 1]'], 'low < high'),
+        (['--config', 'nothing.yaml'], 'nothing.yaml: cannot be read'),
+        (['--duration', '0.015'], 'whole multiple of sample_period=0.01'),
+        (['--duration', '-1'], 'must be finite and > 0'),
+        (['--duration', 'nan'], 'must be finite and > 0'),
+        (['--duration', 'x'], "invalid float value: 'x'"),
+        (['--seeds', '0'], '--seeds=0 must be >= 1'),
+        (['--seed', '-1'], 'seed=-1'),
+        (['--sweep', 'seed=1,2', '--seeds', '2'], 'exclude each other'),
+        (['--sweep', 'seed'], 'must be KEY=v1,v2,...'),
+        (['--sweep', 'seed=1', '--sweep', 'seed=2'], 'names seed twice'),
+        (['--sweep', 'backlash.m=1,-1'], 'backlash.m=-1.0 must be > 0'),
+        (['--sweep', 'backlash.c_l=-1,5'], 'must be < backlash.c_r'),
+        (['--set', 'waveform=file'], 'must name a CSV'),
+        (['--nonsense'], 'unrecognized arguments: --nonsense'),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    arguments: list[str], message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    err = capsys.readouterr().err
+    assert message in err
+    assert err.startswith('simulate: ')
+    assert err.count('\n') == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('seed=1,2', Sweep('seed', (1, 2))),
+        ('amplitude=1,2e0', Sweep('amplitude', (1.0, 2.0))),
+        ('estimator.law=lms, printed', Sweep('estimator.law', ('lms', 'printed'))),
+        ('backlash.rate=[0,0,0],[0,0,1]',
+         Sweep('backlash.rate', ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))),
+        ('control.max=5,.inf', Sweep('control.max', (5.0, inf))),
+        ('lockstep=true,false', Sweep('lockstep', (True, False))),
+    ],
+)
+def test_sweep_lists_values_as_in_yaml(text: str, expected: Sweep) -> None:
+    assert batch.parse_sweep(text) == expected
+
+
+def test_no_sweep_is_one_combination() -> None:
+    assert batch.combinations([]) == [{}]
+
+
+def test_length_comes_from_the_duration_or_the_parameter() -> None:
+    assert number_of_samples(Parameters(), None) == 1000
+    assert number_of_samples(Parameters({'samples': 30}), None) == 30
+    assert number_of_samples(Parameters({'samples': 30}), 0.2) == 20
+    assert whole_samples(0.3, 0.1) == 3  # 0.3 / 0.1 falls just short of 3
+    with pytest.raises(InputError, match='whole multiple'):
+        whole_samples(0.35, 0.1)
+
+
+def outcome(error: float, settling: float, std: float = nan) -> Outcome:
+    return Outcome(
+        final=(2.0 + error, 4.0, -4.0), std=(std, std, std), truth=(2.0, 4.0, -4.0),
+        settling=(settling, 0.0, 0.0),
+    )
+
+
+def test_statistics_are_those_of_the_errors() -> None:
+    of = statistics([outcome(0.01, 1.0, 0.01), outcome(-0.025, inf, 0.01),
+                           outcome(0.015, 2.0, 0.015)])
+    m = of['m']
+    assert m.bias == pytest.approx(0.0, abs=1e-15)
+    assert m.rmse == pytest.approx((9.5 / 3) ** 0.5 * 0.01)
+    assert (m.settling_median, m.settling_max) == (2.0, inf)
+    assert m.within == pytest.approx(2 / 3)  # 1 % of 2 is 0.02
+    assert m.nees == pytest.approx((1.0 + 6.25 + 1.0) / 3)
+    assert m.nees_interval == pytest.approx((0.0719, 3.1161), abs=1e-4)  # chi2 of 3, over 3
+    assert of['c_r'].within == 1.0
+
+
+def test_nees_needs_every_standard_deviation() -> None:
+    of = statistics([outcome(0.01, 1.0, 0.01), outcome(0.01, 1.0)])
+    assert isnan(of['m'].nees)
+
+
+def test_run_that_broke_off_is_left_out_of_the_statistics() -> None:
+    of = statistics([outcome(0.01, 1.0), Outcome(problem='y=inf')])
+    assert of['m'].rmse == pytest.approx(0.01)
+    with pytest.raises(InputError, match='every run broke off, the first one with: y=inf'):
+        statistics([Outcome(problem='y=inf')])
+
+
+def test_run_that_breaks_off_says_why() -> None:
+    # No measurement is that large, and no reference may be.
+    [job] = batch.make_jobs(noisy({'amplitude': 1e99}), [{}], [1], 1.0)
+    broken = batch.run_job(job)
+    assert 'must be finite' in broken.problem
+    assert isnan(broken.final[0])
+
+
+def test_single_run_that_breaks_off_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    arguments = ['--set', 'amplitude=1e99', '--duration', '1', '--out', str(tmp_path)]
+    assert main(arguments) == 1
+    err = capsys.readouterr().err
+    assert err.startswith('simulate: the run broke off: ')
+    assert err.count('\n') == 1
+
+
+def test_bad_combination_is_refused_before_anything_runs() -> None:
+    with pytest.raises(ParameterError, match=r'backlash\.c_l'):
+        batch.make_jobs(Parameters(), [{'seed': 1}, {'backlash.c_l': 5.0}], [1], 1e9)
+
+
+def is_gone(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def children(pid: int) -> list[str]:
+    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_seeds_end_at_once_with_one_line(tmp_path: Path, number: int) -> None:
+    command = [sys.executable, '-m', 'backlash_ros.tools.simulate', '--seeds', '4',
+               '--duration', '100000', '--out', str(tmp_path / 'out')]
+    process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True,
+                               start_new_session=True)
+    try:
+        # The first child only keeps track of shared resources; a worker may still be starting,
+        # which is the worst moment.
+        wait_until(lambda: len(children(process.pid)) > 1, 'the start of a worker')
+        # A terminal sends Ctrl-C to the whole group, a supervisor SIGTERM to the parent alone.
+        send = os.killpg if number == signal.SIGINT else os.kill
+        send(process.pid, number)
+        _, err = process.communicate(timeout=DEADLINE_S)
+        assert process.returncode == 1
+        assert err == 'simulate: interrupted\n'
+        wait_until(lambda: is_gone(process.pid), 'the end of every process')
+    finally:
+        if not is_gone(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    command = [sys.executable, '-m', 'backlash_ros.tools.simulate', '--seeds', '4',
+               '--duration', '100000', '--out', str(tmp_path / 'out')]
+    process = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
+    try:
+        wait_until(lambda: len(children(process.pid)) > 1, 'the start of a worker')
+        process.kill()
+        assert process.wait() == -signal.SIGKILL
+        wait_until(lambda: is_gone(process.pid), 'the end of every worker')
+    finally:
+        if not is_gone(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()

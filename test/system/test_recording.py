@@ -1,0 +1,337 @@
+"""The recorder as a process: killed, stopped, out of room; and what can still be had of its bag."""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from places import ROOT
+from ros_processes import NodeProcess, Probe, RosWorld, ros_world, wait_until
+from rosbags.highlevel import AnyReader
+from std_msgs.msg import Float64, Float64MultiArray
+
+from backlash_ros import topics
+from backlash_ros.bags.content import BagError, message_files
+from backlash_ros.bags.remains import damage, open_remains
+from backlash_ros.bags.writer import STORAGE
+from backlash_ros.tools.report import command as report
+from backlash_ros.tools.run_files.bag_reading import read_bag
+
+NODES = ('recorder', 'controller', 'reference', 'plant')
+SAMPLE = topics.SIGNAL_LABELS.index('sample')
+LOST_S = 1.0  # what a killed recorder may lose
+
+
+def start_loop(world: RosWorld, bag: Path, storage: str) -> dict[str, NodeProcess]:
+    """Start the nodes of a run in real time, none of which begins before the others."""
+    own: dict[str, dict[str, object]] = {
+        'recorder': {'wait_for_publishers': True, 'bag': f"'{bag}'", 'storage': storage},
+        'plant': {'wait_for_subscribers': 3},
+    }
+    return {name: world.start(name, own.get(name, {'wait_for_subscribers': 2})) for name in NODES}
+
+
+class Listener:
+    """Hears the signals of the controller beside the recorder, and when each of them came."""
+
+    def __init__(self, probe: Probe) -> None:
+        self._probe = probe
+        self.heard: list[tuple[float, int]] = []
+        probe.node.create_subscription(Float64MultiArray, topics.SIGNALS, self._take, 1000)
+
+    def _take(self, message: Float64MultiArray) -> None:
+        self.heard.append((time.monotonic(), int(message.data[SAMPLE])))
+
+    def wait_for(self, further: int) -> None:
+        """Listen until so many samples more have come."""
+        wanted = len(self.heard) + further
+        self._probe.wait_until(lambda: len(self.heard) >= wanted, 'further samples')
+
+    def before(self, moment: float) -> set[int]:
+        """Samples that came before a moment on the monotonic clock."""
+        return {sample for at, sample in self.heard if at < moment}
+
+
+def recorded_samples(bag: Path) -> set[int]:
+    """Samples of the controller's signals in a complete bag."""
+    with AnyReader([bag]) as reader:
+        return {
+            int(reader.deserialize(raw, connection.msgtype).data[SAMPLE])
+            for connection, _, raw in reader.messages()
+            if connection.topic == f'/{topics.SIGNALS}'
+        }
+
+
+def count_signals(bag: Path) -> int:
+    """Samples of the controller's signals that a recorder has flushed so far."""
+    try:
+        messages = open_remains(bag).messages()
+        return sum(message.topic.name == f'/{topics.SIGNALS}' for message in messages)
+    except BagError:
+        return 0
+
+
+def recorder(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, '-m', 'backlash_ros.nodes.recorder', *map(str, arguments)]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.mark.usefixtures('undrawn')
+@pytest.mark.parametrize('storage', STORAGE)
+def test_killed_recorder_loses_at_most_the_last_second(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], storage: str,
+) -> None:
+    bag = tmp_path / 'bag'
+    with ros_world(tmp_path) as world:
+        probe = world.probe()
+        listener = Listener(probe)
+        nodes = start_loop(world, bag, storage)
+        probe.wait_until(
+            lambda: len(listener.before(time.monotonic() - LOST_S)) > 60, 'samples that must stay'
+        )
+        nodes['recorder'].send(signal.SIGKILL)
+        killed = time.monotonic()
+        nodes['recorder'].wait()
+        listener.wait_for(20)  # nobody waits for a recorder
+        assert all(nodes[name].stop() == 0 for name in ('plant', 'reference', 'controller'))
+    before = {path.name: path.read_bytes() for path in bag.iterdir()}
+    cure = f'ros2 run backlash_ros recorder --repair {bag}'
+    remains = read_bag(bag)
+    assert remains.damage.startswith(f'{bag} was never closed: this is what is left, ')
+    assert remains.damage.endswith(f' To have it complete: {cure}')
+    if storage == 'mcap':  # what it says depends on read_bag alone
+        assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
+        assert capsys.readouterr().err == f'report: warning: {remains.damage}\n'
+        assert cure in (tmp_path / 'out' / 'report.html').read_text()
+    assert {path.name: path.read_bytes() for path in bag.iterdir()} == before
+
+    done = recorder('--repair', bag)
+    assert done.returncode == 0, done.stderr
+    assert re.search(rf'/{topics.SIGNALS} +\d\d+ messages\n', done.stdout)
+    assert f'the original is kept: {bag}.damaged\n' in done.stdout
+    assert damage(bag) == ''
+    kept = recorded_samples(bag)
+    assert listener.before(killed - LOST_S) - kept == set()
+    assert len(listener.before(killed - LOST_S)) > 50
+    repaired = read_bag(bag)
+    assert repaired.damage == ''
+    np.testing.assert_array_equal(repaired.run.rows, remains.run.rows)
+    if storage == 'mcap':
+        with next(bag.glob('*.mcap')).open('rb') as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            found = reader.iter_decoded_messages([f'/{topics.SIGNALS}'])
+            assert {int(message.data[SAMPLE]) for *_, message in found} == kept
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_recording_that_goes_on_is_read_and_not_repaired(tmp_path: Path, storage: str) -> None:
+    bag = tmp_path / 'bag'
+    with ros_world(tmp_path) as world:
+        probe = world.probe()
+        nodes = start_loop(world, bag, storage)
+        probe.wait_until(lambda: count_signals(bag) > 50, 'samples in the bag')
+        found = read_bag(bag)
+        assert found.damage.endswith('To have it complete: stop the recorder')
+        assert found.run.samples > 50
+        refused = recorder('--repair', bag)
+        assert (refused.returncode, refused.stderr) == (
+            1, f'recorder: {bag}: is being recorded: stop its recorder first\n'
+        )
+        assert all(nodes[name].stop() == 0 for name in reversed(NODES))
+    assert damage(bag) == ''
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM], ids=lambda s: s.name)
+def test_signal_amid_a_flood_ends_with_a_complete_bag(
+    tmp_path: Path, storage: str, number: signal.Signals,
+) -> None:
+    bag = tmp_path / 'bag'
+    with ros_world(tmp_path) as world:
+        probe = world.probe()
+        node = world.start('recorder', {'bag': f"'{bag}'", 'storage': storage})
+        node.wait_for('ready')
+        flood = probe.publisher(topics.CONTROL, Float64)
+        probe.wait_until(flood.get_subscription_count, 'the recorder')
+
+        def pour() -> None:
+            for _ in range(100):
+                flood.publish(Float64(data=1.0))
+
+        (file,) = message_files(bag)
+        wait_until(lambda: file.stat().st_size > 100_000, 'messages in the bag', pour)
+        node.send(number)
+        wait_until(lambda: node.process.poll() is not None, 'the end of the recorder', pour)
+        assert node.wait() == 0, node.stderr
+        counts = node.events('closed')[0]['messages']
+    assert damage(bag) == ''
+    values = [message.data for message in open_remains(bag).messages()
+              if message.topic.name == f'/{topics.CONTROL}']
+    assert len(values) == counts[f'/{topics.CONTROL}'] > 0
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path, storage: str) -> None:
+    bag = tmp_path / 'bag'
+    with ros_world(tmp_path) as world:
+        probe = world.probe()
+        listener = Listener(probe)
+        diagnostics = probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
+        nodes = start_loop(world, bag, storage)
+
+        def recorded() -> int:
+            told = nodes['recorder'].events('progress')
+            return int(told[-1]['received'][topics.SIGNALS]) if told else 0
+
+        probe.wait_until(lambda: recorded() > 60, 'a recording')
+        # As a file system does that is full: what goes beyond is refused.
+        size = max(path.stat().st_size for path in bag.iterdir())
+        limit = (size + 20_000,) * 2
+        resource.prlimit(nodes['recorder'].process.pid, resource.RLIMIT_FSIZE, limit)
+        reason = nodes['recorder'].wait_for('recording_stopped')['reason']
+        assert f'recording to {bag} stopped: ' in reason
+        assert re.search(r'saved are \d+ messages of \d+\.\d s', reason)
+        assert reason.endswith(f'ros2 run backlash_ros recorder --repair {bag}')
+        probe.wait_until(
+            lambda: any(
+                status.level == DiagnosticStatus.ERROR
+                and reason in [pair.value for pair in status.values]
+                for message in diagnostics for status in message.status
+            ), 'the error in the diagnostics',
+        )
+        told = len(nodes['recorder'].events('progress'))
+        listener.wait_for(50)
+        probe.wait_until(
+            lambda: len(nodes['recorder'].events('progress')) > told, 'further progress'
+        )
+        codes = {name: nodes[name].stop() for name in reversed(NODES)}
+        assert codes == {'plant': 0, 'reference': 0, 'controller': 0, 'recorder': 1}
+        log = nodes['recorder'].stderr
+    assert log.count('stopped: ') == 1
+    assert 'Traceback' not in log
+    assert re.search(r'[1-9]\d* messages came after the recording had stopped', log)
+    saved = int(re.search(r'saved are (\d+) messages', reason)[1])
+    assert sum(1 for _ in open_remains(bag).messages()) >= saved > 0
+    assert read_bag(bag).run.samples > 20
+    assert recorder('--repair', bag).returncode == 0
+    assert damage(bag) == ''
+
+
+@contextmanager
+def small_disk(folder: Path, size: str) -> Iterator[list[str]]:
+    """What to put before a command so that it sees a file system of this size at a folder."""
+    folder.mkdir()
+    mount = f'mount -t tmpfs -o size={size} tmpfs "$0" && exec "$@"'
+    prefix = ['unshare', '--user', '--map-root-user', '--mount', 'sh', '-c', mount, str(folder)]
+    try:
+        allowed = subprocess.run([*prefix, 'true'], capture_output=True).returncode == 0
+    except FileNotFoundError:
+        allowed = False
+    if not allowed:
+        pytest.skip('this machine does not let users mount a file system')
+    yield prefix
+
+
+FULL_AT_THE_START = """
+cd "$1"
+head -c 1000000 /dev/zero > filling 2>/dev/null
+"$2" -m backlash_ros.nodes.recorder --ros-args -p "bag:='$1/bag'" -p "storage:=$3"
+echo "exit code $?, left: $(ls)"
+"""
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_disk_that_is_full_at_the_start_is_refused_in_one_line(
+    tmp_path: Path, storage: str,
+) -> None:
+    disk = tmp_path / 'disk'
+    with small_disk(disk, '64k') as prefix:
+        done = subprocess.run(
+            [*prefix, 'sh', '-c', FULL_AT_THE_START, '-', str(disk), sys.executable, storage],
+            capture_output=True, text=True, env={
+                **os.environ, 'PYTHONPATH': str(ROOT), 'ROS_LOG_DIR': str(tmp_path / 'logs'),
+            },
+        )
+    assert done.stdout == 'exit code 2, left: filling\n'
+    assert done.stderr.startswith(f"recorder: bag='{disk}/bag' cannot be made: ")
+    assert 'full' in done.stderr or 'No space left' in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+FILL = """
+import subprocess, sys
+from backlash_ros.bags.remains import open_remains
+from backlash_ros.bags.repair import repair_command
+from backlash_ros.bags.writer import Bag, RecordingError
+bag = Bag(sys.argv[1] + '/bag', sys.argv[2])
+number = bag.add_topic('/number', 'std_msgs/msg/Float64')
+try:
+    for i in range(10**6):
+        bag.write(number, 10**18 + i, bytes(12))
+        if i % 50 == 49:
+            bag.flush()
+except RecordingError as error:
+    print(error)
+left = sum(1 for _ in open_remains(bag.path).messages())
+assert left >= bag.saved > 500, (left, bag.saved)
+assert repair_command(bag.path) == 1
+assert sum(1 for _ in open_remains(bag.path).messages()) == left
+subprocess.run(['mount', '-o', 'remount,size=4m', sys.argv[1]], check=True)
+assert repair_command(bag.path) == 0
+print(f'{left:>8} messages')
+"""
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_bag_on_a_disk_that_became_full_is_repaired_once_there_is_room(
+    tmp_path: Path, storage: str,
+) -> None:
+    disk = tmp_path / 'disk'
+    with small_disk(disk, '200k') as prefix:
+        done = subprocess.run(
+            [*prefix, sys.executable, '-c', FILL, str(disk), storage], cwd=ROOT,
+            capture_output=True, text=True,
+        )
+    assert done.returncode == 0, done.stderr
+    first, *_, last = done.stdout.splitlines()
+    assert 'full' in first or 'No space left' in first
+    assert f'/number  {last}' in done.stdout
+    assert done.stderr.startswith(f'recorder: {disk}/bag: cannot be repaired: ')
+    assert done.stderr.endswith('The bag is as it was\n')
+    assert done.stderr.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['--repair', '/nowhere/bag'], '/nowhere/bag: does not exist'),
+        (['--repair', str(ROOT)], 'is no bag: has no metadata.yaml, no .mcap and no .db3 file'),
+        (['--repair'], '--repair needs the folder of a bag'),
+        (['--repair', 'bag', 'more'], 'unrecognized arguments: --repair bag more'),
+    ],
+)
+def test_repair_of_what_is_no_bag_is_bad_input(arguments: list[str], words: str) -> None:
+    done = recorder(*arguments)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert words in done.stderr
+    assert done.stderr.count('\n') == 1
+
+
+def test_help_tells_of_the_repair() -> None:
+    done = recorder('--help')
+    assert done.returncode == 0
+    assert done.stdout.startswith('recorder --repair BAG: ')
+    assert 'storage' in done.stdout

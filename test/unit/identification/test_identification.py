@@ -1,0 +1,250 @@
+"""Identification from arrays: what is found, how surely, and what a record cannot tell."""
+
+from __future__ import annotations
+
+from itertools import islice
+
+import numpy as np
+import pytest
+from accuracy import identification_cases
+from accuracy.identification_cases import random_case
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core.estimation.regression.play import play
+from backlash_ros.core.identification.identification import (
+    Identification,
+    Options,
+    identify,
+)
+from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.identification.output_error import (
+    Point,
+    Samples,
+    Structure,
+    fit,
+    linear_columns,
+    slopes,
+    solve_linear,
+)
+from backlash_ros.core.identification.play_record import PlayRecord
+from backlash_ros.core.identification.uncertainty import response
+
+Array = NDArray[np.float64]
+PERIOD_S = 0.005
+SEEDS = (7, 21, 42, 55)  # of the benchmark; among them integrators and quantised y
+QUICK = Options(orders=(1, 2), delays=(0, 1))
+
+
+def motion(count: int, reach: float = 3.0, rate: float = 40.0) -> Array:
+    return np.array(list(islice(
+        strokes(-reach, reach, rate, PERIOD_S, count * PERIOD_S, 0.0), count
+    )))
+
+
+def record(
+    count: int = 1600, gap: float = 0.9, c_r: float = 0.5, noise: float = 2e-3, seed: int = 1,
+) -> tuple[Array, Array]:
+    """v and y of a load on a spring behind a gap, one sample of delay."""
+    v = motion(count)
+    return v, answer(v, gap, c_r, noise, seed)
+
+
+def answer(v: Array, gap: float, c_r: float, noise: float, seed: int = 1) -> Array:
+    u = PlayRecord(v).output(gap, float(v[0]) + 0.4 * gap).p - c_r
+    late = np.append([u[0]] * 200, u)
+    y = lfilter([0.0, 0.0, 0.03, 0.025], [1.0, -1.7, 0.755], late)
+    return np.asarray(y[200:]) + noise * np.random.default_rng(seed).standard_normal(len(v))
+
+
+@pytest.mark.parametrize('seed', SEEDS)
+def test_random_actuators_are_found_to_within_their_deviations(seed: int) -> None:
+    case = random_case(seed)
+    found = identify(case.v, case.y, case.period)
+    assert found.reasons == ()
+    assert found.integrator == case.integrating
+    assert case.delay in found.delays
+    for name, true in (('gap', case.gap), ('c_r', case.c_r), ('c_l', case.c_l)):
+        assert abs(getattr(found, name) - true) < max(4.0 * found.std[name], 1e-9)
+    assert found.details is not None
+    w = found.frequencies
+    ratio = response(found.details.fit, w) * np.exp(-1j * w * found.delay) / case.response(w)
+    assert np.abs(ratio - 1.0).max() < 0.03
+
+
+@pytest.mark.parametrize('seed', [1, 8])
+def test_rounding_alone_is_no_reason_for_a_further_pole(
+    monkeypatch: pytest.MonkeyPatch, seed: int,
+) -> None:
+    monkeypatch.setattr(identification_cases, 'NOISE', (1e-300, 1e-300))
+    case = random_case(seed)
+    found = identify(case.v, case.y, case.period)
+    assert len(found.denominator) == len(case.denominator)
+    assert found.denominator == pytest.approx(case.denominator, abs=1e-9)
+
+
+def test_delays_that_contradict_each_other_where_each_is_sure_leave_the_gentler_one() -> None:
+    # By its deviations alone, each of four delays tells all of G.
+    case = random_case(1042)
+    found = identify(case.v, case.y, case.period, Options((1, 2)))
+    assert set(found.delays) == {0, 1, 2, 3}
+    assert found.delay == case.delay
+
+
+def test_lost_samples_and_outliers_do_not_matter() -> None:
+    v, y = record()
+    rng = np.random.default_rng(3)
+    y[rng.random(len(y)) < 0.1] = np.nan
+    wild = rng.choice(np.flatnonzero(np.isfinite(y)), 12, replace=False)
+    y[wild] += 5.0
+    found = identify(v, y, PERIOD_S, QUICK)
+    assert 12 <= found.outliers <= 40
+    assert found.gap == pytest.approx(0.9, abs=4.0 * found.std['gap'])
+    assert found.delay == 1
+    assert found.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
+
+
+def test_slope_is_taken_out_of_the_gain_of_g() -> None:
+    v, y = record()
+    one = identify(v, y, PERIOD_S, QUICK)
+    tenth = identify(v, y, PERIOD_S, Options(QUICK.orders, QUICK.delays, slope=0.1))
+    assert tenth.m == 0.1
+    assert np.array(tenth.numerator) == pytest.approx(10.0 * np.array(one.numerator))
+    assert (tenth.gap, tenth.c_r) == (one.gap, one.c_r)
+
+
+@given(st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=60), st.floats(0.0, 8.0),
+       st.floats(-12.0, 12.0))
+def test_play_output_of_a_record_is_that_of_the_operator(
+    values: list[float], gap: float, start: float,
+) -> None:
+    v = np.array(values)
+    expected, _ = play(v, gap, start)
+    assert PlayRecord(v).output(gap, start).p.tolist() == expected.tolist()
+
+
+def test_slopes_are_the_derivatives_of_the_simulation() -> None:
+    v, y = record(400, gap=0.9137)
+    samples, structure = Samples(v, y, 3), Structure(2, 1, False)
+    point = Point(np.array([-1.68, 0.74]), 0.8137, float(v[0]) + 0.3)
+    exact = samples.play.output(point.gap, point.start)
+    linear = solve_linear(samples, structure, point.a, exact.p)
+    by = slopes(samples, structure, point.a, exact, linear.solution[:2], linear.simulated)
+    step = 1e-6
+
+    def simulated(moved: Point) -> Array:
+        p = samples.play.output(moved.gap, moved.start).p
+        return linear_columns(samples, structure, moved.a, p) @ linear.solution
+
+    for column, moved in enumerate((
+        point._replace(a=point.a + np.array([step, 0.0])),
+        point._replace(a=point.a + np.array([0.0, step])),
+        point._replace(gap=point.gap + step), point._replace(start=point.start + step),
+    )):
+        difference = (simulated(moved) - simulated(point)) / step
+        assert by[:, column] == pytest.approx(difference, abs=2e-4 * np.abs(difference).max())
+
+
+def test_fit_without_noise_is_exact() -> None:
+    v, y = record(800, gap=0.9137, noise=0.0)
+    found = fit(Samples(v, y, 3), Structure(2, 1, False),
+                Point(np.array([-1.69, 0.745]), 0.91, float(v[0]) + 0.36))
+    assert found.point.gap == pytest.approx(0.9137, abs=1e-6)
+    assert found.c_r == pytest.approx(0.5, abs=1e-6)
+    assert found.numerator == pytest.approx([0.03, 0.025], rel=1e-4)
+
+
+def reasons(v: Array, y: Array, options: Options = QUICK) -> str:
+    found = identify(v, y, PERIOD_S, options)
+    assert not found.usable
+    return ' '.join(found.reasons)
+
+
+def test_a_v_that_stays_within_the_gap_shows_nothing() -> None:
+    v = 0.1 * motion(1600)
+    assert 'y shows nothing of v' in reasons(v, answer(v, 0.9, 0.45, 2e-3))
+
+
+def test_too_few_reversals_are_told() -> None:
+    # Up once and halfway down.
+    v = np.append(np.linspace(0.0, 3.0, 400), np.linspace(3.0, 0.5, 400))
+    text = reasons(v, answer(v, 0.9, 0.5, 2e-3))
+    assert 'went past the gap' in text or 'known to' in text
+
+
+def test_a_gap_that_noise_hides_is_told() -> None:
+    v, y = record(500, gap=0.4, c_r=0.2, noise=0.8)
+    assert 'the gap, about' in reasons(v, y)
+
+
+def test_a_sensor_at_its_end_is_told() -> None:
+    v, y = record()
+    assert 'the sensor is at its end' in reasons(v, np.clip(y, -1.2, 1.2))
+
+
+def test_zero_outside_of_the_gap_is_told() -> None:
+    v, y = record()
+    assert '0 of v lies outside' in reasons(v, y + 2.0)
+
+
+def test_a_load_that_coasts_in_the_gap_is_told() -> None:
+    # While v crosses the gap, u goes on as it went before, ever slower.
+    v = motion(1600)
+    held = PlayRecord(v).output(0.9, float(v[0]) + 0.4).p
+    u, speed = held.copy(), 0.0
+    for k in range(1, len(u)):
+        speed = held[k] - held[k - 1] if held[k] != held[k - 1] else 0.97 * speed
+        u[k] = min(max(u[k - 1] + speed, v[k]), v[k] + 0.9)
+        if u[k] in (v[k], v[k] + 0.9):
+            speed = u[k] - u[k - 1]
+    y = lfilter([0.0, 0.03, 0.025], [1.0, -1.7, 0.755], u - 0.5)
+    text = reasons(v, y + 2e-3 * np.random.default_rng(1).standard_normal(len(v)))
+    assert 'follows from no backlash and no linear G' in text
+
+
+def test_one_speed_is_noted() -> None:
+    t = np.arange(1600) % 320
+    v = np.where(t < 160, t, 320 - t) / 40.0 - 2.0
+    found = identify(v, answer(v, 0.9, 0.5, 2e-3), PERIOD_S, QUICK)
+    assert any('one speed' in text for text in found.remarks)
+
+
+def test_no_backlash_is_noted() -> None:
+    v = motion(1600)
+    found = identify(v, answer(v, 0.0, 0.0, 2e-3), PERIOD_S, QUICK)
+    assert any('no backlash was found' in text for text in found.remarks)
+
+
+@pytest.mark.parametrize(('v', 'y', 'said'), [
+    (np.zeros(0), np.zeros(0), 'too few'), (np.zeros(3), np.zeros(3), 'too few'),
+    (np.zeros(900), np.ones(900), 'v stood still'),
+    (np.arange(900) % 100 / 10.0, np.ones(900), 'y stood still'),
+    (np.arange(900) % 100 / 10.0, np.full(900, np.nan), 'too few'),
+    (np.arange(900) % 100 / 10.0, np.where(np.arange(900) < 700, np.nan, 1.0), 'too unevenly'),
+    (np.arange(900) % 100 / 10.0, np.where(np.arange(900) < 500, 1.0, np.nan), 'too unevenly'),
+])
+def test_what_holds_no_motion_is_told_in_a_sentence(v: Array, y: Array, said: str) -> None:
+    assert said in reasons(v, y)
+
+
+@pytest.mark.parametrize(('v', 'y'), [
+    (np.zeros(5), np.zeros(4)), (np.full(5, np.nan), np.zeros(5)),
+    (np.zeros(5), np.full(5, np.inf)), (np.zeros((5, 2)), np.zeros((5, 2))),
+])
+def test_arrays_that_are_none_are_refused(v: Array, y: Array) -> None:
+    with pytest.raises(ValueError, match='must be'):
+        identify(v, y, PERIOD_S)
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**31), st.sampled_from((0.0, 1e-6, 1.0, 1e6)), st.floats(0.0, 0.9))
+def test_any_numbers_lead_to_a_result(seed: int, size: float, lost: float) -> None:
+    rng = np.random.default_rng(seed)
+    v, y = np.cumsum(rng.standard_normal(300)), size * rng.standard_normal(300)
+    y[rng.random(300) < lost] = np.nan
+    found = identify(v, y, PERIOD_S, Options((1, 2), (0,)))
+    assert isinstance(found, Identification)
+    assert found.usable == (found.reasons == ())
+    assert not found.usable or found.std['gap'] >= 0.0

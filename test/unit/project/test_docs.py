@@ -1,0 +1,241 @@
+"""The documents: links lead somewhere, what they name exists, what is made is current."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from places import ROOT
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.nodes.driver_check.options import parse_options
+from backlash_ros.tools.bringup import command as bringup
+from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.identify import command as identify
+from backlash_ros.tools.replay import command as replay
+from backlash_ros.tools.simulate import batch
+from backlash_ros.tools.simulate import command as simulate
+
+DOCS = ROOT / 'docs'
+MADE_BY = DOCS / 'made_by'
+PAGES = sorted([ROOT / 'README.md', *DOCS.rglob('*.md')])
+README = (ROOT / 'README.md').read_text()
+BLOCK = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
+LINK = re.compile(r'\]\(([^)\s]+)\)')
+CODE = re.compile(r'`([^`\n]+)`')
+DOTTED = re.compile(r'[a-z_]+(\.[a-z_0-9]+)+')
+SETTING = re.compile(r'^(?P<name>[a-z_.]+): (?P<value>\S.*)$')
+MARKS = re.compile(
+    r'<!-- (\w+): made by docs/made_by/figures\.py -->\n(.*?)<!-- end -->', re.DOTALL
+)
+GROUPS = {name.split('.')[0] for name in BY_NAME if '.' in name}
+# Files of a result and topics share their first word with a group of parameters.
+FILE_ENDINGS = {'py', 'yaml', 'json', 'csv', 'md', 'html', 'txt'}
+
+
+def of_every_page(pattern: re.Pattern[str]) -> Iterator[tuple[Path, str]]:
+    for page in PAGES:
+        for found in pattern.finditer(page.read_text()):
+            yield page, found[1]
+
+
+def shell_commands() -> list[list[str]]:
+    """Return the words of each command in the shell blocks of all pages and in `simulate -...`."""
+    lines = [
+        line
+        for page in PAGES for language, text in BLOCK.findall(page.read_text())
+        if language in ('bash', 'sh')
+        for line in text.replace('\\\n', ' ').splitlines()
+    ]
+    lines += [code for _, code in of_every_page(CODE) if code.startswith('simulate -')]
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [line for line in words if line]
+
+
+def console_scripts() -> set[str]:
+    return set(re.findall(r"f'(\w+) = \{PACKAGE\}", (ROOT / 'setup.py').read_text()))
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings, as they are formed on the web."""
+    headings = re.findall(r'^#+ (.*)$', page.read_text(), re.MULTILINE)
+    return {
+        re.sub(r'[^\w\- ]', '', heading.lower()).replace(' ', '-') for heading in headings
+    }
+
+
+def test_links_lead_to_files_and_headings() -> None:
+    broken = []
+    for page, link in of_every_page(LINK):
+        if '://' in link:
+            continue
+        path, _, anchor = link.partition('#')
+        target = (page.parent / path).resolve() if path else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(f'{page.name}: {link}')
+    assert broken == []
+
+
+def test_every_picture_is_shown() -> None:
+    shown = {(page.parent / link).resolve() for page, link in of_every_page(LINK)}
+    assert set((DOCS / 'images').iterdir()) <= shown
+
+
+def test_readme_begins_with_a_film_that_loads_fast() -> None:
+    first = re.search(r'!\[[^\]]*\]\((\S+)\)', README)
+    assert first is not None
+    path = ROOT / first[1]
+    assert path.stat().st_size < 3e6
+    with Image.open(path) as film:
+        assert film.n_frames > 50
+        assert film.info['loop'] == 0  # for ever
+
+
+def test_made_tables_are_filled_and_known_to_the_script() -> None:
+    found = {name: text for page in PAGES for name, text in MARKS.findall(page.read_text())}
+    assert all(text.startswith('| ') for text in found.values())
+    source = ast.parse((MADE_BY / 'tables.py').read_text())
+    tables = next(
+        node.value for node in ast.walk(source)
+        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == 'TABLES'
+    )
+    assert isinstance(tables, ast.Dict)
+    assert {ast.literal_eval(key) for key in tables.keys if key is not None} == set(found)
+
+
+@pytest.mark.parametrize('page', ['parameters', 'constants'])
+def test_page_that_is_made_from_the_code_is_current(page: str) -> None:
+    code = f'import generate_{page} as g, sys; sys.stdout.write(g.{page}_page())'
+    done = subprocess.run(
+        [sys.executable, '-c', f'import sys; sys.path.insert(0, {str(MADE_BY)!r}); {code}'],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )
+    assert (DOCS / 'reference' / f'{page}.md').read_text() == done.stdout, 'call make docs'
+
+
+def test_every_constant_has_a_meaning() -> None:
+    page = (DOCS / 'reference' / 'constants.md').read_text()
+    rows = re.findall(r'^\| (.+?) \| .+? \| (.*?) \| \[', page, re.M)
+    assert len(rows) > 200
+    assert [names for names, meaning in rows if not meaning] == []
+
+
+def test_python_files_that_pages_name_exist() -> None:
+    named = {code for _, code in of_every_page(CODE) if re.fullmatch(r'\w+\.py', code)}
+    folders = ('backlash_ros', 'docs', 'benchmarks', 'examples', 'test', 'scripts')
+    present = {path.name for folder in folders for path in (ROOT / folder).rglob('*.py')}
+    assert named
+    assert named <= present
+
+
+def test_parameters_that_pages_name_exist() -> None:
+    named = {
+        code for _, code in of_every_page(CODE)
+        if DOTTED.fullmatch(code) and code.split('.')[0] in GROUPS
+        and code.split('.')[-1] not in FILE_ENDINGS
+    }
+    groups = {name.rsplit('.', 1)[0] for name in BY_NAME if '.' in name}
+    assert named & set(BY_NAME)
+    assert named <= set(BY_NAME) | groups
+
+
+def test_settings_that_pages_name_are_accepted() -> None:
+    settings = [
+        (found['name'], found['value']) for _, code in of_every_page(CODE)
+        if (found := SETTING.match(code)) and found['name'] in BY_NAME
+        and found['value'] != 'n'
+    ]
+    assert settings
+    for name, value in settings:
+        effective_parameters(None, [f'{name}={value}'])
+
+
+@pytest.mark.parametrize('words', shell_commands(), ids=' '.join)
+def test_command_exists_and_takes_its_arguments(words: list[str]) -> None:
+    program, *arguments = words
+    if program == 'make':
+        targets = re.findall(r'^(\w+):', (ROOT / 'Makefile').read_text(), re.MULTILINE)
+        assert arguments[0] in targets
+    elif program == 'ros2':
+        assert arguments[:2] == ['run', 'backlash_ros']
+        assert arguments[2] in console_scripts()
+    elif program in ('rosdep', 'colcon', '.', 'export', 'cp') or '=' in program:
+        assert program != 'colcon' or arguments[-1] == 'backlash_ros'
+        if program == 'cp':
+            shipped = arguments[0].removeprefix('$(ros2 pkg prefix --share backlash_ros)/')
+            assert (ROOT / shipped).is_file()
+    elif program == '.venv/bin/python':
+        # test_driver_examples.py runs them.
+        assert arguments[0] == '-c' or (ROOT / arguments[0]).is_file()
+    else:
+        assert program.removeprefix('.venv/bin/') in console_scripts()
+        check_tool(program.removeprefix('.venv/bin/'), arguments)
+
+
+def check_tool(program: str, arguments: list[str]) -> None:
+    """Let the tool itself parse its options, and the core build what they describe."""
+    if program == 'report':
+        assert len(arguments) == 1
+        return
+    if program in ('controller', 'plant', 'reference', 'recorder'):
+        assert arguments[:2] == ['--ros-args', '--params-file']
+        assert (ROOT / arguments[2]).is_file()
+        return
+    if 'identified/identified.yaml' in arguments:
+        # The command before it writes that file, and test_driver_examples.py runs both.
+        assert bringup.parse_options(arguments).config == Path('identified/identified.yaml')
+        return
+    if program in ('identify', 'replay'):
+        parser = identify.make_parser() if program == 'identify' else replay.make_parser()
+        config = parser.parse_args(arguments).config
+        assert config is None or (ROOT / config).is_file()
+        return
+    if program == 'check_driver':
+        config = parse_options(arguments).config
+        assert config is None or (ROOT / config).is_file()
+        return
+    options = (
+        simulate.make_parser().parse_args(arguments) if program == 'simulate'
+        else bringup.parse_options(arguments)
+    )
+    build_controller(effective_parameters(options.config, options.settings, options.seed))
+    for sweep in getattr(options, 'sweep', []):
+        batch.parse_sweep(sweep)
+
+
+def test_python_blocks_run() -> None:
+    blocks = [
+        text for page in PAGES for language, text in BLOCK.findall(page.read_text())
+        if language == 'python'
+    ]
+    assert blocks
+    for text in blocks:
+        command = [sys.executable, '-c', text]
+        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+        assert done.returncode == 0, text + done.stderr
+
+
+def test_readme_names_every_executable_and_topic() -> None:
+    codes = set(CODE.findall(README))
+    assert console_scripts() <= codes
+    named = {value for name, value in vars(topics).items() if name.isupper()}
+    assert {name for name in named if isinstance(name, str)} <= codes
+
+
+def test_terminals_of_the_readme_make_a_whole_loop_with_a_file_that_is_installed() -> None:
+    block = next(text for _, text in BLOCK.findall(README) if 'rosdep install' in text)
+    lines = block.splitlines()
+    # From Python 3.11 on, rosdep refuses the keys that come from pip otherwise.
+    assert lines[0].startswith('PIP_BREAK_SYSTEM_PACKAGES=1 rosdep install')
+    assert '$(ros2 pkg prefix --share backlash_ros)/config/geared_motor.yaml' in block
+    started = re.findall(r'ros2 run backlash_ros (\w+)', block)
+    assert {'controller', 'plant', 'reference', 'recorder'} <= set(started)

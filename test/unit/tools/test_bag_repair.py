@@ -1,0 +1,429 @@
+"""Bags that lost their writer or their end: nothing that was flushed is lost by the repair."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from places import ROOT
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Writer
+from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
+
+from backlash_ros.bags.content import BagError
+from backlash_ros.bags.remains import damage, open_remains
+from backlash_ros.bags.repair import repair, repair_command
+from backlash_ros.bags.writer import STORAGE, Bag
+
+FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
+CDR = b'\x00\x01\x00\x00'
+MESSAGES, PER_FLUSH = 400, 40
+PAGE = 4096  # of SQLite
+MAGIC = b'\x89MCAP0\r\n'
+
+# Writes without end, and tells after each flush what is safe.
+WRITER = """
+import itertools, struct, sys
+from backlash_ros.bags.writer import Bag
+bag = Bag(sys.argv[1], sys.argv[2])
+number = bag.add_topic('/number', 'std_msgs/msg/Float64')
+for i in itertools.count():
+    bag.write(number, 10**18 + i * 1_000_000, bytes([0, 1, 0, 0]) + struct.pack('<d', i))
+    if i % 100 == 99:
+        bag.flush()
+        print(bag.saved, flush=True)
+"""
+
+
+def number_message(i: int) -> bytes:
+    return CDR + struct.pack('<d', float(i))
+
+
+def write_numbers(path: Path, storage: str, each: Callable[[Bag], None] = Bag.flush) -> None:
+    """Write messages 0, 1, 2, ... to a bag, and something on a second topic, out of order."""
+    bag = Bag(str(path), storage)
+    number, other = bag.add_topic('/number', FLOAT), bag.add_topic('/other', FLOAT)
+    for i in range(MESSAGES):
+        bag.write(number, 10**18 + i * 1_000_000, number_message(i))
+        if i % 10 == 9:
+            bag.write(other, 10**18 + (i - 5) * 1_000_000, number_message(-i))
+        if i % PER_FLUSH == PER_FLUSH - 1:
+            each(bag)
+    bag.close()
+
+
+def numbers_in(bag: Path) -> list[float]:
+    """What was written to /number, as rosbags finds it in a complete bag."""
+    with AnyReader([bag]) as reader:
+        return [
+            reader.deserialize(raw, connection.msgtype).data
+            for connection, _, raw in reader.messages() if connection.topic == '/number'
+        ]
+
+
+def numbers_for_mcap_reader(bag: Path) -> list[float]:
+    """The same by the reader that has nothing to do with rosbags."""
+    (file,) = bag.glob('*.mcap')
+    with file.open('rb') as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [message.data for *_, message in reader.iter_decoded_messages(['/number'])]
+
+
+def message_file(bag: Path) -> Path:
+    (file,) = (file for file in bag.iterdir() if file.suffix in ('.mcap', '.db3'))
+    return file
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob('*') if path.is_file()}
+
+
+@contextmanager
+def writer_process(bag: Path, storage: str) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen(
+        [sys.executable, '-c', WRITER, str(bag), storage], cwd=ROOT,
+        stdout=subprocess.PIPE, text=True,
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_kill_of_the_writer_loses_nothing_that_was_flushed(tmp_path: Path, storage: str) -> None:
+    bag = tmp_path / 'bag'
+    with writer_process(bag, storage) as process:
+        assert process.stdout is not None
+        lines = [process.stdout.readline() for _ in range(5)]
+        process.send_signal(signal.SIGKILL)
+        lines += process.stdout.readlines()
+    flushed = int(lines[-1])
+    before = contents(bag)
+    left = [message.data for message in open_remains(bag).messages()]
+    assert left == [number_message(i) for i in range(len(left))]
+    assert len(left) >= flushed
+    assert contents(bag) == before
+    done = repair(bag)
+    assert done is not None
+    assert done.messages == {'/number': len(left)}
+    assert contents(done.original).keys() == {
+        name.replace('/bag/', '/bag.damaged/') for name in before
+    }
+    assert damage(bag) == ''
+    assert numbers_in(bag) == list(map(float, range(len(left))))
+    if storage == 'mcap':
+        assert numbers_for_mcap_reader(bag) == list(map(float, range(len(left))))
+    assert {path.name for path in tmp_path.iterdir()} == {'bag', 'bag.damaged'}
+    assert repair(bag) is None
+
+
+class Finished:
+    """A finished bag, and how many numbers had been flushed at which size of its file."""
+
+    def __init__(self, folder: Path, storage: str) -> None:
+        self.bag = folder / f'{storage}_bag'
+        self.flushed: list[tuple[int, int]] = [(0, 0)]
+
+        def flush(bag: Bag) -> None:
+            bag.flush()
+            size = message_file(bag.path).stat().st_size
+            self.flushed.append((size, self.flushed[-1][1] + PER_FLUSH))
+
+        write_numbers(self.bag, storage, flush)
+        self.data = message_file(self.bag).read_bytes()
+
+    def numbers_within(self, size: int) -> int:
+        """How many numbers had been flushed when the file was no larger than this."""
+        return max(count for end, count in self.flushed if end <= size)
+
+    @contextmanager
+    def with_file(self, data: bytes, metadata: bool) -> Iterator[Path]:
+        """A copy of the bag whose file holds this."""
+        with tempfile.TemporaryDirectory() as folder:
+            bag = Path(folder) / self.bag.name
+            shutil.copytree(self.bag, bag)
+            message_file(bag).write_bytes(data)
+            if not metadata:
+                (bag / 'metadata.yaml').unlink()
+            yield bag
+
+
+@pytest.fixture(scope='module')
+def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Finished]:
+    folder = tmp_path_factory.mktemp('finished')
+    return {storage: Finished(folder, storage) for storage in STORAGE}
+
+
+def repaired_numbers(bag: Path) -> list[float]:
+    """What the repair leaves; nothing if it says that nothing can be saved."""
+    return numbers_in(bag) if is_complete_after_repair(bag) else []
+
+
+def is_complete_after_repair(bag: Path) -> bool:
+    """Repair a bag; False if it says that nothing can be saved, which then is as it was."""
+    before = contents(bag.parent)
+    try:
+        repair(bag)
+    except BagError:
+        assert contents(bag.parent) == before
+        return False
+    assert damage(bag) == ''
+    return True
+
+
+def ends_of_records(data: bytes) -> list[int]:
+    """Where the records of an mcap file end, those within chunks left aside (mcap.dev/spec)."""
+    ends = [len(MAGIC)]
+    while ends[-1] < len(data) - len(MAGIC):
+        (length,) = struct.unpack_from('<Q', data, ends[-1] + 1)
+        ends.append(ends[-1] + 9 + length)
+    return [*ends, len(data)]
+
+
+def test_mcap_cut_at_any_record_keeps_every_block_before_it(
+    finished: dict[str, Finished],
+) -> None:
+    whole = finished['mcap']
+    ends = ends_of_records(whole.data)
+    assert len(ends) > 2 * len(whole.flushed)
+    for k, (begin, end) in enumerate(pairwise([0, *ends])):
+        # After a power cut the file may have its old length, and zeros where nothing was written.
+        for size, zeros in (end, (0, 1, 10_000)[k % 3]), ((begin + end) // 2, 0):
+            # Whoever closes a bag writes the metadata last: at the end they may be there or not.
+            with whole.with_file(whole.data[:size] + bytes(zeros), metadata=k % 2 == 0) as bag:
+                found = repaired_numbers(bag)
+            assert found == list(map(float, range(len(found)))), size
+            assert len(found) >= whole.numbers_within(size), size
+
+
+def test_sqlite_cut_at_any_page_gives_what_it_still_can(finished: dict[str, Finished]) -> None:
+    whole = finished['sqlite3']
+    for end in range(0, len(whole.data) + 1, PAGE):
+        for size in (end, max(end - 100, 0)):
+            with whole.with_file(whole.data[:size], metadata=end % (2 * PAGE) == 0) as bag:
+                found = repaired_numbers(bag)
+            assert found == list(map(float, range(len(found)))), size
+            if size == len(whole.data):
+                assert len(found) == MESSAGES
+
+
+@settings(max_examples=120)
+@given(st.data())
+def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_error(
+    finished: dict[str, Finished], data: st.DataObject,
+) -> None:
+    whole = finished[data.draw(st.sampled_from(sorted(STORAGE)))]
+    changed = bytearray(whole.data)
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(changed) - 1))
+        garbage = data.draw(st.binary(min_size=1, max_size=40))
+        changed[at:at + len(garbage)] = garbage
+    with whole.with_file(bytes(changed), data.draw(st.booleans())) as bag:
+        complete = is_complete_after_repair(bag)
+        assert (damage(bag) == '') == complete
+
+
+def test_length_that_is_garbage_is_not_taken_for_a_need_of_memory(
+    finished: dict[str, Finished],
+) -> None:
+    whole = finished['mcap']
+    begin, flushed = whole.flushed[5]
+    assert whole.data[begin] == 6  # a chunk
+    changed = whole.data[:begin + 1] + struct.pack('<Q', 2**62) + whole.data[begin + 9:]
+    with whole.with_file(changed, metadata=False) as bag:
+        assert len(repaired_numbers(bag)) >= flushed
+
+
+def test_sqlite_that_lost_its_last_pages_gives_the_messages_before_them(
+    finished: dict[str, Finished],
+) -> None:
+    whole = finished['sqlite3']
+    with whole.with_file(whole.data[:-2 * PAGE], metadata=True) as bag:
+        found = repaired_numbers(bag)
+    assert MESSAGES // 2 < len(found) < MESSAGES
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_bag_with_less_than_its_metadata_promise_is_not_complete(
+    finished: dict[str, Finished], storage: str,
+) -> None:
+    with finished[storage].with_file(finished[storage].data, metadata=True) as bag:
+        metadata = bag / 'metadata.yaml'
+        text = metadata.read_text()
+        metadata.write_text(text.replace('message_count: 440', 'message_count: 441'))
+        done = repair(bag)
+        assert done is not None
+        assert done.why == 'holds 440 of 441 messages'
+        assert damage(bag) == ''
+
+
+def test_page_of_zeros_costs_only_the_block_that_it_lies_in(
+    finished: dict[str, Finished],
+) -> None:
+    whole = finished['mcap']
+    (begin, before), (end, after) = whole.flushed[4:6]
+    at = begin + (end - begin) // 2
+    changed = whole.data[:at] + bytes(600) + whole.data[at + 600:]
+    with whole.with_file(changed, metadata=False) as bag:
+        found = repaired_numbers(bag)
+    lost = sorted(set(map(float, range(MESSAGES))) - set(found))
+    assert lost
+    assert all(before <= number < after for number in lost)
+    assert found == sorted(found)
+
+
+def test_torn_message_before_a_missing_page_is_not_taken_for_sound(
+    finished: dict[str, Finished],
+) -> None:
+    whole = finished['mcap']
+    (begin, _), (end, _) = whole.flushed[4:6]
+    sound = set(map(float, range(MESSAGES)))
+    for at in range(begin + 100, end - 300, 7):
+        changed = whole.data[:at] + bytes(200) + whole.data[at + 200:]
+        with whole.with_file(changed, metadata=False) as bag:
+            messages = open_remains(bag).messages()
+            found = {struct.unpack('<d', data[4:])[0] for topic, _, data in messages
+                     if topic.name == '/number'}
+        assert found <= sound
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_flush_reaches_into_the_installed_rosbags(tmp_path: Path, storage: str) -> None:
+    bag = Bag(str(tmp_path / 'bag'), storage)
+    assert bag.survives_a_crash, 'rosbags has changed: see _flush_of'
+    bag.write(bag.add_topic('/number', FLOAT), 1, number_message(7))
+    assert list(open_remains(bag.path).messages()) == []
+    bag.flush()
+    assert [message.data for message in open_remains(bag.path).messages()] == [number_message(7)]
+    bag.close()
+    assert damage(bag.path) == ''
+
+
+class OtherStorage:
+    """Has all that rosbags promises of a storage, and nothing of what it is made of today."""
+
+    def __init__(self, path: Path, compression: Any) -> None:
+        self._hidden = Sqlite3Writer(path, compression)
+        self.path = self._hidden.path
+        self.add_msgtype = self._hidden.add_msgtype
+        self.add_connection = self._hidden.add_connection
+        self.write, self.close = self._hidden.write, self._hidden.close
+        self.abort = self._hidden.abort
+
+
+@pytest.mark.parametrize('storage', STORAGE)
+def test_rosbags_made_otherwise_still_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, storage: str,
+) -> None:
+    monkeypatch.setattr(Writer, 'STORAGE_PLUGINS', {STORAGE[storage]: OtherStorage})
+    bag = Bag(str(tmp_path / 'bag'), storage)
+    assert not bag.survives_a_crash
+    bag.write(bag.add_topic('/number', FLOAT), 1, number_message(7))
+    bag.flush()
+    bag.close()
+    assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
+
+
+def test_bag_that_is_whole_is_left_alone(
+    finished: dict[str, Finished], capsys: pytest.CaptureFixture[str],
+) -> None:
+    for whole in finished.values():
+        before = contents(whole.bag.parent)
+        assert repair_command(whole.bag) == 0
+        assert capsys.readouterr().out == f'{whole.bag} is complete: nothing to repair\n'
+        assert contents(whole.bag.parent) == before
+
+
+def test_bag_that_is_being_recorded_is_left_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    bag = Bag(str(tmp_path / 'bag'), 'mcap')
+    assert repair_command(bag.path) == 1
+    assert 'is being recorded: stop its recorder first' in capsys.readouterr().err
+    bag.close()
+    assert repair_command(bag.path) == 0
+
+
+def other_program(bag: Path) -> None:
+    """The beginning of a bag that `ros2 bag record` may have left."""
+    file = message_file(bag)
+    file.write_bytes(file.read_bytes()[:3000].replace(b'rosbags-', b'another-'))
+
+
+def second_file(bag: Path) -> None:
+    (bag / 'more.mcap').touch()
+
+
+def nothing_flushed(bag: Path) -> None:
+    file = message_file(bag)
+    file.write_bytes(file.read_bytes()[:60])
+
+
+def file_gone(bag: Path) -> None:
+    message_file(bag).unlink()
+
+
+@pytest.mark.parametrize(
+    ('spoil', 'code', 'words'),
+    [
+        (shutil.rmtree, 2, 'does not exist'),
+        (lambda bag: (shutil.rmtree(bag), bag.touch()), 2, 'is a file: give the folder'),
+        (lambda bag: (shutil.rmtree(bag), bag.mkdir()), 2, 'is no bag: has no metadata.yaml'),
+        (other_program, 1, 'was not written by the recorder: try `ros2 bag reindex`'),
+        (second_file, 1, 'has 2 files with messages: give each a folder'),
+        (nothing_flushed, 1, 'holds no message that could be saved'),
+        (file_gone, 1, 'its file with the messages is gone'),
+    ],
+)
+def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
+    tmp_path: Path, finished: dict[str, Finished], capsys: pytest.CaptureFixture[str],
+    spoil: Callable[[Path], object], code: int, words: str,
+) -> None:
+    bag = tmp_path / finished['mcap'].bag.name
+    shutil.copytree(finished['mcap'].bag, bag)
+    if spoil is not file_gone:
+        (bag / 'metadata.yaml').unlink()
+    spoil(bag)
+    before = contents(tmp_path)
+    assert repair_command(bag) == code
+    said = capsys.readouterr()
+    assert said.out == ''
+    assert words in said.err
+    assert said.err.count('\n') == 1
+    assert contents(tmp_path) == before
+
+
+def test_second_repair_keeps_both_originals(
+    tmp_path: Path, finished: dict[str, Finished],
+) -> None:
+    bag = tmp_path / finished['mcap'].bag.name
+    shutil.copytree(finished['mcap'].bag, bag)
+    originals = []
+    for size in (6000, 4000):
+        file = message_file(bag)
+        file.write_bytes(file.read_bytes()[:size])
+        done = repair(bag)
+        assert done is not None
+        originals.append(message_file(done.original).stat().st_size)
+    assert originals == [6000, 4000]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        'mcap_bag', 'mcap_bag.damaged', 'mcap_bag.damaged.1',
+    ]

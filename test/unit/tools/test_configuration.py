@@ -1,0 +1,294 @@
+"""Parameter files and settings: what is accepted, how mistakes are answered."""
+
+from __future__ import annotations
+
+from math import inf
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.config.configuration import (
+    Setting,
+    effective_parameters,
+    find_config,
+    load_config,
+    parse_setting,
+    read_configuration,
+    shipped_configs,
+    write_config,
+)
+
+SHIPPED = sorted((ROOT / 'config').glob('*.yaml'))
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    return tmp_path / 'my.yaml'
+
+
+def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() -> None:
+    example = load_config(shipped_configs() / 'paper_example.yaml')
+    # The paper supposes G(z) exact, which the plant of a user never is.
+    exact = Parameters().replaced({'plant.uncertainty': 0.0})
+    assert example == {name: exact[name] for name in example}
+    assert effective_parameters(None) == exact
+    assert Parameters().get_float('plant.uncertainty') > 0.0
+
+
+@pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.name)
+def test_shipped_file_loads_and_runs(path: Path) -> None:
+    for axis in read_configuration(path).axes or ('',):
+        parameters = effective_parameters(path, axis=axis)
+        assert build_closed_loop(parameters).run(50).samples == 50
+
+
+def test_shipped_file_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_config(Path('geared_motor.yaml')).is_file()
+    here = written(tmp_path / 'geared_motor.yaml', 'a file of that name here goes first')
+    assert find_config(Path('geared_motor.yaml')).resolve() == here
+
+
+def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
+    parameters = Parameters({
+        'driver': "ros2 run 'it'", 'axes': ['x', 'y'], 'plant.numerator': [1 / 3, 1e-300],
+        'control.min': -0.1, 'control.rate_max': 5.5, 'lockstep': True,
+        'file': "it's a: file.csv", 'seed': 7, 'backlash.jump': [0.0, 1e22, -0.5],
+        'truth.numerator': [0.5], 'truth.denominator': [1.0, -0.5],
+        'actuator.numerator': [0.5], 'actuator.denominator': [1.0, -0.5],
+    })
+    write_config(parameters, config)
+    assert Parameters(load_config(config)) == parameters
+    assert len(load_config(config)) == len(parameters)
+
+
+def test_empty_list_is_left_out_and_so_is_what_bringup_alone_would_use(config: Path) -> None:
+    # ROS 2 knows no empty list.
+    write_config(Parameters(), config)
+    assert '/bringup' not in config.read_text()
+    assert '[]' not in config.read_text()
+    assert Parameters(load_config(config)) == Parameters()
+
+
+def test_written_infinity_is_one_for_ros_as_well(config: Path) -> None:
+    write_config(Parameters(), config)
+    text = config.read_text()
+    assert 'max: .inf\n' in text
+    assert 'min: -.inf\n' in text
+    assert load_config(config)['control.max'] == inf
+
+
+def test_misspelt_key_is_answered_with_the_nearest_one_and_the_file(config: Path) -> None:
+    written(config, '/**: {ros__parameters: {estimator: {lwa: lms}}}')
+    with pytest.raises(ParameterError) as caught:
+        load_config(config)
+    assert str(caught.value).startswith(f'{config}: estimator.lwa is not a parameter: ')
+    assert 'did you mean estimator.law?' in str(caught.value)
+
+
+def test_bad_value_is_answered_with_rule_and_file(config: Path) -> None:
+    written(config, '/**: {ros__parameters: {sample_period: -1}}')
+    with pytest.raises(ParameterError, match=r'my\.yaml: sample_period=-1\.0 must be > 0 \[s\]'):
+        load_config(config)
+
+
+def test_whole_number_and_bare_exponent_are_floats(config: Path) -> None:
+    # YAML 1.1 reads 1e-5 as a text.
+    written(config, '/**: {ros__parameters: {amplitude: 3, plant.numerator: [1e-5, 4]}}')
+    values = load_config(config)
+    assert values == {'amplitude': 3.0, 'plant.numerator': (1e-5, 4.0)}
+    assert isinstance(values['amplitude'], float)
+
+
+@pytest.mark.parametrize('section', ['/**', '/controller', 'controller', '/**/controller'])
+def test_section_of_a_node_is_accepted(config: Path, section: str) -> None:
+    written(config, f'{section}: {{ros__parameters: {{estimator: {{law: lms}}}}}}')
+    assert load_config(config) == {'estimator.law': 'lms'}
+
+
+def test_section_of_a_node_goes_before_that_of_all(config: Path) -> None:
+    written(
+        config,
+        '/plant: {ros__parameters: {seed: 5}}\n/**: {ros__parameters: {seed: 4, amplitude: 2.0}}',
+    )
+    assert load_config(config) == {'seed': 5, 'amplitude': 2.0}
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('/robot: {ros__parameters: {seed: 1}}', "section '/robot' is none of"),
+        ('/plant: {ros__parameters: {seed: 1}}\nplant: {ros__parameters: {seed: 2}}',
+         'seed has two values, 1 and 2'),
+        ('/controller: {ros__parameters: {seed: 1}}', 'is not a parameter of controller'),
+        ('/**: {ros__parameters: {seed: 1, seed: 2}}', "line 1: 'seed' is given twice"),
+        ('/**: {seed: 1}', 'must hold ros__parameters'),
+        ('/**: {ros__parameters: }', 'must hold "name: value" lines'),
+        ('/**: {ros__parameters: {seed: [}}', 'line 1:'),
+        ('seed', 'must hold'),
+        ('', 'must hold'),
+        ('/**: {ros__parameters: {5: 1}}', '5 is not a parameter'),
+        ('/contoller: {ros__parameters: {seed: 1}}', 'did you mean /controller?'),
+        ('/x/contoller: {ros__parameters: {seed: 1}}', 'did you mean /x/controller?'),
+        ('/x/plant: {ros__parameters: {seed: 1}}', "there is no axis 'x': list it in"),
+        ('/a/b/plant: {ros__parameters: {seed: 1}}', "section '/a/b/plant' is none of"),
+        ('/x/bringup: {ros__parameters: {axes: [x]}}', 'is for the whole run'),
+        ('/plant: {ros__parameters: {driver: none}}', 'put it under /** or /bringup'),
+    ],
+)
+def test_mistake_in_a_file_is_one_line_that_names_the_file(
+    config: Path, text: str, message: str,
+) -> None:
+    written(config, text)
+    with pytest.raises((InputError, ParameterError)) as caught:
+        load_config(config)
+    assert str(caught.value).startswith(f'{config}:')
+    assert message in str(caught.value)
+    assert '\n' not in str(caught.value)
+
+
+def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'nothing\.yaml: cannot be read: No such file'):
+        load_config(tmp_path / 'nothing.yaml')
+    binary = tmp_path / 'binary.yaml'
+    binary.write_bytes(b'\xff\xfe\x00')
+    with pytest.raises(InputError, match='not a text file'):
+        load_config(binary)
+
+
+@pytest.mark.parametrize(
+    ('text', 'expected'),
+    [
+        ('seed=3', ('seed', 3)),
+        ('amplitude=1e1', ('amplitude', 10.0)),
+        ('control.max=.inf', ('control.max', inf)),
+        ('lockstep=true', ('lockstep', True)),
+        ('axes=[x, y]', ('axes', ('x', 'y'))),
+        ('axes=[]', ('axes', ())),
+        ('plant.numerator=[1, 2e-3]', ('plant.numerator', (1.0, 2e-3))),
+        ('file=2024', ('file', '2024')),
+        ('file=', ('file', '')),
+        ('estimator.law=lms', ('estimator.law', 'lms')),
+    ],
+)
+def test_setting_is_read_like_a_line_of_yaml(text: str, expected: tuple[str, object]) -> None:
+    assert parse_setting(text) == Setting('', *expected)
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('seed', 'must be KEY=VALUE'),
+        ('/seed=1', 'must be KEY=VALUE'),
+        ('x/sed=1', 'did you mean seed'),
+        ('x/axes=[y]', 'is for the whole run'),
+        ('axes=[x, x]', 'each once'),
+        ('axes=[on]', 'quote true, on'),
+        ('axes=[a/b]', 'must be a list of names'),
+        ('axes=7', 'must be a list of names'),
+        ('sed=1', 'did you mean seed'),
+        ('seed=x', 'must be a number'),
+        ('seed=[', 'is not a value in YAML'),
+        ('seed=', 'must be a number'),
+        ('structure=square', 'must be one of'),
+    ],
+)
+def test_bad_setting_is_refused(text: str, message: str) -> None:
+    with pytest.raises((InputError, ParameterError), match=message):
+        parse_setting(text)
+
+
+def test_settings_go_before_the_file_and_the_seed_before_both(config: Path) -> None:
+    written(config, '/**: {ros__parameters: {seed: 2, amplitude: 2.0, bias: 2.0}}')
+    parameters = effective_parameters(config, ['amplitude=3', 'seed=3'], seed=4)
+    assert (parameters['bias'], parameters['amplitude'], parameters['seed']) == (2.0, 3.0, 4)
+
+
+AXES = '/bringup: {ros__parameters: {axes: [x, y]}}\n'
+
+
+@pytest.mark.parametrize('sections', [
+    # From the most to the least specific; the order in the file is of no account.
+    ['/x/plant', '/**/plant', '/x/**', '/**'],
+    ['/**', '/x/**', '/**/plant', '/x/plant'],
+])
+def test_named_node_goes_before_named_axis_and_that_before_all(
+    config: Path, sections: list[str],
+) -> None:
+    values = {'/x/plant': 4, '/**/plant': 3, '/x/**': 2, '/**': 1}
+    text = AXES
+    left = list(sections)
+    for specific in ('/x/plant', '/**/plant', '/x/**', '/**'):
+        text = AXES + ''.join(
+            f'{name}: {{ros__parameters: {{seed: {values[name]}}}}}\n' for name in left
+        )
+        written(config, text)
+        assert effective_parameters(config, axis='x')['seed'] == values[specific]
+        left.remove(specific)
+
+
+def test_section_of_an_axis_is_for_that_one_alone(config: Path) -> None:
+    written(config, AXES + '/y/**: {ros__parameters: {seed: 7}}')
+    assert effective_parameters(config, axis='x')['seed'] == Parameters()['seed']
+    assert effective_parameters(config, axis='y')['seed'] == 7
+
+
+def test_setting_of_an_axis_goes_before_one_for_all_in_any_order(config: Path) -> None:
+    written(config, AXES)
+    for settings in (['x/seed=5', 'seed=4'], ['seed=4', 'x/seed=5']):
+        assert effective_parameters(config, settings, axis='x')['seed'] == 5
+        assert effective_parameters(config, settings, axis='y')['seed'] == 4
+
+
+def test_driver_of_one_axis_goes_before_that_of_all(config: Path) -> None:
+    written(config, '/bringup: {ros__parameters: {axes: [x, y], driver: all}}\n'
+                    '/x/bringup: {ros__parameters: {driver: own}}')
+    configuration = read_configuration(config)
+    drivers = [configuration.parameters(axis)['driver'] for axis in configuration.axes]
+    assert drivers == ['own', 'all']
+
+
+@pytest.mark.parametrize(
+    ('section', 'message'),
+    [
+        ('/plant', "section '/plant' belongs to no axis: write /**/plant for all axes or /x/plant"),
+        ('/z/plant', "there is no axis 'z' among x, y: did you mean"),
+        ('/xx/**', "there is no axis 'xx' among x, y: did you mean x?"),
+    ],
+)
+def test_section_that_no_axis_would_read_is_refused(
+    config: Path, section: str, message: str,
+) -> None:
+    written(config, AXES + f'{section}: {{ros__parameters: {{seed: 1}}}}')
+    with pytest.raises(InputError) as caught:
+        read_configuration(config)
+    assert str(caught.value).startswith(f'{config}: ')
+    assert message in str(caught.value)
+
+
+def test_one_of_several_axes_must_be_chosen_by_its_name(config: Path) -> None:
+    written(config, AXES)
+    with pytest.raises(InputError, match=r'holds the axes x, y .* like --axis x'):
+        effective_parameters(config)
+    with pytest.raises(InputError, match="no axis 'z' among x, y"):
+        effective_parameters(config, axis='z')
+    with pytest.raises(InputError, match="--set z/seed: there is no axis 'z' among x, y"):
+        effective_parameters(config, ['z/seed=1'], axis='x')
+
+
+def test_given_names_are_those_of_the_user_and_not_of_the_default_file(config: Path) -> None:
+    assert read_configuration(None, ['bias=1'], seed=3).given() == {'bias', 'seed'}
+    written(config, AXES + '/x/**: {ros__parameters: {amplitude: 2.0}}')
+    given = read_configuration(config, ['y/bias=1'])
+    assert given.given('x') == {'axes', 'amplitude'}
+    assert given.given('y') == {'axes', 'bias'}
