@@ -34,7 +34,7 @@ from reporting import (
     text_table,
 )
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.tools.config.configuration import effective_parameters
 
 CONFIG = Path('geared_motor.yaml')

@@ -22,7 +22,7 @@ from reporting import ROOT, machine, markdown_table, parallel, processors, text_
 from scipy.stats import chi2
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.identification.identification import Identification, identify
 from backlash_ros.core.identification.uncertainty import crossings_covariance, response
 from backlash_ros.core.parameters import Parameters

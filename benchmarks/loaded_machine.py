@@ -45,7 +45,7 @@ from reporting import (
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.middleware.loopback import prefer_loopback
 
 Array = NDArray[np.float64]

@@ -43,7 +43,7 @@ from gears.gear_runs import (
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
 from tqdm import tqdm
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.tools.config.configuration import parse_setting
 

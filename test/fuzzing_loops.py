@@ -22,7 +22,7 @@ import numpy as np
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.control.controller import plausible
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.parameters import Parameters
 
 SAMPLES = 2000  # of a loop

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.estimate import Estimate, Interval
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Estimate, Interval
 from backlash_ros.core.parameters import Parameters
 
 # Second order, 20 Hz, at 200 Hz, as in geared_motor.yaml.

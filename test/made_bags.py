@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel
+from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-    from backlash_ros.core.estimation.protocol import Estimate, Status
+    from backlash_ros.core.estimate import Estimate, Status
     from backlash_ros.core.estimation.whole_record.record_fit import fit_record
     from backlash_ros.core.parameters import Parameters
     from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    'Estimate': 'estimation.protocol', 'Parameters': 'parameters', 'Status': 'estimation.protocol',
+    'Estimate': 'estimate', 'Parameters': 'parameters', 'Status': 'estimate',
     'build_closed_loop': 'simulation.closed_loop', 'build_controller': 'assembly',
     'build_plant': 'assembly', 'build_reference': 'assembly',
     'fit_record': 'estimation.whole_record.record_fit',

@@ -18,13 +18,13 @@ from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
 from backlash_ros.core.control.structure import Structure
 from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.control.tracking.tracking import Tracking
-from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
-from backlash_ros.core.estimation.baselines.gradient import GradientEstimator
-from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
-from backlash_ros.core.estimation.baselines.lms import NormalisedLms
-from backlash_ros.core.estimation.baselines.printed_law import PrintedLaw
+from backlash_ros.core.estimate import Bounds, Estimate, Estimator
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Estimator
+from backlash_ros.core.laws.fixed import FixedBacklash
+from backlash_ros.core.laws.gradient import GradientEstimator
+from backlash_ros.core.laws.input_reconstruction import InputReconstruction
+from backlash_ros.core.laws.lms import NormalisedLms
+from backlash_ros.core.laws.printed_law import PrintedLaw
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles

@@ -16,12 +16,12 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, warnings_of
 from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
-from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.estimation.storage import load_estimate, worth_saving
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter, kept_outputs
+from backlash_ros.core.loop.storage import load_estimate, worth_saving
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import CONTROLLER

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from accuracy.cramer_rao import cramer_rao
 from accuracy.random_cases import Case, bound_of, random_case, uncertain_case
 from backlash_ros.core.control.controller import Limits
+from backlash_ros.core.estimate import Estimator, Status
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Estimator, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord

@@ -22,8 +22,8 @@ import simulated_motor
 
 from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.control.controller import REFINE_SHARE
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.moving_horizon import moving_horizon
-from backlash_ros.core.estimation.protocol import Estimate
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters

@@ -25,7 +25,7 @@ from accuracy.uncertain_cases import (
     random_backlash,
 )
 from accuracy.uncertain_runs import DEVIATIONS, Figures, larger_moves, run_job
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.config.configuration import effective_parameters
 

@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from accuracy.coasting_load import CoastingLoad
 from accuracy.uncertain_cases import Job
 from backlash_ros.core.assembly import build_plant, build_true_model
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop

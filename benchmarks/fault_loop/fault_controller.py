@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from math import isfinite
 
 from backlash_ros.core.control.controller import ControlStep, Limits
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.report_use import AWAITED_REPORTS
 from backlash_ros.core.loop.sample_counter import KEPT_OUTPUTS, Output, SampleCounter

@@ -15,7 +15,7 @@ from backlash_ros.core.control.structure import LARGEST_FEEDBACK, LARGEST_IN_ACQ
 from backlash_ros.core.control.tracking.design import Weights, feedback_around
 from backlash_ros.core.control.tracking.rest import TOLERANCE
 from backlash_ros.core.control.tracking.tracking import FADING
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 
 ROUNDING = 1e-9

@@ -19,7 +19,7 @@ import numpy as np
 from reporting import ROOT
 from tqdm import tqdm
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.identification.identification import Options
 from gears.gear_runs import PRESETS, Gear, close_loop, identified, learning
 

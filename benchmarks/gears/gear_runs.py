@@ -19,7 +19,7 @@ from gear_physics import PRESETS, Gear, GearPhysics
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.control.controller import AdaptiveController
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import (
     Identification,

@@ -13,7 +13,7 @@ from reporting import Check
 
 from backlash_ros.core.assembly import law_fits
 from backlash_ros.core.control.controller import REFINE_SHARE
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 

@@ -16,8 +16,8 @@ from backlash_ros.core.assembly import (
     build_reference,
     law_fits,
 )
-from backlash_ros.core.estimation.protocol import Estimate, Status
-from backlash_ros.core.estimation.storage import was_given
+from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.loop.storage import was_given
 from backlash_ros.core.parameters import Parameters
 
 SAMPLES, RESTS_FROM = 1500, 900

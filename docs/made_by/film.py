@@ -30,7 +30,7 @@ from film_scene import Scene  # noqa: E402
 from gears.gear_runs import PRESETS, Run, close_loop, constant, identified  # noqa: E402
 
 from backlash_ros.core.assembly import build_controller  # noqa: E402
-from backlash_ros.core.estimation.protocol import Status  # noqa: E402
+from backlash_ros.core.estimate import Status  # noqa: E402
 
 FILE = ROOT / 'docs' / 'images' / 'gear.gif'
 SWING, PERIODS = 0.04, 4  # [rad], of a sine with the frequency of the preset

@@ -19,7 +19,7 @@ from printed_law import (
 from runs import simulate
 
 from backlash_ros.core.assembly import build_model, build_true_model
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.metrics import control_error_rms, settling_time
@@ -31,7 +31,6 @@ DISTURBANCE = 2.0
 ROOT = Path(__file__).resolve().parents[2]
 ESTIMATION = ROOT / 'backlash_ros' / 'core' / 'estimation'
 CONSTANTS = ESTIMATION / 'constants.py'
-OF_EVERY_LAW = ('protocol.py', 'storage.py')
 CONSTANT = re.compile(r'([A-Z][A-Z0-9_]*(?:, [A-Z][A-Z0-9_]*)*) = (.*?)(?:  # (.*))?')
 KIND = re.compile(r'# --- (\w+)')
 MOTOR = 'geared_motor.yaml'
@@ -221,8 +220,7 @@ def estimator_details() -> str:
     """The guards and the structure of single computations of the method."""
     rows: list[tuple[str, str, str, str, str]] = []
     for path in sorted(ESTIMATION.rglob('*.py'), key=lambda path: path.name):
-        of_the_law = path.name not in OF_EVERY_LAW and path.parent.name != 'baselines'
-        if of_the_law and path != CONSTANTS:
+        if path != CONSTANTS:
             link = f'[{path.name}](../{path.relative_to(ROOT)})'
             rows += [
                 (kind, f'`{name}`', value, what, link)

@@ -13,7 +13,7 @@ from ros_processes import ros_world
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 
 ABSURD = (nan, inf, -inf, 1e300, -1e300)
 

@@ -13,8 +13,8 @@ from ros_processes import Probe, ros_world
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel, from_fields
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.parameters import Parameters
 
 P = Parameters({})

@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.control.structure import Adoption, ControlInput, Structure
-from backlash_ros.core.estimation.protocol import Estimate, Estimator, Interval, StateSource
+from backlash_ros.core.estimate import Estimate, Estimator, Interval, StateSource
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.state_model import StateModel
 

@@ -19,7 +19,7 @@ from backlash_ros.core.control.structure import (
     ControlInput,
     Structure,
 )
-from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.four_blocks import FourBlocks
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction

@@ -7,7 +7,7 @@ from math import hypot, inf, isnan
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import Adoption, Command, ControlInput, Structure
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.state_model import StateModel
 

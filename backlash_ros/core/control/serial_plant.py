@@ -15,9 +15,9 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
+from backlash_ros.core.estimate import Estimate, Interval
 from backlash_ros.core.estimation.constants import OUTLIERS
-from backlash_ros.core.estimation.protocol import Estimate, Interval
+from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.state_model import StateModel

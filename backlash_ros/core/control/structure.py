@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.estimation.protocol import Estimate, StateSource
+from backlash_ros.core.estimate import Estimate, StateSource
 from backlash_ros.core.plant.state_model import StateModel
 
 # Largest feedback, whatever y does, in units of the u that the reference has asked for so far or

@@ -1,1 +1,1 @@
-"""How m, c_r, c_l are learned from v and y: the protocol, the default law, and its baselines."""
+"""How m, c_r, c_l are learned from v and y: the default law."""

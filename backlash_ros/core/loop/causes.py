@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import inf, isfinite, nan
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures
 
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides

@@ -17,9 +17,9 @@ from backlash_ros.core.assembly import (
 )
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep, plausible
 from backlash_ros.core.control.last_command import last_commands
-from backlash_ros.core.estimation.baselines.lms import NormalisedLms
+from backlash_ros.core.estimate import Estimate, Interval
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Estimate, Interval
+from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.report_use import report_use

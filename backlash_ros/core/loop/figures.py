@@ -7,7 +7,7 @@ from enum import IntEnum
 from math import nan
 from typing import NamedTuple
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 
 
 class Level(IntEnum):

@@ -15,8 +15,8 @@ from backlash_ros.core.assembly import (
     build_reference,
 )
 from backlash_ros.core.control.controller import AdaptiveController
-from backlash_ros.core.estimation.moving_horizon.learned_model import learned_model_of
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.transfer_function import TransferFunction

@@ -5,8 +5,8 @@ from __future__ import annotations
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
-from backlash_ros.core.estimation.protocol import Estimate
-from backlash_ros.core.estimation.storage import save_estimate
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.loop.storage import save_estimate
 from backlash_ros.core.parameters import Parameters
 
 

@@ -10,8 +10,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
-from backlash_ros.core.estimation.moving_horizon.learned_model import learned_model_of
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.nodes.runtime.messages import without_events
 

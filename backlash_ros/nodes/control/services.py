@@ -11,8 +11,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros.core.estimation.storage import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.storage import worth_saving
 
 UNCONFIGURED = 'the controller is unconfigured: configure it first'
 

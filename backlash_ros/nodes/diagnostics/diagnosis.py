@@ -11,13 +11,13 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Status
-from backlash_ros.core.estimation.storage import was_given
 from backlash_ros.core.loop.causes import LONGEST_TEXT, findings_of
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer
 from backlash_ros.core.loop.loop_statistics import Lately
+from backlash_ros.core.loop.storage import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.run_record import stated_deviations

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.identification.least_response import known_up_to
 from backlash_ros.core.identification.uncertainty import response

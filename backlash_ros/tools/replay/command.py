@@ -204,7 +204,7 @@ def _several(jobs: Sequence[_Job], out: Path | None) -> None:
 def _figures(run: RunRecord) -> tuple[float, ...]:
     import numpy as np
 
-    from backlash_ros.core.estimation.protocol import Status
+    from backlash_ros.core.estimate import Status
     last = [float(run.column(name)[-1]) for name in HEADER[2:8]]
     tracking = np.flatnonzero(run.column('status') == Status.TRACKING)
     begins = float(run.column('t')[tracking[0]]) if len(tracking) else float('nan')

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import ESTIMATORS, law_fits
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash

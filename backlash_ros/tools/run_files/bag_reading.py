@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros import topics
-from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel, from_fields
+from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli.errors import InputError
 from backlash_ros.tools.run_files.bag_content import Content, read_content

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from backlash_ros.atomic_file import point_link, write_atomically
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel, from_fields
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.metrics import (
     control_error_rms,

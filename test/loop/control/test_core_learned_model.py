@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_model, build_true_model
-from backlash_ros.core.estimation.moving_horizon.learned_model import (
+from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.loop.learned_model import (
     FREQUENCIES,
     LearnedModel,
     from_fields,
     learned_model_of,
 )
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop

@@ -26,8 +26,8 @@ from backlash_ros.core.control.tracking.design import (
 )
 from backlash_ros.core.control.tracking.slope_tolerance import margin_in_pieces
 from backlash_ros.core.control.tracking.tracking import Tracking
-from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
-from backlash_ros.core.estimation.protocol import Estimate, Interval
+from backlash_ros.core.estimate import Estimate, Interval
+from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.four_blocks import place_poles
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant

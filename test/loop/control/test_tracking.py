@@ -17,7 +17,7 @@ from backlash_ros.core.control.tracking.lq_preview import preview_gains
 from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
 from backlash_ros.core.control.tracking.slope_tolerance import tolerates
 from backlash_ros.core.control.tracking.tracking import shrunk_crossings
-from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction

@@ -8,8 +8,8 @@ import pytest
 from accuracy.simulated_processes import HeldUpProcesses
 from simulated_motor import C_L, C_R
 
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.tools.config.configuration import effective_parameters
 
 CONFIG = Path('geared_motor.yaml')

@@ -22,8 +22,8 @@ from accuracy.estimation_runs import (
 from scipy.special import chdtri
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation.moving_horizon.learning import CAPACITY
-from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 

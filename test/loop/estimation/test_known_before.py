@@ -9,8 +9,8 @@ import pytest
 from known_gear import KNOWN, answers, estimator_knowing, learn
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.plant.backlash import play_outputs
 
 Array = NDArray[np.float64]

@@ -26,10 +26,10 @@ from places import ROOT
 from scipy.signal import cont2discrete, lfilter
 
 from backlash_ros.core.assembly import build_controller, build_model, build_true_model
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.constants import BLOCK
 from backlash_ros.core.estimation.fit.relabelling import searched
 from backlash_ros.core.estimation.moving_horizon import acquisition
-from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.simulation.closed_loop import build_closed_loop

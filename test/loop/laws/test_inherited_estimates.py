@@ -7,7 +7,7 @@ import pytest
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.control.controller import AdaptiveController
-from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 
 EXACT = {'plant.uncertainty': 0.0}

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from strategies import output_of, paper_example, plants
 
 from backlash_ros.core.control.controller import AdaptiveController, ControlStep
-from backlash_ros.core.estimation.baselines.lms import NormalisedLms
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop

@@ -14,7 +14,7 @@ from strategies import signals
 from backlash_ros.core.control.controller import LARGEST, AdaptiveController, Limits
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval
+from backlash_ros.core.estimate import Bounds, Estimate, Interval
 from backlash_ros.core.parameters.errors import ParameterError
 
 PAPER = Estimate(1.3, 3.0, -3.0, 0.22)

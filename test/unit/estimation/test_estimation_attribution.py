@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from accuracy.uncertain_cases import motor_jobs
 
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted, labelled
 from backlash_ros.core.estimation.fit.solution import Around
@@ -13,7 +14,6 @@ from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHor
 from backlash_ros.core.estimation.moving_horizon.refitting import refit
 from backlash_ros.core.estimation.observer.observer import Observer
 from backlash_ros.core.estimation.observer.record_attribution import attributed
-from backlash_ros.core.estimation.protocol import Status
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.plant.state_model import StateModel

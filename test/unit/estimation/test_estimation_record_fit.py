@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from records import PERIOD_S, Truth, output, resonance, swing
 from scipy.special import chdtri
 
+from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.fit.prior import Prior
-from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.whole_record.record_description import RecordFit, frequencies_of
 from backlash_ros.core.estimation.whole_record.record_fit import fit_record
 from backlash_ros.core.estimation.whole_record.record_samples import SEARCHED_AT_MOST

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from known_gear import KNOWN, answers, estimator_knowing, learn
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.plant.backlash import play_outputs
 
 MOVES, RESTS, TURNS = 60, 400, 60  # samples

@@ -12,7 +12,7 @@ pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.
 from gear_physics import PRESETS, Gear, GearPhysics
 from gears import gear_runs
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 
 SERVO = PRESETS['servo']
 

@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.estimation.baselines.agreement import LEAST_SAMPLES, MEMORY, Agreement
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.laws.agreement import LEAST_SAMPLES, MEMORY, Agreement
 
 
 @given(seed=st.integers(0, 2**32 - 1), exponent=st.integers(-6, 6))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, output_of, plants
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
+from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction

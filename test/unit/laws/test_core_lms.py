@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import KnownInput, Play, strokes, usual_plays
 
-from backlash_ros.core.estimation.baselines.lms import NormalisedLms
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
+from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.plant.backlash import Backlash, Region
 
 START = Estimate(0.696, 0.5, -0.5, 0.22)

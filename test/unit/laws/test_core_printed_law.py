@@ -13,13 +13,13 @@ from strategies import NO_STATE, KnownInput, Play, eighths, usual_plays
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.structure import Command, ControlInput
-from backlash_ros.core.estimation.baselines.printed_law import (
+from backlash_ros.core.estimate import Bounds, Estimate, Interval
+from backlash_ros.core.laws.printed_law import (
     PrintedLaw,
     printed_c,
     printed_f,
     printed_m,
 )
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.reference.signal import ReferenceSignal
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.closed_loop import build_closed_loop

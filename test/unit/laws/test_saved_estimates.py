@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimation.protocol import Estimate, Status
-from backlash_ros.core.estimation.storage import load_estimate, save_estimate, worth_saving
+from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.loop.storage import load_estimate, save_estimate, worth_saving
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.closed_loop import build_closed_loop

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.causes import (
     HELD,
     KNOWN,

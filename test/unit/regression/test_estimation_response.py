@@ -11,9 +11,9 @@ from backlash_ros.core.estimation.fit.learned_error import response_std
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.relabelling import Fitted, fitted
 from backlash_ros.core.estimation.fit.solution import Around
-from backlash_ros.core.estimation.moving_horizon.learned_model import FREQUENCIES
 from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.loop.learned_model import FREQUENCIES
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 

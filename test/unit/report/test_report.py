@@ -14,7 +14,7 @@ import pytest
 from made_bags import LATENCY_S, PARAMETERS, TYPES, believed, write_bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from backlash_ros.core.estimation.moving_horizon.learned_model import LearnedModel
+from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord

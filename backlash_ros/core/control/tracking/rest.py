@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.structure import dot
 from backlash_ros.core.control.tracking.design import TrackingDesign
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.protocol import Estimate
+from backlash_ros.core.estimate import Estimate
 
 
 @dataclass(frozen=True)

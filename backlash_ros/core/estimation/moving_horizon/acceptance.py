@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.constants import BY_CHANCE, NO_GAP, PRECISE_GAP, PRECISE_SLOPE
 from backlash_ros.core.estimation.fit.crossings import Crossings
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import Fitted
-from backlash_ros.core.estimation.protocol import Bounds
 
 # --- guards
 BOUND_ROUNDING = 1e-9  # relative distance from a bound that is none

@@ -7,6 +7,7 @@ from collections.abc import Generator
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation.constants import (
     AS_GOOD,
     BLOCK,
@@ -24,7 +25,6 @@ from backlash_ros.core.estimation.observer.record_attribution import (
     as_told,
     with_other_commands,
 )
-from backlash_ros.core.estimation.protocol import Estimate, Status
 from backlash_ros.core.estimation.regression.play import Start
 
 Array = NDArray[np.float64]

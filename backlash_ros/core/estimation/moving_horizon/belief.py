@@ -7,12 +7,12 @@ from enum import Enum, auto
 
 import numpy as np
 
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.constants import LASTING, PRECISE_GAP, RECOVERED, REPLACING
 from backlash_ros.core.estimation.fit.crossings import Crossings, difference
 from backlash_ros.core.estimation.fit.prior import beyond_chance, contradicts, prior_of
 from backlash_ros.core.estimation.moving_horizon.acceptance import differs, is_precise
 from backlash_ros.core.estimation.moving_horizon.learning import Learning
-from backlash_ros.core.estimation.protocol import Estimate
 
 # Motion that no backlash and no G explains, over m times the gap: no more than the gap may be
 # uncertain by an error that lasts.

@@ -8,6 +8,7 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimation.constants import (
     AS_GOOD,
     BLOCK,
@@ -33,7 +34,6 @@ from backlash_ros.core.estimation.moving_horizon.acquisition import (
 )
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.observer.record_attribution import with_other_commands
-from backlash_ros.core.estimation.protocol import Estimate, Status
 
 Array = NDArray[np.float64]
 

@@ -13,6 +13,7 @@ from math import inf, log
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.constants import (
     BLOCK,
     FIRST_SEARCH,
@@ -35,7 +36,6 @@ from backlash_ros.core.estimation.fit.solution import Around, Solution
 from backlash_ros.core.estimation.fit.window_fit import WindowFit
 from backlash_ros.core.estimation.moving_horizon.acceptance import usable
 from backlash_ros.core.estimation.observer.record_attribution import Attributed
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Status
 from backlash_ros.core.estimation.regression.play import Labels, Start
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from time import perf_counter, thread_time
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.baselines.fixed import FixedBacklash
+from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
 from backlash_ros.core.estimation.constants import (
     BLOCK,
     NO_DATA,
@@ -35,8 +35,8 @@ from backlash_ros.core.estimation.moving_horizon.belief import (
 from backlash_ros.core.estimation.moving_horizon.learning import CAPACITY, Learning, Task
 from backlash_ros.core.estimation.moving_horizon.schedule import next_task
 from backlash_ros.core.estimation.observer.state_following import Sample, StateFollowing
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval, Status
 from backlash_ros.core.estimation.regression.error_model import build_error_model
+from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]

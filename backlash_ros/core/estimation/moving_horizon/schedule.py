@@ -10,12 +10,12 @@
 
 from __future__ import annotations
 
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.constants import BLOCK, BLOCK_SHARE
 from backlash_ros.core.estimation.moving_horizon.acquisition import acquire
 from backlash_ros.core.estimation.moving_horizon.change_detection import halve, reconsider
 from backlash_ros.core.estimation.moving_horizon.learning import Learning, Task
 from backlash_ros.core.estimation.moving_horizon.refitting import refit, take_block
-from backlash_ros.core.estimation.protocol import Estimate
 
 
 def next_task(learning: Learning, estimate: Estimate) -> Task | int:

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.constants import PRECISE_SLOPE, REVERSALS
 from backlash_ros.core.estimation.fit.crossings import crossings_of
 from backlash_ros.core.estimation.fit.learned_error import as_told, likelier
 from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.moving_horizon.acceptance import largest_gap_std, outside_bounds
-from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.regression.play import play
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction

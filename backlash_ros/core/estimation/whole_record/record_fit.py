@@ -12,6 +12,7 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.fit.pace import Pace, drained
 from backlash_ros.core.estimation.fit.prior import Prior
 from backlash_ros.core.estimation.fit.relabelling import (
@@ -22,7 +23,6 @@ from backlash_ros.core.estimation.fit.relabelling import (
     searched,
 )
 from backlash_ros.core.estimation.fit.solution import SMALLEST_NOISE, Around
-from backlash_ros.core.estimation.protocol import Bounds
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
 from backlash_ros.core.estimation.whole_record.record_description import (

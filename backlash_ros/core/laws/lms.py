@@ -15,9 +15,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
-from backlash_ros.core.estimation.baselines.lagged_law import LaggedLaw
-from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
+from backlash_ros.core.laws.agreement import LEAST_SQUARE
+from backlash_ros.core.laws.input_reconstruction import InputReconstruction
+from backlash_ros.core.laws.lagged_law import LaggedLaw
 
 
 class NormalisedLms(LaggedLaw):

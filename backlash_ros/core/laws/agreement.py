@@ -18,10 +18,13 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Status
+from backlash_ros.core.estimate import Status
 
 Array = NDArray[np.float64]
 
+# Square of a signal below which it counts as none. Its inverse, times the square of any
+# measurement, still is a number.
+LEAST_SQUARE = 1e-240
 MEMORY = 200  # samples over which the mean is taken, with weights that fade
 LEAST_SAMPLES, EVERY = 100, 20  # before the first judgement, and from one to the next
 AGREED = 0.1  # largest error, as a share of what the crossings make of t

@@ -12,7 +12,7 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.protocol import Estimate, Interval, Status
+from backlash_ros.core.estimate import Estimate, Interval, Status
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.state_model import StateModel
 

@@ -8,7 +8,7 @@ from math import isfinite, isnan, nan
 from pathlib import Path
 
 from backlash_ros.atomic_file import write_atomically
-from backlash_ros.core.estimation.protocol import Estimate, Status
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 

@@ -13,10 +13,6 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.parameters.errors import ParameterError
 
-# Square of a signal below which it counts as none. Its inverse, times the square of any
-# measurement, still is a number.
-LEAST_SQUARE = 1e-240
-
 
 class Status(IntEnum):
     """How much an estimate may be trusted; the code stands in `controller/signals`."""

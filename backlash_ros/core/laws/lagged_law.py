@@ -8,15 +8,14 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.baselines.agreement import Agreement
-from backlash_ros.core.estimation.baselines.history import History
-from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
-from backlash_ros.core.estimation.protocol import Status
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.laws.agreement import Agreement
+from backlash_ros.core.laws.history import History
+from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 
 # A side is engaged when the reconstructed u moves on in one direction over this many samples to
 # either side, by more than so many standard deviations of its error: smoothing rounds the corners.
-STROKE = 8
-MOTION_THRESHOLD = 2.0
+STROKE, MOTION_THRESHOLD = 8, 2.0
 LEAST_SHARE = 0.25  # of the mean motion of the stroke, below which the sample itself rests
 
 

@@ -30,8 +30,8 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.baselines.agreement import Agreement
-from backlash_ros.core.estimation.protocol import LEAST_SQUARE, Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
+from backlash_ros.core.laws.agreement import LEAST_SQUARE, Agreement
 from backlash_ros.core.plant.four_blocks import FourBlocks
 from backlash_ros.core.plant.transfer_function import TransferFunction
 

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from math import isfinite, nan
 
-from backlash_ros.core.estimation.baselines.input_reconstruction import InputReconstruction
-from backlash_ros.core.estimation.baselines.lagged_law import LaggedLaw
-from backlash_ros.core.estimation.protocol import Bounds, Estimate, Interval
+from backlash_ros.core.estimate import Bounds, Estimate, Interval
+from backlash_ros.core.laws.input_reconstruction import InputReconstruction
+from backlash_ros.core.laws.lagged_law import LaggedLaw
 
 
 def printed_f(u: float, y_m: float, m: float, w: float) -> float:

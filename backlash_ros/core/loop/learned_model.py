@@ -8,8 +8,8 @@ from math import nan
 
 import numpy as np
 
+from backlash_ros.core.estimate import Estimator
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation.protocol import Estimator
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 # At which the response of G is judged, as shares of the sampling rate: from slow motion to where
