@@ -18,9 +18,8 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 RUN := .venv/bin/python
-# Half of the workers compute at a low priority while the others wait for processes, each of which
-# has a ROS domain of its own: see test/conftest.py and test/scheduling.py.
-WORKERS := -n auto --no-loadscope-reorder
+# A worker per processor; tests of one file share what their fixtures have made.
+WORKERS := -n auto --dist loadfile
 # A Python that was not asked for by name leaves an existing .venv of another Python as it is.
 KEEP := $(if $(filter file,$(origin PYTHON)),--keep-python)
 # A sourced ROS 2 brings its own numpy, and each numpy has other types than the pinned one.
@@ -42,7 +41,6 @@ help:
 demo: run-environment
 	@$(RUN) -m backlash_ros.tools.bringup --duration 10 $(ARGS)
 
-test: export MAKE_TEST_BEGAN := $(shell date +%s)
 test: lint
 	@$(RUN) -m pytest $(WORKERS) $(ARGS)
 

@@ -43,8 +43,7 @@ setup(
     extras_require={
         'cluster': ['distributed'],
         'test': [
-            'distributed', 'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-rerunfailures',
-            'pytest-timeout',
+            'distributed', 'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout',
         ],
     },
     entry_points={

@@ -118,7 +118,7 @@ def assert_told(folder: Path, fault: str, wrong: list[str], *options: str) -> st
             if (subjects(told, '✗'), code) == (wrong, 1 if wrong else 0):
                 return told
             assert beside.held_up() > HELD_UP, told
-    pytest.skip(f'the machine held up the driver in each of {ATTEMPTS} runs')
+    raise AssertionError(f'the machine held up the driver in each of {ATTEMPTS} runs')
 
 
 def test_a_good_driver_passes_and_its_record_is_saved(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from places import ROOT
-from scheduling import SHARE_RUNS
 
 # The interpreter beneath the environment that runs the tests: without packages, so without rclpy.
 BASE_PYTHON = f'{sys.base_prefix}/bin/python3.{sys.version_info.minor}'
@@ -85,7 +84,3 @@ def test_make_test_runs_the_linters_and_passes_arguments_on(bare_clone: Path) ->
     modules = [line.split('-m ', 1)[1] for line in done.stdout.splitlines() if ' -m ' in line]
     assert [module.split()[0] for module in modules] == ['ruff', 'mypy', 'pytest']
     assert modules[-1].endswith(' -x test/system/test_make.py')
-
-
-def test_files_whose_tests_share_runs_are_there() -> None:
-    assert {path.stem for path in (ROOT / 'test').rglob('test_*.py')} >= SHARE_RUNS
