@@ -151,7 +151,7 @@ class GearPhysics:
     def __init__(self, gear: Gear) -> None:
         self.gear = gear
         self.model = mujoco.MjModel.from_xml_string(_description(gear))
-        self._set_contact()
+        set_contact(self.model, gear.contact_stiffness, gear.contact_damping)
         self.data = mujoco.MjData(self.model)
 
     def move_to(self, v: float) -> None:
@@ -174,29 +174,29 @@ class GearPhysics:
 
     def motor_encoder(self) -> float:
         """Position of the motor as it is measured."""
-        return _rounded(self.motor, self.gear.scale * self.gear.motor_resolution)
+        return rounded(self.motor, self.gear.scale * self.gear.motor_resolution)
 
     def load_encoder(self) -> float:
         """Position of the load as it is measured."""
-        return _rounded(self.load, self.gear.scale * self.gear.load_resolution)
-
-    def _set_contact(self) -> None:
-        """Make the limit of the tendon a spring with a damper that push and never pull.
-
-        MuJoCo solves f = max(0, (-b x' - k x - x'') / R), R = (1 - d) / d W, x the way into the
-        limit, W the inverse inertia that it sees (Computation, Constraint model). With k = K R and
-        b = B R that is f = K x + B x' and, with d small, next to no inertia. Negative solref are
-        -k d and -b d.
-        """
-        model, gear = self.model, self.gear
-        r = (1.0 - SOFTNESS) / SOFTNESS * model.tendon_invweight0[0]
-        model.tendon_solref_lim[0] = (
-            -gear.contact_stiffness * r * SOFTNESS, -gear.contact_damping * r * SOFTNESS
-        )
-        model.tendon_solimp_lim[0, :2] = SOFTNESS
+        return rounded(self.load, self.gear.scale * self.gear.load_resolution)
 
 
-def _rounded(value: float, step: float) -> float:
+def set_contact(model: mujoco.MjModel, stiffness: float, damping: float) -> None:
+    """Make the limits of all tendons springs with dampers that push and never pull.
+
+    MuJoCo solves f = max(0, (-b x' - k x - x'') / R), R = (1 - d) / d W, x the way into the
+    limit, W the inverse inertia that it sees (Computation, Constraint model). With k = K R and
+    b = B R that is f = K x + B x' and, with d small, next to no inertia. Negative solref are
+    -k d and -b d.
+    """
+    r = (1.0 - SOFTNESS) * model.tendon_invweight0
+    model.tendon_solref_lim[:, 0] = -stiffness * r
+    model.tendon_solref_lim[:, 1] = -damping * r
+    model.tendon_solimp_lim[:, :2] = SOFTNESS
+
+
+def rounded(value: float, step: float) -> float:
+    """Return the nearest multiple of step, the value itself where step is 0."""
     return step * round(value / step) if step else value
 
 
