@@ -1,0 +1,369 @@
+"""Measure what the estimator learns from the motions that most machines make.
+
+A geared motor with a worn gear and a 14-bit encoder follows slow sines and triangles, squares, and
+moves from point to point with rests, while the true plant differs from the nominal G(z).
+
+All cases, one seed each:     python benchmarks/ordinary_motions.py
+Some of them, three seeds:    ... --cases 'sine|moves' exact --seeds 3 --by motion
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from math import pi
+from pathlib import Path
+from typing import Any
+
+# Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from reporting import ROOT, parallel, text_table
+from scipy.signal import cont2discrete
+
+from backlash_ros.core import Parameters, Status, build_closed_loop
+
+Array = NDArray[np.float64]
+Motion = Callable[[np.random.Generator, float, float], Array]
+
+CORNER, DAMPING = 2.0 * pi * 20.0, 0.5  # of the load in config/geared_motor.yaml [rad/s]
+AMPLITUDE = 0.5  # of y_m [rad]
+FIVE_PERIODS = 10  # reversals
+IN_TIME = 6  # reversals within which *tracking* is due
+CLOSE, FAR, BEYOND = 0.005, 0.01, 5.0  # error in gaps; in gaps; in published deviations
+LEAST_S = 12.0  # of a periodic motion
+
+PLANTS: dict[str, dict[str, object]] = {
+    'exact': {}, 'G known': {'plant.uncertainty': 0.0},
+    'ω × 0.85': {'truth.scale_frequency': 0.85}, 'ω × 1.15': {'truth.scale_frequency': 1.15},
+    'lag 10 ms': {'truth.extra_lag': 0.01}, 'delay 1': {'truth.delay_samples': 1},
+    'offset 0.02': {'input_disturbance': 0.02}, 'offset 0.06': {'input_disturbance': 0.06},
+}
+
+
+def periodic(shape: str, omega: float) -> Motion:
+    """Sine, triangle or square of AMPLITUDE at omega [rad/s], for five periods and a bit."""
+    def motion(rng: np.random.Generator, period_s: float, lost_motion: float) -> Array:
+        phase = omega * np.arange(0.0, max(5.3 * 2.0 * pi / omega, LEAST_S), period_s)
+        wave = np.sin(phase)
+        if shape == 'triangle':
+            wave = 2.0 / pi * np.arcsin(wave)
+        elif shape == 'square':
+            wave = np.where(wave >= 0.0, 1.0, -1.0)
+        return np.asarray(AMPLITUDE * rng.choice([-1.0, 1.0]) * wave)
+    return motion
+
+
+@dataclass(frozen=True)
+class Moves:
+    """Trapezoidal moves with rests between them.
+
+    speed [rad/s], acceleration [rad/s^2], rests: shortest and longest [s]. small: targets within
+    0.8 lost motions instead of 1 rad. one_way: three to five moves ahead, then a short one back.
+    """
+
+    seconds: float
+    speed: float
+    acceleration: float
+    rests: tuple[float, float]
+    small: bool = False
+    one_way: bool = False
+
+    def __call__(self, rng: np.random.Generator, period_s: float, lost_motion: float) -> Array:
+        pieces, x, length, ahead = [np.zeros(1)], 0.0, 1, 0
+        while length * period_s < self.seconds:
+            if self.one_way:
+                back = ahead == 0
+                ahead = int(rng.integers(3, 6)) if back else ahead - 1
+                goal = x + (-lost_motion * rng.uniform(1.2, 3.0) if back and length > 1
+                            else rng.uniform(0.1, 0.4))
+            else:
+                reach = 0.8 * lost_motion if self.small else 1.0
+                goal = rng.uniform(-reach, reach)
+            move = x + np.sign(goal - x) * self._way(abs(goal - x), period_s)
+            x = goal
+            pieces += [move, np.full(round(rng.uniform(*self.rests) / period_s), x)]
+            length += len(pieces[-1]) + len(move)
+        return np.concatenate(pieces)
+
+    def _way(self, distance: float, period_s: float) -> Array:
+        """Way along one move from rest to rest, at every sample."""
+        peak = min(self.speed, np.sqrt(distance * self.acceleration))
+        ramp = peak / self.acceleration
+        end = ramp + distance / peak
+        t = np.arange(0.0, end, period_s)
+        way = np.where(t < ramp, 0.5 * self.acceleration * t**2, peak * (t - 0.5 * ramp))
+        left = np.maximum(end - t, 0.0)
+        return np.asarray(np.where(
+            left < ramp, distance - 0.5 * self.acceleration * left**2, way))
+
+
+MOTIONS: dict[str, Motion] = {
+    **{f'sine {w:g} rad/s': periodic('sine', w) for w in (0.2, 0.5, 1.0, 2.0)},
+    **{f'triangle {w:g} rad/s': periodic('triangle', w) for w in (0.5, 1.0)},
+    'square 1 rad/s': periodic('square', 1.0),
+    'moves, rests 0.5 to 1.5 s': Moves(45.0, 1.0, 5.0, (0.5, 1.5)),
+    'slow moves, rests 1 to 3 s': Moves(90.0, 0.3, 1.0, (1.0, 3.0)),
+    'fast moves, rests 3 to 8 s': Moves(100.0, 2.0, 20.0, (3.0, 8.0)),
+    'moves, rests 10 to 20 s': Moves(250.0, 1.0, 5.0, (10.0, 20.0)),
+    'small moves, rests 0.2 to 0.6 s': Moves(30.0, 0.3, 3.0, (0.2, 0.6), small=True),
+    'one-way moves, rests 0.5 to 1.5 s': Moves(90.0, 1.0, 5.0, (0.5, 1.5), one_way=True),
+}
+RATES = (200.0, 50.0, 1000.0)  # [Hz]; all combinations at the first, some at the others
+AT_OTHER_RATES = (
+    ('sine 1 rad/s', 'triangle 1 rad/s', 'moves, rests 0.5 to 1.5 s'), ('exact', 'ω × 1.15'),
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run: a motion, what the true plant differs in, a rate [Hz] and a seed."""
+
+    motion: str
+    plant: str
+    rate: float
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """How it is chosen and shown."""
+        return f'{self.motion}; {self.plant}; {self.rate:g} Hz'
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of one run; errors are those of c_r or c_l, the worse one.
+
+    learned: reversals of y_m until the first sample that is *tracking* with at most 1 % of the gap
+    of error; first: until the first *tracking*; None for never. first_s: the time of that [s].
+    at_five: error at five periods (ten reversals, or the end), in gaps; std_five: its published
+    deviation in gaps, None without one. Of the *tracking* samples, None without any: rms: RMS of
+    error over deviation; beyond: share with more than five deviations; wrong: share with these and
+    more than 1 % of the gap. shares: of every status. ms: processor time per sample.
+    """
+
+    motion: str
+    plant: str
+    rate: float
+    seed: int
+    learned: int | None
+    first: int | None
+    first_s: float | None
+    at_five: float
+    std_five: float | None
+    rms: float | None
+    beyond: float | None
+    wrong: float | None
+    shares: Mapping[str, float]
+    ms: float
+    problem: str = ''
+
+    @property
+    def good(self) -> bool:
+        """Whether it is as due: in time, close or honest about it, and never wrong."""
+        if self.first is None or self.rms is None or self.beyond is None:
+            return False
+        honest = self.std_five is not None and self.std_five < 0.03 \
+            and self.at_five <= 3.0 * self.std_five
+        return bool(self.first <= IN_TIME and (self.at_five <= CLOSE or honest)
+                    and not self.wrong and self.beyond <= 0.02)
+
+
+def all_cases(seeds: Sequence[int]) -> Iterator[Case]:
+    """Every motion with every plant at 200 Hz, some at other rates."""
+    for rate in RATES:
+        motions, plants = (MOTIONS, PLANTS) if rate == RATES[0] else AT_OTHER_RATES
+        for motion in motions:
+            for plant in plants:
+                yield from (Case(motion, plant, rate, seed) for seed in seeds)
+
+
+@lru_cache
+def motor() -> dict[str, Any]:
+    """Parameters of config/geared_motor.yaml and its simulated plant, by their flat names."""
+    sections = yaml.safe_load((ROOT / 'config' / 'geared_motor.yaml').read_text())
+    found: dict[str, Any] = {}
+
+    def flatten(values: Mapping[str, Any], prefix: str) -> None:
+        for key, value in values.items():
+            if isinstance(value, dict):
+                flatten(value, f'{prefix}{key}.')
+            else:
+                found[prefix + key] = value
+
+    for section in sections.values():
+        flatten(section['ros__parameters'], '')
+    return found
+
+
+def random_backlash(seed: int) -> dict[str, float]:
+    """A slope, and a gap that is split at random between c_r and -c_l."""
+    rng = np.random.default_rng([seed, 12])
+    gap, share = rng.uniform(0.2, 2.0), rng.uniform(0.2, 0.8)
+    return {'backlash.m': float(rng.uniform(0.06, 0.15)), 'backlash.c_r': float(gap * share),
+            'backlash.c_l': float(gap * (share - 1.0))}
+
+
+def run_case(case: Case) -> Result:
+    """Simulate; a run that breaks off is a result as well."""
+    period = 1.0 / case.rate
+    backlash = random_backlash(case.seed)
+    gap = backlash['backlash.c_r'] - backlash['backlash.c_l']
+    lost_motion = backlash['backlash.m'] * gap
+    rng = np.random.default_rng([case.seed, 13])
+    y_m = MOTIONS[case.motion](rng, period, lost_motion)
+    numerator, denominator, _ = cont2discrete(
+        ([CORNER**2], [1.0, 2.0 * DAMPING * CORNER, CORNER**2]), period)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / 'y_m.csv'
+        rows = (f'{k * period:.6f},{value:.9g}' for k, value in enumerate(y_m))
+        file.write_text('\n'.join(['t,y_m', *rows]))
+        p = Parameters({
+            **motor(), **backlash, **PLANTS[case.plant], 'seed': case.seed,
+            'sample_period': period, 'plant.numerator': numerator[0, 1:].tolist(),
+            'plant.denominator': denominator.tolist(), 'waveform': 'file', 'file': str(file),
+            # A way that is longer than that of the example.
+            'control.min': -1e4, 'control.max': 1e4,
+        })
+        loop = build_closed_loop(p)
+    began = time.process_time()
+    try:
+        run = loop.run(len(y_m))
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        return Result(*_key(case), None, None, None, 1e9, None, None, None, None, {}, 0.0,
+                      f'broke off: {error}')
+    ms = 1e3 * (time.process_time() - began) / len(y_m)
+    # A constant that is added to u moves both crossings.
+    shift = p.get_float('input_disturbance') / backlash['backlash.m']
+    error, std = (
+        np.column_stack(columns) for columns in (
+            [run.column(name) - (backlash[f'backlash.{name}'] - shift) for name in ('c_r', 'c_l')],
+            [run.column(f'std_{name}') for name in ('c_r', 'c_l')],
+        )
+    )
+    return _result(case, y_m, np.abs(error) / gap, std / gap, run.column('status'), ms)
+
+
+def _key(case: Case) -> tuple[str, str, float, int]:
+    return case.motion, case.plant, case.rate, case.seed
+
+
+def _result(
+    case: Case, y_m: Array, error: Array, std: Array, status: Array, ms: float,
+) -> Result:
+    reversals = reversals_of(y_m)
+    tracking = status == Status.TRACKING
+    worse, z = error.max(axis=1), error / std
+    close = tracking & (worse <= FAR)
+    five = int(np.argmax(reversals >= FIVE_PERIODS)) or len(y_m) - 1
+    five = min(round(5 * 2 * pi * case.rate / _omega(case.motion)), five) \
+        if _omega(case.motion) else five
+    side = int(np.argmax(error[five]))
+    beyond = ~(z.max(axis=1) <= BEYOND)[tracking]
+
+    def first(rows: NDArray[np.bool_]) -> int | None:
+        return int(np.argmax(rows)) if rows.any() else None
+
+    learned, begun = first(close), first(tracking)
+    return Result(
+        *_key(case), None if learned is None else int(reversals[learned]),
+        None if begun is None else int(reversals[begun]),
+        None if begun is None else begun / case.rate, float(worse[five]),
+        float(std[five, side]) if np.isfinite(std[five, side]) else None,
+        *((float(np.sqrt(np.mean(z[tracking]**2))), float(beyond.mean()),
+           float((beyond & (worse[tracking] > FAR)).mean())) if tracking.any() else (None,) * 3),
+        {word.word: float(np.mean(status == word)) for word in Status}, ms,
+    )
+
+
+def _omega(motion: str) -> float:
+    """Frequency of a periodic motion [rad/s], 0 for another one."""
+    found = re.search(r'([\d.]+) rad/s', motion)
+    return float(found[1]) if found else 0.0
+
+
+def reversals_of(y_m: Array) -> NDArray[np.int_]:
+    """How often the reference has turned back up to every sample, shape (N,)."""
+    moves = np.sign(np.diff(y_m, prepend=y_m[:1]))
+    moving = np.flatnonzero(moves)
+    turned = np.zeros(len(y_m), dtype=int)
+    turned[moving[1:]] = moves[moving[1:]] != moves[moving[:-1]]
+    return np.asarray(np.cumsum(turned))
+
+
+HEADER = ('case', 'good', 'learned', 'reversals', 'error at 5 [% gap]', 'worst',
+          'RMS of e/std', 'beyond 5', 'wrong', 'acquiring', 'tracking', 'inconsistent', 'ms')
+
+
+def row(name: str, results: Sequence[Result]) -> list[str]:
+    """One row of the table: the runs of one case or motion."""
+    def over(values: Sequence[float | None], how: Callable[[Any], Any], form: str) -> str:
+        known = [value for value in values if value is not None]
+        return format(float(how(known)), form) if known else '–'
+
+    learned = [r.learned for r in results if r.learned is not None]
+    return [
+        name, f'{sum(r.good for r in results)}/{len(results)}', f'{len(learned)}/{len(results)}',
+        over(learned, np.median, 'g'), over([100 * r.at_five for r in results], np.median, '.3g'),
+        over([100 * r.at_five for r in results], max, '.3g'),
+        over([r.rms for r in results], lambda x: np.sqrt(np.mean(np.square(x))), '.2f'),
+        over([r.beyond for r in results], np.mean, '.1%'),
+        over([r.wrong for r in results], np.mean, '.1%'),
+        *(over([r.shares.get(word) for r in results], np.mean, '.0%')
+          for word in ('acquiring', 'tracking', 'inconsistent')),
+        over([r.ms for r in results], np.mean, '.2f'),
+    ]
+
+
+def main() -> int:
+    """Return 0 if every run is as due, else 1."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--cases', nargs='+', default=[], metavar='REGEX',
+                        help='cases in whose name each of these is found')
+    parser.add_argument('--seeds', type=int, default=1)
+    parser.add_argument('--first-seed', type=int, default=3)
+    parser.add_argument('--workers', type=int, default=1, help='processes, default 1')
+    parser.add_argument('--by', choices=('case', 'motion', 'plant'), default='case',
+                        help='what a row of the table is')
+    parser.add_argument('--list', action='store_true', help='show the cases and end')
+    parser.add_argument('--out', type=Path, default=ROOT / 'results' / 'ordinary_motions.json')
+    arguments = parser.parse_args()
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
+    cases = [case for case in all_cases(seeds)
+             if all(re.search(word, case.name) for word in arguments.cases)]
+    if not cases:
+        parser.error(f'--cases {" ".join(arguments.cases)}: no case has such a name; see --list')
+    names = list(dict.fromkeys(case.name for case in cases))
+    if arguments.list:
+        print('\n'.join(names))
+        return 0
+    results = parallel(run_case, cases, 'ordinary motions', arguments.workers)
+    label = (lambda case: case.name) if arguments.by == 'case' \
+        else (lambda case: f'{getattr(case, arguments.by)}; {case.rate:g} Hz')
+    groups: dict[str, list[Result]] = {}
+    for case, result in zip(cases, results, strict=True):
+        groups.setdefault(label(case), []).append(result)
+    print(text_table(HEADER, [row(*group) for group in [*groups.items(), ('all', results)]]))
+    for result in results:
+        if result.problem:
+            print(f'    {result.motion}; {result.plant}, seed {result.seed}: {result.problem}')
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    arguments.out.write_text(json.dumps([asdict(r) for r in results], indent=1) + '\n')
+    print(f'wrote {arguments.out}')
+    return 0 if all(result.good for result in results) else 1
+
+
+if __name__ == '__main__':
+    sys.exit(main())
