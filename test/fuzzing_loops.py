@@ -21,7 +21,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 import numpy as np
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.control.controller import plausible
+from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.parameters import Parameters
 

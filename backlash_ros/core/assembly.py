@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from math import inf
 
 import numpy as np
 
-from backlash_ros.core.control.controller import AdaptiveController, Limits
+from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.last_command import check_last_commands
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
@@ -140,9 +140,12 @@ def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
 
 def build_limits(p: Parameters) -> Limits:
     """Limits of v per sample."""
-    rate = p.get_float('control.rate_max')
-    move = inf if rate == inf else rate * p.get_float('sample_period')
-    return Limits(p.get_float('control.min'), p.get_float('control.max'), move)
+    period = p.get_float('sample_period')
+    return Limits(
+        p.get_float('control.min'), p.get_float('control.max'),
+        p.get_float('control.rate_max') * period,
+        p.get_float('control.acceleration_max') * period**2,
+    )
 
 
 def _bounds(p: Parameters) -> Bounds:

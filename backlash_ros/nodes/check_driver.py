@@ -18,7 +18,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_limits
-from backlash_ros.core.control.controller import plausible
+from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.driver_check.findings import (
     WRONG,
     Finding,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from accuracy.cramer_rao import cramer_rao
 from accuracy.random_cases import Case, bound_of, random_case, uncertain_case
-from backlash_ros.core.control.controller import Limits
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.estimate import Estimator, Status
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.parameters import Parameters

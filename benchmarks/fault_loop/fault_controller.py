@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from math import isfinite
 
-from backlash_ros.core.control.controller import ControlStep, Limits
+from backlash_ros.core.control.controller import ControlStep
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.report_use import AWAITED_REPORTS

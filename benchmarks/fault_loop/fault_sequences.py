@@ -14,7 +14,8 @@ from backlash_ros.core.assembly import (
     build_model,
     build_true_model,
 )
-from backlash_ros.core.control.controller import ControlStep, Limits
+from backlash_ros.core.control.controller import ControlStep
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.loop.storage import was_given

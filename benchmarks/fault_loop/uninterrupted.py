@@ -6,6 +6,7 @@ from copy import copy
 from dataclasses import replace
 
 from backlash_ros.core.control.controller import AdaptiveController, ControlStep
+from backlash_ros.core.control.limits import at_rest
 from backlash_ros.core.control.structure import ControlInput
 
 
@@ -26,4 +27,4 @@ class Uninterrupted:
         inverse.set_band(band)
         used = step.estimate if core.compensating else replace(step.estimate, c_r=0.0, c_l=0.0)
         inputs = ControlInput(step.y_m, step.y, used, core.estimator)
-        return core.limits.apply(self._structure.control(inputs, inverse).v, v_before)
+        return core.limits.apply(self._structure.control(inputs, inverse).v, at_rest(v_before)).v

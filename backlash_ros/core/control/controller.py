@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from math import inf, isnan
+from dataclasses import replace
+from math import inf
 from typing import NamedTuple, Protocol
 
 from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.control.structure import Adoption, ControlInput, Structure
 from backlash_ros.core.estimate import Estimate, Estimator, Interval, StateSource
-from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.state_model import StateModel
 
 # Samples after which a better design takes over though v crosses the gap: an unstable loop never
@@ -21,57 +21,6 @@ LONGEST_WAIT = 200
 # Lost outputs in a row that are stepped over; after more nothing is left to predict from them.
 LONGEST_GAP = 1000
 REFINE_SHARE = 0.3  # of a sample period for `refine`, after the command
-LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
-
-
-def plausible(value: float) -> bool:
-    """Whether a value can be a measurement at all; nan, inf and absurd magnitudes are not."""
-    return abs(value) <= LARGEST
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Bounds of v [unit of v] and of its move per sample."""
-
-    low: float = -inf
-    high: float = inf
-    move: float = inf
-
-    def __post_init__(self) -> None:
-        if not self.low < self.high:
-            raise ParameterError(
-                'control.min', self.low, f'must be < control.max={self.high!r}'
-            )
-
-    @property
-    def zero(self) -> float:
-        """The v nearest to 0 within the bounds."""
-        return min(max(0.0, self.low), self.high)
-
-    def go_on_from(self, told: float, known: float | None) -> float:
-        """The v from which commands go on where others tell that it acts.
-
-        Whatever they tell leads no command out of the bounds, or further out than known is: the v
-        that acted before, None where nobody knows it. The bounds may have been narrowed since.
-        """
-        low, high = self.low, self.high
-        if known is not None:
-            low, high = min(low, known), max(high, known)
-        return min(max(told, low), high)
-
-    def apply(self, v: float, v_before: float) -> float:
-        """What may be sent instead of v after v_before: every command passes through here, last.
-
-        It is within the bounds, or as far on the way to them as one sample allows; v_before stays
-        where v is no number.
-        """
-        if self.low <= v <= self.high and abs(v - v_before) <= self.move and abs(v) <= LARGEST:
-            return v
-        if isnan(v):
-            v = v_before
-        # Beyond the largest measurement nobody could tell what v does.
-        v = min(max(v, self.low, -LARGEST), self.high, LARGEST)
-        return min(max(v, v_before - self.move), v_before + self.move)
 
 
 class ControlStep(NamedTuple):
@@ -114,6 +63,7 @@ class AdaptiveController:
     ) -> None:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
+        self.motion = at_rest(inverse.v)  # of the newest command
         self.compensating = True
         self.lost_samples = 0
         self.adopted: StateModel | None = None  # the learned model of G that is in use
@@ -180,9 +130,9 @@ class AdaptiveController:
             used = replace(estimate, c_r=0.0, c_l=0.0)
         elif self._serial is not None:
             used = self._serial.for_command(estimate)
-        v_before = inverse.v
         u_d, v, f = self.structure.control(ControlInput(y_m, y, used, self._source), inverse)
-        v = self.limits.apply(v, v_before)
+        self.motion = self.limits.apply(v, self.motion)
+        v = self.motion.v
         inverse.applied(v)
         self.interval = Interval(v, y_m, u_d, f)
         return ControlStep(y_m, y, u_d, v, estimate)
@@ -198,6 +148,8 @@ class AdaptiveController:
 
     def start_from(self, v: float) -> None:
         """Say which command acts now, so that the first one goes on from there."""
+        if v != self.motion.v:
+            self.motion = at_rest(v)
         self.inverse.start_from(v)
 
     def go_on_from(self, before: AdaptiveController) -> None:
@@ -206,6 +158,7 @@ class AdaptiveController:
         v, the line that is engaged and the learned model of G stay.
         """
         self.inverse.go_on_from(before.inverse)
+        self.motion = before.motion
         self._considered = before._considered
         if self._learner is not None and before.adopted is not None:
             self._learner.adopt(before.adopted)

@@ -5,29 +5,34 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from math import inf
 
-from backlash_ros.core.control.controller import Limits
+from backlash_ros.core.control.limits import Limits, Motion
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
 
-def last_commands(action: str, v: float, limits: Callable[[], Limits]) -> Iterator[float]:
-    """Commands that follow v, one per sample; the last one stays in force.
+def last_commands(
+    action: str, motion: Motion, limits: Callable[[], Limits],
+) -> Iterator[float]:
+    """Commands that follow after a motion, one per sample; the last one stays in force.
 
-    action: hold (no further command), zero or ramp. Both go to the v nearest to 0 within the limits
-    as fast as the limits allow; where they allow any move, which ramp is refused for, that is one
-    command.
+    action: hold (v comes to rest: no further command where any acceleration is allowed), zero or
+    ramp. Both go to the v nearest to 0 within the limits as fast as the limits allow; where they
+    allow any move, which ramp is refused for, that is one command.
 
     limits: those that hold when the next command is made.
     """
     if action == 'hold':
+        while (onward := limits().stop(motion)).v != motion.v:
+            motion = onward
+            yield motion.v
         return
-    if action == 'zero' and v == limits().zero:
-        yield v  # said even if nothing changes
-    while v != limits().zero:
-        before, v = v, limits().apply(limits().zero, v)
-        if v == before:
+    if action == 'zero' and motion.v == limits().zero:
+        yield motion.v  # said even if nothing changes
+    while motion.v != limits().zero or (motion.move != 0.0 and limits().acceleration < inf):
+        before, motion = motion, limits().apply(limits().zero, motion)
+        if motion.v == before.v and motion.move == 0.0:
             return  # v is so large that a step at rate_max does not change it
-        yield v
+        yield motion.v
 
 
 def check_last_commands(p: Parameters) -> None:

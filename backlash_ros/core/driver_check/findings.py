@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.controller import plausible
+from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.loop.causes import SKEW
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
 

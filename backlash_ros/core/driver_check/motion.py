@@ -11,7 +11,7 @@ from math import inf, isnan, nan, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.controller import plausible
+from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.driver_check.findings import (
     FITS,
     UNKNOWN,

@@ -15,8 +15,9 @@ from backlash_ros.core.assembly import (
     build_model,
     build_structure,
 )
-from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep, plausible
+from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.last_command import last_commands
+from backlash_ros.core.control.limits import at_rest, plausible
 from backlash_ros.core.estimate import Estimate, Interval
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.laws.lms import NormalisedLms
@@ -249,7 +250,10 @@ class ControlLoop:
         """
         if not self.knows_v:
             return iter(())
-        return last_commands(action, self.v, lambda: self.core.limits)
+        motion = self.core.motion
+        return last_commands(
+            action, motion if motion.v == self.v else at_rest(self.v), lambda: self.core.limits
+        )
 
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""

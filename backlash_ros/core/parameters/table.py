@@ -142,6 +142,10 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('control.max', inf, 'largest v', 'v', live=True, infinite=True),
     Parameter('control.rate_max', inf, 'largest speed of v', 'v/s', low=0.0, above=True,
               live=True, infinite=True),
+    Parameter('control.acceleration_max', inf,
+              'largest acceleration of v, so that a stepper loses no steps; v brakes in time for '
+              'its bounds and for where it is to go', 'v/s^2', low=0.0, above=True, live=True,
+              infinite=True),
     Parameter('control.initial', inf,
               'v that acts when the controller starts, where no applied_control tells it; '
               '.inf: not known', 'v', infinite=True),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.bags.content import is_bag
-from backlash_ros.core.control.controller import LARGEST
+from backlash_ros.core.control.limits import LARGEST
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
 from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
 from backlash_ros.tools.cli.errors import InputError

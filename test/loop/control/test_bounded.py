@@ -19,9 +19,10 @@ from backlash_ros.core.assembly import (
     build_reference,
     law_fits,
 )
-from backlash_ros.core.control.controller import AdaptiveController, Limits
+from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.last_command import last_commands
+from backlash_ros.core.control.limits import Limits, at_rest
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.structure import (
@@ -279,7 +280,7 @@ def test_every_command_keeps_the_limits_that_hold_at_that_moment(
         else:
             if values[0] == 'ramp' and limits.move == inf:
                 continue  # refused when it is configured
-            sent = list(islice(last_commands(values[0], v, lambda held=limits: held), 5))
+            sent = list(islice(last_commands(values[0], at_rest(v), lambda held=limits: held), 5))
             core.start_from(sent[-1] if sent else v)
         for command in sent:
             assert abs(command - v) <= limits.move * (1.0 + 1e-9)

@@ -12,8 +12,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
-from backlash_ros.core.control.controller import LONGEST_WAIT, AdaptiveController, Limits
+from backlash_ros.core.control.controller import LONGEST_WAIT, AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.structure import Adoption, Structure

@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import signals
 
-from backlash_ros.core.control.controller import LARGEST, AdaptiveController, Limits
+from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
+from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.estimate import Bounds, Estimate, Interval
 from backlash_ros.core.parameters.errors import ParameterError
@@ -144,29 +145,6 @@ def test_narrowed_limits_are_entered_at_the_rate_limit() -> None:
     assert [c.step(0.0, 20.0).v for _ in range(6)] == [10.5, 9.0, 7.5, 6.0, 5.0, 5.0]
 
 
-@given(st.one_of(st.floats(), st.just(1e300)), st.floats(-10.0, 10.0), st.floats(-20.0, 5.0),
-       st.floats(0.1, 30.0), st.one_of(st.just(inf), st.floats(0.1, 10.0)))
-def test_whatever_is_asked_what_is_sent_is_a_number_that_keeps_the_limits(
-    asked: float, v: float, low: float, width: float, move: float,
-) -> None:
-    limits = Limits(low, low + width, move)
-    sent = limits.apply(asked, v)
-    assert abs(sent - v) <= move * (1.0 + 1e-12)
-    outside, outside_before = (max(low - x, x - low - width, 0.0) for x in (sent, v))
-    assert outside <= max(outside_before - move, 0.0) + 1e-12
-    assert abs(Limits(move=move).apply(asked, v)) <= LARGEST
-
-
-@pytest.mark.parametrize(('told', 'known', 'begins'), [
-    (4.0, None, 4.0), (9.0, None, 5.0), (-9.0, None, -5.0), (9.0, 3.0, 5.0),
-    (9.0, 9.0, 9.0), (7.0, 9.0, 7.0), (20.0, 9.0, 9.0), (-9.0, 9.0, -5.0), (-9.0, -7.0, -7.0),
-])
-def test_what_others_tell_of_v_leads_it_no_further_out(
-    told: float, known: float | None, begins: float,
-) -> None:
-    assert Limits(-5.0, 5.0, 0.1).go_on_from(told, known) == begins
-
-
 @pytest.mark.parametrize('f', [0.0, 0.22])
 def test_new_estimates_move_v_no_faster_than_the_gap_is_crossed(f: float) -> None:
     estimator = Notebook(replace(PAPER, f=f, c_r=1.0))
@@ -259,12 +237,6 @@ def test_negative_number_of_lost_samples_is_refused() -> None:
     with pytest.raises(ValueError, match='lost'):
         c.step(0.1, 2.0, lost=-1)
     assert c.lost_samples == 0
-
-
-@pytest.mark.parametrize('limits', [(1.0, 1.0), (2.0, 1.0), (nan, 1.0), (0.0, nan)])
-def test_limits_without_room_are_refused(limits: tuple[float, float]) -> None:
-    with pytest.raises(ParameterError):
-        Limits(*limits)
 
 
 @pytest.mark.parametrize(

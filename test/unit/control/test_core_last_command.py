@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.control.controller import Limits
 from backlash_ros.core.control.last_command import last_commands
+from backlash_ros.core.control.limits import Limits, at_rest
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
@@ -24,7 +24,7 @@ def test_ramp_goes_to_the_v_nearest_to_zero_as_fast_as_the_limits_allow(
 ) -> None:
     limits = Limits(low, low + width, move)
     v = min(max(v, low), low + width)
-    commands = [v, *last_commands('ramp', v, lambda: limits)]
+    commands = [v, *last_commands('ramp', at_rest(v), lambda: limits)]
     assert abs(commands[-1]) == min(abs(min(max(0.0, low), low + width)), abs(v))
     for before, after in pairwise(commands):
         assert abs(after - before) <= move * (1.0 + 1e-9)
@@ -33,28 +33,28 @@ def test_ramp_goes_to_the_v_nearest_to_zero_as_fast_as_the_limits_allow(
 
 @given(values)
 def test_hold_sends_nothing_and_zero_one_command(v: float) -> None:
-    assert list(last_commands('hold', v, lambda: Limits())) == []
-    assert list(last_commands('zero', v, lambda: Limits())) == [0.0]
-    assert list(last_commands('zero', v, lambda: Limits(low=2.0))) == [2.0]
+    assert list(last_commands('hold', at_rest(v), lambda: Limits())) == []
+    assert list(last_commands('zero', at_rest(v), lambda: Limits())) == [0.0]
+    assert list(last_commands('zero', at_rest(v), lambda: Limits(low=2.0))) == [2.0]
 
 
 @given(values, st.floats(0.5, 1e3))
 def test_zero_keeps_the_rate_limit_where_there_is_one(v: float, move: float) -> None:
-    commands = [v, *last_commands('zero', v, lambda: Limits(move=move))]
+    commands = [v, *last_commands('zero', at_rest(v), lambda: Limits(move=move))]
     assert commands[-1] == 0.0
     assert all(abs(b - a) <= move * (1.0 + 1e-9) for a, b in pairwise(commands))
 
 
 def test_limits_that_change_on_the_way_hold_at_once() -> None:
     limits = [Limits(move=2.0)]
-    commands = last_commands('ramp', 10.0, lambda: limits[0])
+    commands = last_commands('ramp', at_rest(10.0), lambda: limits[0])
     assert next(commands) == 8.0
     limits[0] = Limits(high=20.0, low=5.0, move=0.5)
     assert list(commands) == [7.5, 7.0, 6.5, 6.0, 5.5, 5.0]
 
 
 def test_ramp_from_an_absurd_v_ends() -> None:
-    assert len(list(last_commands('ramp', 1e300, lambda: Limits(move=1.0)))) < 3
+    assert len(list(last_commands('ramp', at_rest(1e300), lambda: Limits(move=1.0)))) < 3
 
 
 @pytest.mark.parametrize('name', ['on_stop', 'on_timeout'])

@@ -1,0 +1,130 @@
+"""The last gate: every v that is sent has passed `Limits.apply`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import floor, inf, isnan, sqrt
+from typing import NamedTuple
+
+from backlash_ros.core.parameters.errors import ParameterError
+
+LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
+ROUNDING = 1e-14  # relative, of a v that has arrived at its target
+
+
+def plausible(value: float) -> bool:
+    """Whether a value can be a measurement at all; nan, inf and absurd magnitudes are not."""
+    return abs(value) <= LARGEST
+
+
+class Motion(NamedTuple):
+    """A command and how it moves.
+
+    v: the command. move: v(k) - v(k-1). target: the v that was asked for. pace: the move of the
+    target. All in the unit of v.
+    """
+
+    v: float
+    move: float = 0.0
+    target: float = 0.0
+    pace: float = 0.0
+
+
+def at_rest(v: float) -> Motion:
+    """The motion of an actuator that stands at v."""
+    return Motion(v, 0.0, v)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds of v [unit of v], of its move per sample, and of the change of that per sample."""
+
+    low: float = -inf
+    high: float = inf
+    move: float = inf
+    acceleration: float = inf
+
+    def __post_init__(self) -> None:
+        if not self.low < self.high:
+            raise ParameterError(
+                'control.min', self.low, f'must be < control.max={self.high!r}'
+            )
+
+    @property
+    def zero(self) -> float:
+        """The v nearest to 0 within the bounds."""
+        return min(max(0.0, self.low), self.high)
+
+    def go_on_from(self, told: float, known: float | None) -> float:
+        """The v from which commands go on where others tell that it acts.
+
+        Whatever they tell leads no command out of the bounds, or further out than known is: the v
+        that acted before, None where nobody knows it. The bounds may have been narrowed since.
+        """
+        low, high = self.low, self.high
+        if known is not None:
+            low, high = min(low, known), max(high, known)
+        return min(max(told, low), high)
+
+    def apply(self, v: float, before: Motion) -> Motion:
+        """The motion that may be sent where v is asked for, after the motion before it.
+
+        v is within the bounds, or as far on the way to them as one sample allows; it stays where
+        it is when what is asked for is no number. With a finite acceleration v brakes in time for
+        the bounds and for the target, and joins a target that moves steadily without a lag.
+        """
+        if isnan(v):
+            v = before.v
+        # Beyond the largest measurement nobody could tell what v does.
+        target = min(max(v, self.low, -LARGEST), self.high, LARGEST)
+        if self.acceleration == inf:
+            sent = min(max(target, before.v - self.move), before.v + self.move)
+            return Motion(sent, sent - before.v, target)
+        return self._accelerated(target, before)
+
+    def stop(self, before: Motion) -> Motion:
+        """The next motion on the shortest way to rest."""
+        if self.acceleration == inf or before.move == 0.0:
+            return at_rest(before.v)
+        less = max(abs(before.move) - self.acceleration, 0.0)
+        move = less if before.move > 0.0 else -less
+        return Motion(before.v + move, move, before.v + move)
+
+    def samples_across(self, distance: float) -> float:
+        """Samples that a move of v over a distance >= 0 takes from rest to rest."""
+        if self.acceleration == inf:
+            return distance / self.move if self.move < inf else 0.0
+        fastest = min(self.move, sqrt(distance * self.acceleration))
+        return distance / fastest + fastest / self.acceleration if fastest > 0.0 else 0.0
+
+    def _accelerated(self, target: float, before: Motion) -> Motion:
+        v, most = before.v, self.acceleration
+        asked = pace = target - before.target
+        if abs(pace) > self.move or abs(pace - before.pace) > most:
+            pace = 0.0  # a jump is no motion that v could join
+        # Seen from a target that moves steadily v has to come to rest.
+        ahead = target - pace - v
+        move = pace + (self._braking(ahead) if ahead > 0.0 else -self._braking(-ahead))
+        move = min(max(move, -self.move), self.move)
+        # Beyond a bound, as after bounds were narrowed, v comes back likewise.
+        up, down = self.high - v, v - self.low
+        move = min(move, self._braking(up) if up >= 0.0 else -min(self._braking(-up), self.move))
+        move = max(move, -self._braking(down) if down >= 0.0
+                   else min(self._braking(-down), self.move))
+        move = min(max(move, before.move - most), before.move + most)
+        sent = v + move
+        if abs(sent - target) <= ROUNDING * (abs(v) + abs(target)):
+            sent = target
+        return Motion(sent, move, target, asked)
+
+    def _braking(self, distance: float) -> float:
+        """The largest move now after which v can still come to rest within a distance >= 0.
+
+        A move of (n + f) times the acceleration takes n (n+1)/2 + (n+1) f of it until v rests.
+        """
+        way = distance / self.acceleration
+        if way == inf:
+            return inf
+        n = floor(0.5 * (sqrt(1.0 + 8.0 * way) - 1.0))
+        return self.acceleration * (n + (way - 0.5 * n * (n + 1)) / (n + 1))
+

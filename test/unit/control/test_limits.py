@@ -1,0 +1,130 @@
+"""The last gate: bounds, rate and acceleration of v."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import ceil, cos, inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from backlash_ros.core.control.last_command import last_commands
+from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+
+
+@given(st.one_of(st.floats(), st.just(1e300)), st.floats(-10.0, 10.0), st.floats(-20.0, 5.0),
+       st.floats(0.1, 30.0), st.one_of(st.just(inf), st.floats(0.1, 10.0)))
+def test_whatever_is_asked_what_is_sent_is_a_number_that_keeps_the_limits(
+    asked: float, v: float, low: float, width: float, move: float,
+) -> None:
+    limits = Limits(low, low + width, move)
+    sent = limits.apply(asked, at_rest(v)).v
+    assert abs(sent - v) <= move * (1.0 + 1e-12)
+    outside, outside_before = (max(low - x, x - low - width, 0.0) for x in (sent, v))
+    assert outside <= max(outside_before - move, 0.0) + 1e-12
+    assert abs(Limits(move=move).apply(asked, at_rest(v)).v) <= LARGEST
+
+
+@pytest.mark.parametrize(('told', 'known', 'begins'), [
+    (4.0, None, 4.0), (9.0, None, 5.0), (-9.0, None, -5.0), (9.0, 3.0, 5.0),
+    (9.0, 9.0, 9.0), (7.0, 9.0, 7.0), (20.0, 9.0, 9.0), (-9.0, 9.0, -5.0), (-9.0, -7.0, -7.0),
+])
+def test_what_others_tell_of_v_leads_it_no_further_out(
+    told: float, known: float | None, begins: float,
+) -> None:
+    assert Limits(-5.0, 5.0, 0.1).go_on_from(told, known) == begins
+
+
+@pytest.mark.parametrize('limits', [(1.0, 1.0), (2.0, 1.0), (nan, 1.0), (0.0, nan)])
+def test_limits_without_room_are_refused(limits: tuple[float, float]) -> None:
+    with pytest.raises(ParameterError):
+        Limits(*limits)
+
+
+def sent(limits: Limits, targets: list[float], v: float = 0.0) -> list[float]:
+    """v before and after each target."""
+    motion, commands = at_rest(v), [v]
+    for target in targets:
+        motion = limits.apply(target, motion)
+        commands.append(motion.v)
+    return commands
+
+
+def accelerations(v: list[float]) -> list[float]:
+    """Changes of the move, from rest."""
+    return np.abs(np.diff(v, 2, prepend=[v[0]])).tolist()
+
+
+@given(targets=st.lists(st.one_of(st.floats(-20.0, 20.0), st.just(1e13)), min_size=1, max_size=80),
+       width=st.floats(0.1, 30.0), move=st.one_of(st.just(inf), st.floats(0.01, 5.0)),
+       acceleration=st.floats(0.01, 5.0))
+def test_no_target_makes_v_faster_or_hastier_or_leave_its_bounds(
+    targets: list[float], width: float, move: float, acceleration: float,
+) -> None:
+    v = sent(Limits(-0.5 * width, 0.5 * width, move, acceleration), targets)
+    assert max(map(abs, v)) <= 0.5 * width + 1e-9
+    assert max(abs(b - a) for a, b in pairwise(v)) <= move + 1e-9
+    assert max(accelerations(v)) <= acceleration + 1e-9
+
+
+@given(target=st.floats(-50.0, 50.0), move=st.one_of(st.just(inf), st.floats(0.05, 5.0)),
+       acceleration=st.floats(0.01, 5.0))
+def test_v_comes_to_rest_at_a_target_without_overshoot_and_as_soon_as_it_is_said_to(
+    target: float, move: float, acceleration: float,
+) -> None:
+    limits = Limits(move=move, acceleration=acceleration)
+    needed = ceil(limits.samples_across(abs(target))) + 2
+    v = sent(limits, [target] * needed)
+    assert v[-1] == target
+    assert max(map(abs, v)) <= abs(target) * (1.0 + 1e-12)
+    assert max(accelerations(v)) <= acceleration * (1.0 + 1e-9) + 1e-12
+
+
+def test_a_target_that_moves_steadily_is_joined_without_a_lag() -> None:
+    targets = [5.0 - 5.0 * cos(0.05 * k) + 3.0 * (k > 50) for k in range(300)]
+    v = sent(Limits(acceleration=0.05), targets)
+    assert v[1:51] == targets[:50], 'what may be sent is sent'
+    assert v[90:] == pytest.approx(targets[89:], abs=1e-12)
+    assert max(accelerations(v)) <= 0.05 + 1e-12
+
+
+def test_bounds_that_are_narrowed_are_entered_as_fast_as_acceleration_allows() -> None:
+    motion = at_rest(0.0)
+    for _ in range(20):
+        motion = Limits(move=1.0, acceleration=0.25).apply(100.0, motion)
+    v = [motion.v]
+    narrow = Limits(-5.0, 5.0, 1.0, 0.25)
+    for _ in range(60):
+        motion = narrow.apply(100.0, motion)
+        v.append(motion.v)
+    assert v[-1] == pytest.approx(5.0)
+    assert max(v) <= v[0] + 0.5 * 1.0**2 / 0.25
+    assert np.abs(np.diff(v, 2)).max() <= 0.25 + 1e-9
+
+
+@pytest.mark.parametrize('action', ['hold', 'zero', 'ramp'])
+def test_the_last_commands_brake(action: str) -> None:
+    limits = Limits(move=2.0, acceleration=0.3)
+    motion = at_rest(0.0)
+    v = [0.0]
+    for _ in range(10):
+        motion = limits.apply(100.0, motion)
+        v.append(motion.v)
+    v += last_commands(action, motion, lambda: limits)
+    assert max(accelerations([*v, v[-1]])) <= 0.3 + 1e-9
+    assert v[-1] == (0.0 if action != 'hold' else max(v))
+
+
+def test_a_loop_keeps_the_acceleration_it_is_told() -> None:
+    p = Parameters({
+        'structure': 'tracking', 'amplitude': 0.2, 'estimator.law': 'fixed',
+        'estimator.initial.m': 1.3, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0,
+        'control.acceleration_max': 2e4,
+    })
+    v = build_closed_loop(p).run(300).column('v')
+    assert np.abs(np.diff(v, 2, prepend=[0.0])).max() == pytest.approx(2.0)
