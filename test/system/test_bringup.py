@@ -1,67 +1,122 @@
-"""bringup with real processes: whole runs, interruptions, deaths, bad input."""
+"""bringup with real nodes: whole runs, several axes, drivers, interruptions, deaths."""
 
 from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
-import socket
-import subprocess
 import sys
 import time
-import uuid
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
-from bringup_processes import Session, bag_counts, marked_processes, wait_until
+from bringup_processes import Session, bag_counts, wait_until
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from places import ROOT
+from ros_processes import ros_world
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup import axis_progress, domains, environment, supervision
-from backlash_ros.tools.bringup import command as bringup
-from backlash_ros.tools.bringup.environment import child_environment
-from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
-from backlash_ros.tools.bringup.progress import ProgressDisplay, describe
-from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
-from backlash_ros.tools.cli.stop_requests import StopRequests
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.run_files.bag_reading import read_bag
 
-NODES = ('controller', 'plant', 'recorder', 'reference')
+TWO_AXES = ROOT / 'config' / 'two_axes.yaml'
+TRUTH = {'pan': (1.3, 3.0, -3.0), 'tilt': (0.8, 1.0, -2.0)}
+PLANT = f'{shlex.quote(sys.executable)} -m backlash_ros.nodes.plant'
+# Begins when controller, reference and recorder listen, so that nothing of it goes unrecorded.
+PATIENT = f'{PLANT} --ros-args -p wait_for_subscribers:=3'
+OF_AN_AXIS = f'{PATIENT} --params-file {TWO_AXES} -r __ns:=/{{axis}}'
+NOISE_FREE = {'estimator.law': 'lms', 'estimator.output_noise_std': 0.0}
+LOSSES = {
+    'output_noise_std': 1e-4, 'output_loss': 0.1, 'truth.walk_std': 1e-3,
+    'truth.numerator': [1.00001e-5, 4e-5, 1e-5],
+}
+
+# A driver that is none of this package: y follows v like a first-order lag, at 100 Hz.
+FOREIGN = """
+import signal, sys, rclpy
+from rclpy.signals import SignalHandlerOptions
+from std_msgs.msg import Float64
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGUSR1, lambda number, frame: sys.exit('the fuse has blown'))
+node = rclpy.create_node('driver')
+output = node.create_publisher(Float64, 'plant_output', 10)
+state = {'v': 0.0, 'y': 0.0}
+node.create_subscription(Float64, 'control', lambda m: state.update(v=m.data), 1)
+def tick():
+    state['y'] += 0.1 * (state['v'] - state['y'])
+    output.publish(Float64(data=state['y']))
+node.create_timer(0.01, tick)
+try:
+    rclpy.spin(node)
+except KeyboardInterrupt:
+    print('last command', state['v'], flush=True)
+"""
 
 
-def test_lockstep_run_ends_with_all_files_and_no_process(start: Callable[..., Session]) -> None:
-    session = start('--lockstep', '--duration', '1', '--seed', '5', drawn=True)
+def foreign_driver(folder: Path) -> str:
+    """The command of such a driver, which dies of SIGUSR1."""
+    script = folder / 'driver.py'
+    script.write_text(FOREIGN)
+    return shlex.join([sys.executable, str(script)])
+
+
+def assert_same(found: RunRecord, simulated: RunRecord) -> None:
+    """Equal to the last bit, in all that does not tell of real time."""
+    assert (found.samples, found.lost_samples) == (simulated.samples, simulated.lost_samples)
+    for name in ('t', 'y_m', 'y', 'u_d', 'v', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r',
+                 'innovation', 'u_hat', 'status', 'u'):
+        assert np.array_equal(found.column(name), simulated.column(name), equal_nan=True), name
+    assert repr(found.learned) == repr(simulated.learned)
+
+
+@pytest.mark.parametrize(('values', 'samples'), [(NOISE_FREE, 450), (LOSSES, 200)])
+def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_process(
+    start: Callable[..., Session], values: dict[str, object], samples: int,
+) -> None:
+    storage = 'mcap' if values is NOISE_FREE else 'sqlite3'
+    settings = [f'{name}={value}' for name, value in {**values, 'storage': storage}.items()]
+    session = start(
+        '--lockstep', '--duration', str(0.01 * samples), '--seed', '5',
+        *(part for each in settings for part in ('--set', each)), drawn=storage == 'mcap',
+    )
     assert session.wait() == 0, session.stderr
     assert session.survivors() == {}
-
+    simulated = build_closed_loop(effective_parameters(None, settings, 5)).run(samples)
+    bag = session.out / 'bag'
+    assert_same(read_bag(bag).run, simulated)
+    counts = bag_counts(bag)
+    for topic in (topics.PLANT_OUTPUT, topics.REFERENCE, topics.CONTROL, topics.SIGNALS):
+        assert counts[topic] == simulated.samples
+    assert counts[topics.TRUTH] == counts[topics.APPLIED_CONTROL] == samples
     summary = json.loads((session.out / 'summary.json').read_text())
-    assert (summary['samples'], summary['lost_samples']) == (100, 0)
-    assert len((session.out / 'samples.csv').read_text().splitlines()) == 101
-    assert (session.out / 'report.html').is_file()
-    for node in NODES:
-        assert (session.out / 'logs' / f'{node}.log').is_file()
-    counts = bag_counts(session.out / 'bag')
-    for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.SIGNALS, topics.ESTIMATES):
-        assert counts[topic] == 100
+    assert (summary['samples'], summary['lost_samples']) == (
+        simulated.samples, samples - simulated.samples
+    )
+    assert {path.stem for path in (session.out / 'logs').glob('*.log')} >= {
+        'controller', 'plant', 'recorder', 'reference',
+    }
     effective = yaml.safe_load((session.out / 'parameters.yaml').read_text())
     parameters = effective['/**']['ros__parameters']
-    assert (parameters['seed'], parameters['lockstep'], parameters['samples']) == (5, True, 100)
-    assert 'c_r' in session.stdout
-    assert str(session.out / 'report.html') in session.stdout
+    assert (parameters['seed'], parameters['lockstep'], parameters['samples']) == (5, True, samples)
+    if storage == 'mcap':
+        assert str(session.out / 'report.html') in session.stdout
+        assert (session.out / 'report.html').is_file()
+        # A reader that is none of this package nor of rosbags finds the same.
+        with next(bag.glob('*.mcap')).open('rb') as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+            found = reader.iter_decoded_messages([f'/{topics.CONTROL}'])
+            assert [m.data for *_, m in found] == simulated.column('v').tolist()
 
 
-def test_no_record_leaves_no_bag_and_still_shows_progress(start: Callable[..., Session]) -> None:
-    session = start('--lockstep', '--duration', '1', '--no-record')
-    assert session.wait() == 0, session.stderr
-    assert session.survivors() == {}
-    assert '/100  m ' in session.stderr
-    assert 'no bag' in session.stdout
-    assert sorted(path.name for path in session.out.iterdir()) == ['logs', 'parameters.yaml']
-
-
-def test_recorder_that_was_held_up_gets_all_that_it_has_missed(
+def test_a_recorder_that_was_held_up_gets_all_that_it_has_missed(
     start: Callable[..., Session],
 ) -> None:
     session = start('--lockstep', '--duration', '8')
@@ -72,8 +127,6 @@ def test_recorder_that_was_held_up_gets_all_that_it_has_missed(
     time.sleep(0.8)
     os.kill(recorder, signal.SIGCONT)
     assert session.wait() == 0, session.stderr
-    summary = json.loads((session.out / 'summary.json').read_text())
-    assert (summary['samples'], summary['lost_samples']) == (800, 0)
     counts = bag_counts(session.out / 'bag')
     for topic in (
         topics.PLANT_OUTPUT, topics.APPLIED_CONTROL, topics.TRUTH, topics.SIGNALS, topics.ESTIMATES,
@@ -96,264 +149,119 @@ def test_ctrl_c_leaves_a_readable_bag_and_a_report_and_no_process(
     assert (session.out / 'report.html').is_file()
 
 
-def test_sigterm_while_the_nodes_start_leaves_no_process(start: Callable[..., Session]) -> None:
-    session = start('--duration', '100', '--no-record')
-    wait_until(lambda: len(session.survivors()) > 3, 'nodes exist')
-    session.process.send_signal(signal.SIGTERM)
-    assert session.wait() == 1
-    assert session.survivors() == {}
-    assert session.stderr == 'bringup: interrupted by SIGTERM, stopping\n'
-
-
-def test_killed_controller_is_named_with_its_log_and_all_others_end(
+def test_each_axis_learns_its_own_backlash_in_a_time_of_its_own(
     start: Callable[..., Session],
 ) -> None:
-    session = start('--duration', '100', '--no-record')
-    session.wait_for_samples()
-    os.kill(session.node('controller'), signal.SIGKILL)
+    session = start(
+        '--config', str(TWO_AXES), '--lockstep', '--duration', '1', '--seed', '4',
+        '--set', 'bias=0.5', '--set', 'tilt/bias=0.25',
+    )
+    assert session.wait() == 0, session.stderr
+    assert session.survivors() == {}
+    assert sorted(path.name for path in session.out.iterdir()) == ['pan', 'tilt']
+    for axis, bias in (('pan', 0.5), ('tilt', 0.25)):
+        folder = session.out / axis
+        summary = json.loads((folder / 'summary.json').read_text())
+        assert (summary['samples'], summary['lost_samples']) == (100, 0)
+        assert [summary['final'][name] for name in ('m', 'c_r', 'c_l')] == pytest.approx(
+            TRUTH[axis], rel=0.01
+        )
+        assert bag_counts(folder / 'bag')[f'{axis}/plant_output'] == 100
+        effective = yaml.safe_load((folder / 'parameters.yaml').read_text())
+        assert list(effective) == ['/**']
+        assert effective['/**']['ros__parameters']['bias'] == bias
+        assert f'\n{axis} ' in f'\n{session.stdout}'
+
+
+def test_a_killed_controller_is_named_and_stops_every_axis_and_its_driver(
+    start: Callable[..., Session],
+) -> None:
+    session = start(
+        '--config', str(TWO_AXES), '--unlimited', '--driver', OF_AN_AXIS, '--duration', '100'
+    )
+    session.wait_for_samples('pan: ')
+    session.wait_for_samples('tilt: ')
+    os.kill(session.node('controller', '/tilt'), signal.SIGKILL)
     assert session.wait() == 1
     assert session.survivors() == {}
-    assert 'controller died (killed by SIGKILL)' in session.stderr
-    assert str(session.out / 'logs' / 'controller.log') in session.stderr
+    assert 'tilt/controller died (killed by SIGKILL)' in session.stderr
+    assert str(session.out / 'tilt' / 'logs' / 'controller.log') in session.stderr
+    assert 'pan/' not in session.stderr
+    assert session.stderr.count('no use for what describes the simulated plant') == 0
+    for axis in TRUTH:
+        assert (session.out / axis / 'report.html').is_file()
+        # The plant in the place of the driver says so when it ends.
+        assert 'samples' in (session.out / axis / 'logs' / 'driver.log').read_text()
 
 
-def test_no_process_survives_a_killed_bringup(start: Callable[..., Session]) -> None:
-    session = start('--duration', '100')
+def test_nothing_survives_a_killed_bringup_and_its_bag_is_whole(
+    start: Callable[..., Session],
+) -> None:
+    session = start('--unlimited', '--driver', f'sh -c "{PLANT}; true"', '--duration', '100')
     session.wait_for_samples()
+    assert len(session.survivors()) > 4, 'bringup, its nodes, the shell and its driver'
     session.process.kill()
-    session.wait()
-    wait_until(lambda: not session.survivors(), 'the guardian has stopped all nodes')
+    assert session.wait() == -signal.SIGKILL
+    wait_until(lambda: not session.survivors(), 'the guardian has stopped all')
     assert bag_counts(session.out / 'bag')[topics.PLANT_OUTPUT] > 0
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'words'),
-    [
-        (['--set', 'estimator.initial.cr=1'], ['estimator.initial.cr', 'estimator.initial.c_r?']),
-        (['--set', 'backlash.m=-1'], ['backlash.m=-1.0', 'must be > 0']),
-        (['--set', 'estimator.bounds.m=[2, 1]'], ['estimator.bounds.m', 'low < high']),
-        (['--set', 'plant.denominator=[0, 0]'], ['plant.denominator']),
-        (['--set', 'control.min=3', '--set', 'control.max=2'], ['control.min', 'control.max']),
-        (['--set', 'waveform=file'], ['file', 'CSV']),
-        (['--set', 'bag=here'], ['bag', 'here', '--out']),
-        (['--duration', '0.015'], ['duration', '0.015', 'sample_period']),
-        (['--duration', '-1'], ['duration', '-1']),
-        (['--duration', 'long'], ['--duration', 'long']),
-        (['--driver', 'x', '--lockstep'], ["driver='x'", 'excludes lockstep', 'does not wait']),
-        (['--driver', 'x --axis {axis}'], ['driver', 'names an axis', 'axes']),
-        (['--driver', 'x'], [
-            'control.min=-inf', 'set control.min, control.max, control.rate_max',
-            'give --unlimited',
-        ]),
-        (['--driver', 'none', '--set', 'control.min=-5', '--set', 'control.max=5'], [
-            'control.rate_max=inf', 'set control.rate_max, or',
-        ]),
-        (['--unlimited'], ['give --driver as well']),
-        (['--driver', "x 'y"], ['driver', 'is not a command', 'quotation']),
-        (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
-        (['--set', 'x/seed=3'], ['x/seed', "no axis 'x'"]),
-        (['--set', 'axes=[a, b]', '--set', 'b/backlash.c_l=4'], ['b: backlash.c_l=4.0', '<']),
-        (['--set', 'axes=[a, b]', '--set', 'estimates.file=e'], ["'e'", 'of a and of b']),
-        (['--set', 'axes=[a, b, c, d, e, f, g, h]'], ['8 axes', 'at most 7']),
-        (['--config', 'nowhere.yaml'], ['nowhere.yaml']),
-        (['--out', '/proc/nowhere'], ['/proc/nowhere']),
-        (['--speed', '3'], ['--speed']),
-    ],
-)
-def test_bad_input_is_refused_in_one_line_before_anything_is_made(
-    arguments: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported(
+    start: Callable[..., Session], tmp_path: Path,
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert bringup.main(arguments) == 2
-    said = capsys.readouterr()
-    assert said.out == ''
-    assert said.err.startswith('bringup: ')
-    assert said.err.count('\n') == 1
-    for word in words:
-        assert word in said.err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_ctrl_c_is_heard_before_the_libraries_are_loaded() -> None:
-    code = (
-        'import sys, backlash_ros.tools.bringup.command as b; b.parse_options([]);'
-        'sys.exit(bool({"numpy", "scipy", "rosbags"} & set(sys.modules)))'
+    session = start(
+        '--unlimited', '--driver', foreign_driver(tmp_path), '--duration', '100', '--seed', '3'
     )
-    root = Path(bringup.__file__).resolve().parents[3]
-    assert subprocess.run([sys.executable, '-c', code], cwd=root).returncode == 0
-
-
-def test_processes_find_this_package_behind_what_the_user_has_set() -> None:
-    user, source = environment.with_source({'PYTHONPATH': '/of/the/user'})['PYTHONPATH'].split(':')
-    assert user == '/of/the/user'
-    assert (Path(source) / 'backlash_ros' / '__init__.py').is_file()
-
-
-def test_folder_that_holds_a_bag_is_not_written_over(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    (tmp_path / 'bag').mkdir()
-    assert bringup.main(['--out', str(tmp_path)]) == 2
-    assert 'holds a bag already' in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ['bag']
-
-
-# What follows has small programs in the place of the nodes: what is tested is the watching.
-READY = (
-    'import signal; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]);'
-    'print(\'{"event": "ready"}\', flush=True)'
-)
-WAIT = 'signal.sigwait([signal.SIGINT])'
-DONE = 'print(\'{"event": "done", "published": {"samples": 100}}\', flush=True)'
-
-
-def progress(sample: int) -> str:
-    return f'print(\'{{"event": "progress", "sample": {sample}}}\', flush=True)'
-
-
-@dataclass
-class Watched:
-    """What became of a run of small programs."""
-
-    failure: str
-    complaint: str
-    mark: str
-
-
-@pytest.fixture
-def watch(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> Iterator[Callable[..., Watched]]:
-    """Run bringup's loop over Python programs given by name; none of them is left at the end."""
-    mark = uuid.uuid4().hex
-    monkeypatch.setenv('BACKLASH_TEST_RUN', mark)
-
-    def watch_programs(hurry: bool = False, **programs: str) -> Watched:
-        parameters = effective_parameters(None).replaced({
-            'samples': 100, 'driver': 'some command' if 'driver' in programs else '',
-        })
-        axis = AxisPlan('', parameters, tmp_path, record=False)
-        axis.logs.mkdir()
-        environment = child_environment(axis.logs, None)
-        stages = [
-            [ProcessPlan(
-                name, (sys.executable, '-c', program), axis.logs / f'{name}.log', environment,
-                foreign=name == 'driver',
-            )] for name, program in programs.items()
-        ]
-        with ProcessSupervisor(stages, lambda: hurry) as supervisor:
-            displays = {'': ProgressDisplay(100, 0.01, sys.stderr)}
-            plan = RunPlan((axis,), tmp_path)
-            run = supervision.Run(plan, supervisor, StopRequests(), displays)
-            run.execute()
-        return Watched(run.failure, capsys.readouterr().err, mark)
-
-    yield watch_programs
-    for pid in marked_processes(mark):
-        os.kill(pid, signal.SIGKILL)
-
-
-def test_process_that_is_never_ready_is_named_with_the_end_of_its_log(
-    watch: Callable[..., Watched], monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 1.0)
-    lines = 'import sys; print(*range(100, 130), sep="\\n", file=sys.stderr, flush=True)'
-    run = watch(slow=f'{lines}; import time; time.sleep(600)', quick=f'{READY}; {WAIT}')
-    assert run.failure.startswith('not ready within 1 s: slow\n')
-    assert '    129' in run.complaint
-    assert '    119' not in run.complaint
-
-
-def test_standstill_is_an_error_that_names_the_last_sample(
-    watch: Callable[..., Watched], monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(axis_progress, 'STALL_DEADLINE_S', 0.5)
-    run = watch(recorder=f'{READY}; {progress(41)}; {WAIT}')
-    assert 'no new sample for' in run.failure
-    assert 'after sample 41' in run.failure
-
-
-def test_samples_of_which_nothing_was_heard_are_told(watch: Callable[..., Watched]) -> None:
-    # Diagnostics go on.
-    again = (
-        'import itertools, json\n'
-        'for n in itertools.count():\n'
-        '    if signal.sigtimedwait([signal.SIGINT], 0.01): break\n'
-        '    progress = dict(event="progress", sample=41, received=dict(diagnostics=n))\n'
-        '    print(json.dumps(progress), flush=True)'
+    session.wait_for_samples()
+    (driver,) = (
+        pid for pid, command in session.survivors().items()
+        if 'driver.py' in command and '--driver' not in command
     )
-    run = watch(plant=f'{READY}; {DONE}; {WAIT}', recorder=f'{READY}\n{again}')
-    assert not run.failure
-    assert 'the plant has said more than the recorder heard: 58 samples' in run.complaint
+    os.kill(driver, signal.SIGUSR1)
+    assert session.wait() == 1
+    assert session.survivors() == {}
+    assert 'driver died (exit code 1)' in session.stderr
+    assert f'{session.out}/logs/driver.log:\n    the fuse has blown' in session.stderr
+    assert session.stderr.count('died') == 1
+    assert 'plant: seed\n' in session.stderr
+    assert json.loads((session.out / 'summary.json').read_text())['samples'] > 0
 
 
-def test_process_that_ends_by_itself_is_named_with_its_exit_code(
-    watch: Callable[..., Watched],
+def test_the_last_command_of_the_controller_reaches_the_driver(
+    start: Callable[..., Session], tmp_path: Path,
 ) -> None:
-    run = watch(plant='import sys; sys.exit("no memory left")', recorder=f'{READY}; {WAIT}')
-    assert run.failure.startswith('plant died (exit code 1)')
-    assert 'no memory left' in run.complaint
-
-
-def test_unclean_end_after_a_whole_run_is_an_error(watch: Callable[..., Watched]) -> None:
-    run = watch(plant=f'{READY}; {DONE}; {progress(99)}; {WAIT}; raise SystemExit(7)')
-    assert run.failure.startswith('plant did not stop cleanly (exit code 7)')
-
-
-def test_grandchildren_and_the_deaf_are_stopped_too(
-    watch: Callable[..., Watched], tmp_path: Path,
-) -> None:
-    begun = tmp_path / 'begun'
-    deaf = (
-        'import signal, subprocess, sys, time;'
-        'signal.signal(signal.SIGINT, signal.SIG_IGN);'
-        'signal.signal(signal.SIGTERM, signal.SIG_IGN);'
-        'subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"]);'
-        f'open({str(begun)!r}, "w").close(); time.sleep(600)'
+    session = start(
+        '--unlimited', '--driver', foreign_driver(tmp_path), '--duration', 'inf', '--no-record',
+        '--set', 'on_stop=zero', '--set', 'bias=20',
     )
-    mortal = (
-        'import os, time\n'
-        f'while not os.path.exists({str(begun)!r}): time.sleep(0.01)'
-    )
-    run = watch(hurry=True, deaf=deaf, mortal=mortal)
-    assert run.failure.startswith('mortal died (exit code 0)')
-    wait_until(lambda: not marked_processes(run.mark), 'all have gone')
+    session.wait_for_samples()
+    session.process.send_signal(signal.SIGINT)
+    assert session.wait() == 0, session.stderr
+    assert session.survivors() == {}
+    assert (session.out / 'logs' / 'driver.log').read_text() == 'last command 0.0\n'
+    assert sorted(path.name for path in session.out.iterdir()) == ['logs', 'parameters.yaml']
 
 
-def test_lines_that_are_no_events_stand_in_the_log(
-    watch: Callable[..., Watched], tmp_path: Path,
+def test_a_driver_elsewhere_is_awaited_and_ctrl_c_is_the_regular_end_of_an_endless_run(
+    start: Callable[..., Session], tmp_path: Path,
 ) -> None:
-    watch(plant='print("hello"); print(3); print("{}"); raise SystemExit(1)')
-    assert (tmp_path / 'logs' / 'plant.log').read_text().splitlines() == ['hello', '3', '{}']
-
-
-def test_two_runs_get_two_domains_and_none_that_somebody_uses() -> None:
-    with domains.free_domain() as first:
-        with domains.free_domain() as second:
-            assert first != second
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
-            port = domains.DOMAIN_0_PORT + domains.PORTS_PER_DOMAIN * second + 12
-            participant.bind(('127.0.0.1', port))
-            with domains.free_domain() as third:
-                assert third not in (first, second)
-
-
-def test_what_the_user_has_set_reaches_the_nodes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
-    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
-    environment = child_environment(tmp_path, None)
-    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
-    assert environment['ROS_DOMAIN_ID'] == '7'
-    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE')
-    environment = child_environment(tmp_path, 9)
-    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
-    assert environment['ROS_DOMAIN_ID'] == '9'
-
-
-def test_errors_are_in_percent_of_the_truth_where_it_is_known() -> None:
-    event = {'m': 1.43, 'true_m': 1.3, 'c_r': 2.7, 'true_c_r': None, 'c_l': -3.03,
-             'true_c_l': -3.0, 'lost': 2}
-    assert describe(event) == 'm 1.43 (+10.0 %)  c_r 2.7  c_l -3.03 (-1.0 %)  lost 2'
+    folder = tmp_path / 'elsewhere'
+    folder.mkdir()
+    with ros_world(folder) as world:
+        session = start(
+            '--unlimited', '--driver', 'none', '--duration', 'inf',
+            variables={'ROS_DOMAIN_ID': str(world.domain)},
+        )
+        wait_until(
+            lambda: 'waiting for the driver' in session.stdout
+            or session.process.poll() is not None, 'a word on the terminal',
+        )
+        assert f'ROS_DOMAIN_ID={world.domain} ' in session.stdout, session.stderr
+        plant = world.start('plant')
+        session.wait_for_samples()
+        session.process.send_signal(signal.SIGINT)
+        assert session.wait() == 0, session.stderr
+        assert session.survivors() == {}
+        assert 'SIGINT ends the run' in session.stderr
+        assert plant.process.poll() is None
+    assert json.loads((session.out / 'summary.json').read_text())['samples'] > 0

@@ -1,0 +1,117 @@
+"""How long bringup waits for the samples of an axis, and what it says of those that do not come."""
+
+from __future__ import annotations
+
+import io
+from math import inf
+from pathlib import Path
+
+import pytest
+
+from backlash_ros.tools.bringup.axis_progress import (
+    FIRST_SAMPLE_DEADLINE_S,
+    LATE_DEADLINE_S,
+    AxisProgress,
+)
+from backlash_ros.tools.bringup.processes import RunError
+from backlash_ros.tools.bringup.progress import ProgressDisplay
+from backlash_ros.tools.bringup.run_plan import AxisPlan
+from backlash_ros.tools.config.configuration import effective_parameters
+
+
+def begun(folder: Path, driver: str = '', **values: object) -> tuple[AxisProgress, io.StringIO]:
+    """An axis whose run of 100 samples has just begun, and what is said of it."""
+    p = effective_parameters(None).replaced({'samples': 100, 'driver': driver, **values})
+    said = io.StringIO()
+    display = ProgressDisplay(p.get_int('samples'), 0.01, said)
+    axis = AxisProgress(AxisPlan('', p, folder, record=True), display)
+    axis.begin()
+    return axis, said
+
+
+def let_pass(axis: AxisProgress, seconds: float) -> None:
+    axis.began -= seconds
+    axis.moved -= seconds
+
+
+def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(
+    tmp_path: Path,
+) -> None:
+    axis, _ = begun(tmp_path, 'some command')
+    axis.take({'sample': 5000})
+    assert not axis.complete
+    axis.take({'sample': 5099})
+    assert axis.complete
+
+
+def test_a_plant_is_complete_once_it_says_so_and_what_is_unheard_is_counted(
+    tmp_path: Path,
+) -> None:
+    axis, _ = begun(tmp_path)
+    axis.take({'sample': 41, 'received': {'plant_output': 42}})
+    assert not axis.complete
+    axis.published = {'samples': 100, 'plant_output': 42}
+    assert axis.complete
+    assert axis.unheard == {'samples': 58}
+    axis.repeats = 0
+    for repeats in (1, 2):
+        axis.take({'sample': 41, 'received': {'plant_output': 42}})
+        assert axis.repeats == repeats
+    axis.take({'sample': 99, 'received': {'plant_output': 42}})
+    assert (axis.unheard, axis.repeats) == ({}, 0)
+
+
+def test_a_plant_that_stands_still_is_an_error_that_names_the_last_sample(tmp_path: Path) -> None:
+    axis, _ = begun(tmp_path, lockstep=True)
+    axis.take({'sample': 41})
+    let_pass(axis, axis.patience - 1.0)
+    axis.check_pace()
+    let_pass(axis, 2.0)
+    with pytest.raises(RunError, match=r'no new sample for .* after sample 41, see '):
+        axis.check_pace()
+
+
+def test_a_driver_that_falls_silent_is_waited_for_and_named_once(tmp_path: Path) -> None:
+    axis, said = begun(tmp_path, 'some command', samples=0)
+    axis.take({'sample': 7})
+    let_pass(axis, axis.patience + 1.0)
+    for _ in range(3):
+        axis.check_pace()
+    assert said.getvalue().count('after sample 7, waiting for the driver') == 1
+    axis.take({'sample': 8})
+    let_pass(axis, axis.patience + 1.0)
+    axis.check_pace()
+    assert said.getvalue().count('waiting for the driver') == 2
+
+
+def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> None:
+    axis, _ = begun(tmp_path, 'some command')
+    for sample in (7, 48):
+        axis.take({'sample': sample})
+    axis.began -= 1.0 + LATE_DEADLINE_S - 0.5
+    axis.check_pace()
+    axis.began -= 1.0
+    with pytest.raises(RunError, match=r'^only 42 of 100 samples, '):
+        axis.check_pace()
+
+
+@pytest.mark.parametrize('values', [{'lockstep': True}, {'samples': 0}])
+def test_lockstep_and_endless_runs_have_no_deadline(
+    tmp_path: Path, values: dict[str, object],
+) -> None:
+    assert begun(tmp_path, **values)[0].deadline == inf
+
+
+def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts_it(
+    tmp_path: Path,
+) -> None:
+    for driver in ('some command', 'none'):
+        axis, _ = begun(tmp_path, driver)
+        let_pass(axis, FIRST_SAMPLE_DEADLINE_S - 1.0)
+        axis.check_pace()
+        let_pass(axis, 2.0)
+        if driver == 'none':
+            axis.check_pace()
+        else:
+            with pytest.raises(RunError, match='does the driver publish its output'):
+                axis.check_pace()

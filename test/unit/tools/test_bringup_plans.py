@@ -1,0 +1,239 @@
+"""What bringup makes of its arguments: plans, environments, lines of progress, or one complaint."""
+
+from __future__ import annotations
+
+import io
+import os
+import shlex
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from places import ROOT
+
+from backlash_ros.tools.bringup import command as bringup
+from backlash_ros.tools.bringup import domains, environment
+from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
+from backlash_ros.tools.bringup.orchestrator import prepare
+from backlash_ros.tools.bringup.processes import ProcessPlan
+from backlash_ros.tools.bringup.progress import ProgressDisplay, describe
+from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan, plan_processes
+from backlash_ros.tools.config.configuration import effective_parameters
+
+CONFIG = ROOT / 'config' / 'two_axes.yaml'
+DRIVER = 'drive --axis {axis}'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        (['--set', 'estimator.initial.cr=1'], ['estimator.initial.cr', 'estimator.initial.c_r?']),
+        (['--set', 'backlash.m=-1'], ['backlash.m=-1.0', 'must be > 0']),
+        (['--set', 'estimator.bounds.m=[2, 1]'], ['estimator.bounds.m', 'low < high']),
+        (['--set', 'plant.denominator=[0, 0]'], ['plant.denominator']),
+        (['--set', 'control.min=3', '--set', 'control.max=2'], ['control.min', 'control.max']),
+        (['--set', 'waveform=file'], ['file', 'CSV']),
+        (['--set', 'bag=here'], ['bag', 'here', '--out']),
+        (['--duration', '0.015'], ['duration', '0.015', 'sample_period']),
+        (['--duration', '-1'], ['duration', '-1']),
+        (['--duration', 'long'], ['--duration', 'long']),
+        (['--driver', 'x', '--lockstep'], ["driver='x'", 'excludes lockstep', 'does not wait']),
+        (['--driver', 'x --axis {axis}'], ['driver', 'names an axis', 'axes']),
+        (['--driver', 'x'], [
+            'control.min=-inf', 'set control.min, control.max, control.rate_max',
+            'give --unlimited',
+        ]),
+        (['--driver', 'none', '--set', 'control.min=-5', '--set', 'control.max=5'], [
+            'control.rate_max=inf', 'set control.rate_max, or',
+        ]),
+        (['--unlimited'], ['give --driver as well']),
+        (['--driver', "x 'y"], ['driver', 'is not a command', 'quotation']),
+        (['--axis', 'x'], ["no axis 'x'", 'axes', '/bringup']),
+        (['--set', 'x/seed=3'], ['x/seed', "no axis 'x'"]),
+        (['--set', 'axes=[a, b]', '--set', 'b/backlash.c_l=4'], ['b: backlash.c_l=4.0', '<']),
+        (['--set', 'axes=[a, b]', '--set', 'estimates.file=e'], ["'e'", 'of a and of b']),
+        (['--set', 'axes=[a, b, c, d, e, f, g, h]'], ['8 axes', 'at most 7']),
+        (['--config', 'nowhere.yaml'], ['nowhere.yaml']),
+        (['--out', '/proc/nowhere'], ['/proc/nowhere']),
+        (['--speed', '3'], ['--speed']),
+    ],
+)
+def test_bad_input_is_refused_in_one_line_before_anything_is_made(
+    arguments: list[str], words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert bringup.main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ''
+    assert said.err.startswith('bringup: ')
+    assert said.err.count('\n') == 1
+    for word in words:
+        assert word in said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+
+def test_processes_find_this_package_behind_what_the_user_has_set() -> None:
+    user, source = environment.with_source({'PYTHONPATH': '/of/the/user'})['PYTHONPATH'].split(':')
+    assert user == '/of/the/user'
+    assert (Path(source) / 'backlash_ros' / '__init__.py').is_file()
+
+
+def test_folder_that_holds_a_bag_is_not_written_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / 'bag').mkdir()
+    assert bringup.main(['--out', str(tmp_path)]) == 2
+    assert 'holds a bag already' in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['bag']
+
+
+def test_two_runs_get_two_domains_and_none_that_somebody_uses() -> None:
+    with domains.free_domain() as first:
+        with domains.free_domain() as second:
+            assert first != second
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
+            port = domains.DOMAIN_0_PORT + domains.PORTS_PER_DOMAIN * second + 12
+            participant.bind(('127.0.0.1', port))
+            with domains.free_domain() as third:
+                assert third not in (first, second)
+
+
+def test_what_the_user_has_set_reaches_the_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
+    monkeypatch.setenv('ROS_DOMAIN_ID', '7')
+    environment = child_environment(tmp_path, None)
+    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'SUBNET'
+    assert environment['ROS_DOMAIN_ID'] == '7'
+    monkeypatch.delenv('ROS_AUTOMATIC_DISCOVERY_RANGE')
+    environment = child_environment(tmp_path, 9)
+    assert environment['ROS_AUTOMATIC_DISCOVERY_RANGE'] == 'LOCALHOST'
+    assert environment['ROS_DOMAIN_ID'] == '9'
+
+
+def test_errors_are_in_percent_of_the_truth_where_it_is_known() -> None:
+    event = {'m': 1.43, 'true_m': 1.3, 'c_r': 2.7, 'true_c_r': None, 'c_l': -3.03,
+             'true_c_l': -3.0, 'lost': 2}
+    assert describe(event) == 'm 1.43 (+10.0 %)  c_r 2.7  c_l -3.03 (-1.0 %)  lost 2'
+
+
+def plan(folder: Path, driver: str, *names: str, **values: object) -> RunPlan:
+    """A plan of axes whose driver is the same text."""
+    parameters = effective_parameters(None).replaced({'driver': driver, **values})
+    return RunPlan(tuple(
+        AxisPlan(name, parameters, folder / name, record=True) for name in names or ('',)
+    ), folder)
+
+
+def names_of(stages: list[list[ProcessPlan]]) -> list[list[str]]:
+    return [[process.name for process in stage] for stage in stages]
+
+
+def test_plant_stops_first_but_a_driver_only_after_the_controller(tmp_path: Path) -> None:
+    assert names_of(plan_processes(plan(tmp_path, ''), None)) == [
+        ['plant'], ['reference'], ['controller'], ['recorder'],
+    ]
+    stages = plan_processes(plan(tmp_path, 'run it', sample_period=0.05), None)
+    assert names_of(stages) == [['controller'], ['driver'], ['reference'], ['recorder']]
+    assert stages[1][0].command == ('run', 'it')
+    assert stages[1][0].linger_s == pytest.approx(0.1)
+    slow = plan_processes(plan(tmp_path, 'run it', **{'timeout.ramp': 20.0}), None)
+    assert [stage[0].farewell_s for stage in slow] == [20.0, 0.0, 0.0, 0.0]
+    assert names_of(plan_processes(plan(tmp_path, 'none'), None)) == [
+        ['controller'], [], ['reference'], ['recorder'],
+    ]
+
+
+def test_axes_with_the_same_command_share_one_driver(tmp_path: Path) -> None:
+    stages = plan_processes(plan(tmp_path, 'both --axes', 'x', 'y'), None)
+    assert names_of(stages) == [
+        ['x/controller', 'y/controller'], ['driver of x, y'], ['x/reference', 'y/reference'],
+        ['x/recorder', 'y/recorder'],
+    ]
+    assert stages[1][0].log == tmp_path / 'logs' / 'x_y.log'
+
+
+def test_foreign_program_gets_no_variables_that_were_made_for_this_python() -> None:
+    own, user = f'{sys.prefix}/lib', '/opt/user/lib'
+    made = {
+        '_ROS_WHEELS_BOOTSTRAP_COMPLETE': '1', 'BACKLASH_ROS_EVENTS': '1', 'HOME': '/home',
+        'LD_LIBRARY_PATH': os.pathsep.join([own, user]),
+    }
+    assert foreign_environment(made) == {'HOME': '/home', 'LD_LIBRARY_PATH': user}
+    del made['_ROS_WHEELS_BOOTSTRAP_COMPLETE']
+    assert foreign_environment(made)['LD_LIBRARY_PATH'] == made['LD_LIBRARY_PATH']
+
+
+def planned(folder: Path, *arguments: str) -> RunPlan:
+    """The plan that these arguments lead to, its files in the folder."""
+    return prepare(bringup.parse_options(
+        ['--config', str(CONFIG), '--out', str(folder), *arguments]
+    ))
+
+
+def test_each_axis_gets_a_driver_in_whose_command_it_is_named(tmp_path: Path) -> None:
+    drivers = plan_processes(planned(tmp_path, '--unlimited', '--driver', DRIVER), None)[1]
+    assert [process.name for process in drivers] == ['pan/driver', 'tilt/driver']
+    for axis, process in zip(('pan', 'tilt'), drivers, strict=True):
+        assert process.command == ('drive', '--axis', axis)
+        assert process.log == tmp_path / axis / 'logs' / 'driver.log'
+        effective = yaml.safe_load((tmp_path / axis / 'parameters.yaml').read_text())
+        named = effective['/bringup']['ros__parameters']['driver']
+        assert tuple(shlex.split(named)) == process.command
+
+
+def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
+    plan = planned(tmp_path, '--axis', 'tilt', '--lockstep')
+    (axis,) = plan.axes
+    assert axis.name == 'tilt'
+    assert [path.name for path in tmp_path.iterdir()] == ['tilt']
+    values = [axis.parameters.get_float(f'backlash.{name}') for name in ('m', 'c_r', 'c_l')]
+    assert (*values, axis.parameters.get_float('frequency')) == (0.8, 1.0, -2.0, 9.0)
+    processes = [process for stage in plan_processes(plan, None) for process in stage]
+    assert [process.name for process in processes] == [
+        'tilt/plant', 'tilt/reference', 'tilt/controller', 'tilt/recorder',
+    ]
+    assert all('__ns:=/tilt' in process.command for process in processes)
+
+
+def test_axis_that_holds_a_bag_is_not_written_over(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / 'tilt' / 'bag').mkdir(parents=True)
+    assert bringup.main(['--config', str(CONFIG), '--out', str(tmp_path)]) == 2
+    assert 'holds a bag already' in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ['tilt']
+
+
+def test_progress_names_the_axis_and_an_endless_run_has_no_total() -> None:
+    stream = io.StringIO()
+    progress = {'sample': 149, 'm': 1.0, 'lost': 0}
+    ProgressDisplay(200, 0.01, stream, 'x').show(progress, 150)
+    ProgressDisplay(0, 0.01, stream).show(progress, 150)
+    first, second = stream.getvalue().splitlines()
+    assert first.startswith('x:    1.50 s  150/200  m 1')
+    assert second.startswith('   1.50 s  150  m 1')
+
+
+def test_a_section_of_the_plant_is_no_mistake_where_there_is_a_driver(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
+) -> None:
+    config = tmp_path / 'mine.yaml'
+    common = '/**: {ros__parameters: {control: {min: -1.0, max: 1.0, rate_max: 9.0}'
+    noise = 'estimator: {output_noise_std: 1.0e-4}'
+    of_plant = '/**/plant: {ros__parameters: {output_quantum: 0.1, seed: 3}}'
+    for number, (text, said) in enumerate((
+        (f'{common}, {noise}}}}}\n{of_plant}', False),
+        (f'{common}, {noise}, seed: 3}}}}', True),
+        (f'{common}}}}}\n{of_plant}', True),  # the noise of the estimator follows the quantum
+    )):
+        config.write_text(text)
+        prepare(bringup.parse_options([
+            '--config', str(config), '--driver', 'none', '--out', str(tmp_path / str(number)),
+        ]))
+        assert ('no use for' in capsys.readouterr().err) is said
