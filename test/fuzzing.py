@@ -155,7 +155,7 @@ class Fuzzer:
         elif kind == 7:
             noise = [Parameter('estimator.output_noise_std', value=self._size())]
             node.set_parameters_atomically([
-                *(noise if loop.takes_up_noise else []),
+                *(noise if 'estimator.output_noise_std' in loop.core.estimator.RETUNED else []),
                 Parameter('tracking.input_weight', value=self._size() + 1e-9),
                 Parameter('inverse.direction_band', value=self._size()),
             ])

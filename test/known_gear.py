@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimate import Estimate, Interval
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.parameters import Parameters
 
 # Second order, 20 Hz, at 200 Hz, as in geared_motor.yaml.
@@ -21,11 +21,9 @@ PARAMETERS = Parameters({
 KNOWN = Estimate(1.0, 0.5, -0.5, 0.0, 1e-3, 2e-3, 2e-3)
 
 
-def estimator_knowing(known: Estimate) -> MovingHorizon:
+def estimator_knowing(known: Estimate) -> Law:
     """The default law, which begins with this estimate."""
-    estimator = build_controller(PARAMETERS, known).estimator
-    assert isinstance(estimator, MovingHorizon)
-    return estimator
+    return build_controller(PARAMETERS, known).estimator
 
 
 def answers(u: list[float], late: int = 0) -> NDArray[np.float64]:
@@ -33,7 +31,7 @@ def answers(u: list[float], late: int = 0) -> NDArray[np.float64]:
     return np.asarray(lfilter([0.0] * late + list(NUMERATOR), DENOMINATOR, u))
 
 
-def learn(estimator: MovingHorizon, v: float, y: float) -> None:
+def learn(estimator: Law, v: float, y: float) -> None:
     """Let it take in a sample, and all the time for its fit."""
     estimator.update(y, Interval(v, v, v, 0.0))
     estimator.refine()

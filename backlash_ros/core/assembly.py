@@ -18,8 +18,9 @@ from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
 from backlash_ros.core.control.structure import Structure
 from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.control.tracking.tracking import Tracking
-from backlash_ros.core.estimate import Bounds, Estimate, Estimator
+from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
@@ -77,11 +78,9 @@ def build_controller(p: Parameters, inherited: Estimate | None = None) -> Adapti
     )
     _check_structure(p)
     estimator = ESTIMATORS[p.get_str('estimator.law')](p, inherited or _initial(p))
-    learner = None
-    if isinstance(estimator, MovingHorizon) and p.get_bool('plant.adapt'):
-        learner = estimator
     return AdaptiveController(
-        estimator, build_structure(p), inverse, build_limits(p), learner, _serial(p)
+        estimator, build_structure(p), inverse, build_limits(p), p.get_bool('plant.adapt'),
+        _serial(p),
     )
 
 
@@ -173,7 +172,7 @@ def _reconstruction(p: Parameters) -> InputReconstruction:
         ) from None
 
 
-def _moving_horizon(p: Parameters, initial: Estimate) -> Estimator:
+def _moving_horizon(p: Parameters, initial: Estimate) -> Law:
     observer = None
     if p.get_str('structure') != 'proportional':
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
@@ -188,18 +187,18 @@ def _moving_horizon(p: Parameters, initial: Estimate) -> Estimator:
     )
 
 
-def _lms(p: Parameters, initial: Estimate) -> Estimator:
+def _lms(p: Parameters, initial: Estimate) -> Law:
     return NormalisedLms(
         initial, _bounds(p), p.get_pair('proportional.bounds'), _reconstruction(p),
         p.get_float('lms.step'), p.get_float('lms.step_f'),
     )
 
 
-def _printed(p: Parameters, initial: Estimate) -> Estimator:
+def _printed(p: Parameters, initial: Estimate) -> Law:
     return PrintedLaw(initial, _bounds(p), p.get_pair('proportional.bounds'), _reconstruction(p))
 
 
-def _fixed(p: Parameters, initial: Estimate) -> Estimator:
+def _fixed(p: Parameters, initial: Estimate) -> Law:
     return FixedBacklash(
         initial, build_state_model(p), p.get_float('estimator.output_noise_std'),
         p.get_float('fixed.doubt'),
@@ -211,10 +210,10 @@ def law_fits(law: str, structure: str) -> bool:
     return ONLY_IN.get(law, structure) == structure
 
 
-def _gradient(p: Parameters, initial: Estimate) -> Estimator:
+def _gradient(p: Parameters, initial: Estimate) -> Law:
     blocks = build_four_blocks(p)
     return GradientEstimator(
-        initial, _bounds(p), blocks, build_model(p).order, p.get_float('gradient.step'),
+        initial, _bounds(p), blocks, p.get_float('gradient.step'),
         p.get_float('estimator.output_noise_std'),
     )
 
@@ -254,7 +253,7 @@ def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -
     return StateModel(TransferFunction(numerator, denominator))
 
 
-ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Estimator]] = {
+ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Law]] = {
     'moving_horizon': _moving_horizon, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
     'gradient': _gradient,
 }

@@ -1,15 +1,10 @@
-"""What every estimator of the backlash offers, and the values it publishes."""
+"""Estimates of the backlash: their values, how far to trust them, and their bounds."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from math import inf, isnan, nan
-from typing import NamedTuple, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from math import isnan
 
 from backlash_ros.core.parameters.errors import ParameterError
 
@@ -84,54 +79,3 @@ class Bounds:
             min(max(c_r, self.c_r[0]), self.c_r[1]),
             min(max(c_l, self.c_l[0]), self.c_l[1]),
         )
-
-
-class Interval(NamedTuple):
-    """What the controller did between two samples: v was applied, y_m and u_d led to it.
-
-    f: the gain of (3.2) that was in use. other: v that may have been applied instead, nan where
-    there is no doubt.
-    """
-
-    v: float
-    y_m: float
-    u_d: float
-    f: float
-    other: float = nan
-
-
-class StateSource(Protocol):
-    """Knows the state of G."""
-
-    @property
-    def x_hat(self) -> Sequence[float] | NDArray[np.float64]:
-        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
-
-    @property
-    def x_cov(self) -> NDArray[np.float64] | None:
-        """Covariance of x_hat, shape (n, n); None where the law has none."""
-
-
-class Estimator(StateSource, Protocol):
-    """Learns (m, c_r, c_l), and f where the law adapts it, from v and y alone."""
-
-    @property
-    def estimate(self) -> Estimate:
-        """Newest estimate; reading it changes nothing."""
-
-    adapting: bool
-    """Whether it learns; otherwise it goes on following the state of G alone."""
-
-    @property
-    def u_hat(self) -> float:
-        """Newest reconstruction of u, `lag` samples old."""
-
-    @property
-    def innovation(self) -> float:
-        """y(k) minus its prediction from the samples before; nan where y(k) was lost."""
-
-    def update(self, y: float | None, interval: Interval) -> None:
-        """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
-
-    def refine(self, budget_s: float = inf) -> None:
-        """Do what the command of this sample need not wait for, for about so long at most."""

@@ -315,7 +315,7 @@ class ControllerNode(ManagedNode):
         """Raise ParameterError for values that the running loop cannot take up."""
         build_controller(p)
         changes = p[NOISE] != self._live.parameters[NOISE]
-        if self.loop is not None and changes and not self.loop.takes_up_noise:
+        if self.loop is not None and changes and NOISE not in self.loop.core.estimator.RETUNED:
             raise ParameterError(
                 NOISE, p[NOISE], f'is not taken up live by {p.get_str("estimator.law")}',
                 'clean the node up, set it, and configure again',

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from accuracy.cramer_rao import cramer_rao
 from accuracy.random_cases import Case, bound_of, random_case, uncertain_case
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.estimate import Estimator, Status
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
@@ -84,12 +83,6 @@ def relative_errors(run: RunRecord) -> Array:
     return np.abs(estimates(run) / truths(run) - 1.0)
 
 
-def covariance(estimator: Estimator) -> Array | None:
-    """Covariance of (m, c_r, c_l) behind the published deviations, shape (3, 3)."""
-    assert isinstance(estimator, MovingHorizon)
-    return estimator.covariance
-
-
 def run_seed(job: SeedJob) -> SeedResult:
     """Simulate one seed and compare with the bound at every mark."""
     p = Parameters({**EXACT, 'seed': job.seed, **job.changes})
@@ -100,7 +93,7 @@ def run_seed(job: SeedJob) -> SeedResult:
 
     def keep(k: int) -> None:
         if k in marks:
-            covariances[k] = covariance(loop.controller.estimator)
+            covariances[k] = loop.controller.estimator.covariance
 
     run = loop.run(max(marks) + 1, keep)
     index = np.rint(run.column('t') / period).astype(int)
@@ -252,5 +245,5 @@ def run_hour(job: tuple[str, int]) -> HourResult:
 
 
 def _covariances_finite(loop: ClosedLoop) -> bool:
-    found = covariance(loop.controller.estimator)
+    found = loop.controller.estimator.covariance
     return found is None or bool(np.isfinite(found).all())

@@ -225,7 +225,7 @@ class Sequence:
             {'inverse.direction_band': 0.01 * scale * self.p.get_float('backlash.m')},
             {'lms.step': min(scale, 1.9)}, {'inverse.take_up_rate': 100.0 * scale},
         ]
-        if self.controller.loop.takes_up_noise:
+        if 'estimator.output_noise_std' in self.controller.loop.core.estimator.RETUNED:
             noise = p.get_float('output_noise_std')
             changes.append({'estimator.output_noise_std': noise * scale})
         change = changes[int(rng.integers(len(changes)))]

@@ -6,13 +6,14 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.control.structure import Adoption, ControlInput, Structure
-from backlash_ros.core.estimate import Estimate, Estimator, Interval, StateSource
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.law import Interval, Law, StateSource
 from backlash_ros.core.plant.state_model import StateModel
 
 # Samples after which a better design takes over though v crosses the gap: an unstable loop never
@@ -33,17 +34,6 @@ class ControlStep(NamedTuple):
     estimate: Estimate
 
 
-class ModelLearner(Protocol):
-    """Learns a better model of G."""
-
-    @property
-    def proposal(self) -> StateModel | None:
-        """A better G, of whatever order; None if none is new."""
-
-    def adopt(self, model: StateModel) -> None:
-        """Let x_hat be in the coordinates of this model from now on."""
-
-
 class AdaptiveController:
     """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
 
@@ -52,14 +42,13 @@ class AdaptiveController:
     hurry there calls `command` and, when v is on its way, `take_in`.
 
     compensating: False inverts the slope alone, as if there were no gap.
-    learner: who proposes better models of G, for the structure to be redesigned; None where
-    that of the beginning is kept. serial: the motor and G as the structure sees them; None where
-    v is what it commands.
+    redesign: whether the structure is designed anew for the better models of G that the estimator
+    proposes. serial: the motor and G as the structure sees them; None where v is what it commands.
     """
 
     def __init__(
-        self, estimator: Estimator, structure: Structure, inverse: BacklashInverse,
-        limits: Limits, learner: ModelLearner | None = None, serial: SerialPlant | None = None,
+        self, estimator: Law, structure: Structure, inverse: BacklashInverse,
+        limits: Limits, redesign: bool = False, serial: SerialPlant | None = None,
     ) -> None:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
@@ -67,7 +56,7 @@ class AdaptiveController:
         self.compensating = True
         self.lost_samples = 0
         self.adopted: StateModel | None = None  # the learned model of G that is in use
-        self._learner, self._serial = learner, serial
+        self._redesign, self._serial = redesign, serial
         self._considered: StateModel | None = None  # the proposal that was designed for last
         self._designed: StateModel | None = None  # that, with the motor in front
         self._design: Iterator[Adoption | None] = iter(())
@@ -160,8 +149,8 @@ class AdaptiveController:
         self.inverse.go_on_from(before.inverse)
         self.motion = before.motion
         self._considered = before._considered
-        if self._learner is not None and before.adopted is not None:
-            self._learner.adopt(before.adopted)
+        if self._redesign and before.adopted is not None:
+            self.estimator.adopt(before.adopted)
             self.adopted = before.adopted
             if self._serial is not None:
                 self._serial.adopt(self._serial.before(before.adopted))
@@ -177,10 +166,10 @@ class AdaptiveController:
         if self._pending is not None:
             self._learn()
         self.estimator.refine(budget_s)
-        if self._learner is not None:
-            self._design_on(self._learner, started + budget_s)
+        if self._redesign:
+            self._design_on(started + budget_s)
 
-    def _design_on(self, learner: ModelLearner, until: float) -> None:
+    def _design_on(self, until: float) -> None:
         """Design the structure for the newest proposal, a piece at a time while there is time."""
         while time.perf_counter() < until:
             # A design that is begun is ended: a proposal a second would never be used otherwise.
@@ -188,7 +177,7 @@ class AdaptiveController:
                 self._adoption = adoption
                 break
             else:
-                proposal = learner.proposal
+                proposal = self.estimator.proposal
                 if proposal is not None and proposal is not self._considered:
                     self._considered = proposal
                     self._designed = (
@@ -203,7 +192,7 @@ class AdaptiveController:
                 if self.structure.may_change or self._waited > LONGEST_WAIT:
                     # At once and together: x_hat and gains of two models do not fit each other.
                     assert self._considered is not None
-                    learner.adopt(self._considered)
+                    self.estimator.adopt(self._considered)
                     self.adopted = self._considered
                     if self._serial is not None:
                         assert self._designed is not None

@@ -15,8 +15,9 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Estimate, Interval
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.constants import OUTLIERS
+from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import clamp

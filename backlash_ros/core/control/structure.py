@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.estimate import Estimate, StateSource
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.state_model import StateModel
 
 # Largest feedback, whatever y does, in units of the u that the reference has asked for so far or

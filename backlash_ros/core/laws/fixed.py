@@ -7,12 +7,13 @@ disturbance d of u, which takes up what the fixed constants get wrong.
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf, nan
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Estimate, Interval, Status
+from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -21,7 +22,7 @@ Array = NDArray[np.float64]
 STATE_SCALE = 1e3  # prior of x in units of the first output and of the noise
 
 
-class FixedBacklash:
+class FixedBacklash(Law):
     """The estimates stay what they are given as; only the state of G is estimated.
 
     noise_std: of y. doubt: how much d may move per sample, as a share of the motion of u that
@@ -35,7 +36,7 @@ class FixedBacklash:
             initial, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=Status.TRACKING
         )
         self.adapting = False
-        self.innovation = nan
+        self._innovation = nan
         n = model.order
         # A gap of exactly 0 has c_l = c_r, which (2.1) does not know: then u = m (v - c).
         gapless = initial.c_r == initial.c_l
@@ -61,6 +62,11 @@ class FixedBacklash:
         return self._u + float(self._x[-1])
 
     @property
+    def innovation(self) -> float:
+        """y(k) minus its prediction; nan where y(k) was lost."""
+        return self._innovation
+
+    @property
     def x_hat(self) -> Array:
         """State of G in the coordinates of StateModel, shape (n,)."""
         return self._x[:-1]
@@ -69,9 +75,6 @@ class FixedBacklash:
     def x_cov(self) -> Array:
         """Covariance of x_hat, shape (n, n)."""
         return self._p[:-1, :-1]
-
-    def refine(self, budget_s: float = inf) -> None:
-        """Nothing is left to do after the command."""
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
@@ -83,7 +86,7 @@ class FixedBacklash:
         p = self._transition @ self._p @ self._transition.T
         p[-1, -1] += (self._doubt * (self._u - before)) ** 2
         if y is None:
-            self.innovation = nan
+            self._innovation = nan
         else:
             if not self._started:
                 x_scale = STATE_SCALE * (abs(y) + self._noise_var**0.5)
@@ -91,9 +94,9 @@ class FixedBacklash:
                 self._started = True
             cross = self._c * p[:, 0]
             variance = self._c * cross[0] + self._noise_var
-            self.innovation = y - self._c * float(x[0])
+            self._innovation = y - self._c * float(x[0])
             gain = cross / variance
-            x = x + gain * self.innovation
+            x = x + gain * self._innovation
             p -= np.outer(gain, cross)
             p = 0.5 * (p + p.T)
         self._x, self._p = x, p

@@ -25,12 +25,13 @@ Nonlinearities, Wiley 1996.
 from __future__ import annotations
 
 from dataclasses import replace
-from math import inf, nan
+from math import nan
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.agreement import LEAST_SQUARE, Agreement
 from backlash_ros.core.plant.four_blocks import FourBlocks
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -43,23 +44,18 @@ NOISE_MARGIN = 10.0  # a is at least that many standard deviations of y, in unit
 MEMORY = 200  # samples of the running means
 
 
-class GradientEstimator:
+class GradientEstimator(Law):
     """Learns (m, m c_r, m c_l) from y behind the filters of the four-block loop.
 
     step: 0 < step < 2. noise_std: of y. Where y moves against v nothing is learned.
     """
 
     def __init__(
-        self, initial: Estimate, bounds: Bounds, blocks: FourBlocks, order: int, step: float,
-        noise_std: float,
+        self, initial: Estimate, bounds: Bounds, blocks: FourBlocks, step: float, noise_std: float,
     ) -> None:
         self.estimate = initial
         self.step = step
-        self.adapting = True
-        self.innovation = nan
-        self.u_hat = 0.0
-        self.x_hat: Array = np.zeros(order)
-        self.x_cov = None
+        self._innovation, self._u_hat = nan, 0.0
         self._bounds, self._noise_square = bounds, (NOISE_MARGIN * noise_std) ** 2
         self._y = 0.0  # the newest one, or what was expected of it
         self._agreement = Agreement()
@@ -69,12 +65,22 @@ class GradientEstimator:
         self._v_square = self._u_square = self._size = 0.0  # running means
         self._samples = 0
 
+    @property
+    def innovation(self) -> float:
+        """y(k) minus what was expected of it; nan where y(k) was lost."""
+        return self._innovation
+
+    @property
+    def u_hat(self) -> float:
+        """u of the estimate on the line in use."""
+        return self._u_hat
+
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
         old = self.estimate
         self._engage(interval, old)
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
-        self.u_hat = float(theta @ self._phi)
+        self._u_hat = float(theta @ self._phi)
         inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
         filtered = self._filters.step(inputs)
         self._samples += 1
@@ -85,11 +91,11 @@ class GradientEstimator:
         returned = float(filtered[4])
         expected = float(theta @ zeta) - returned
         if y is None:
-            self.innovation, self._y = nan, expected
+            self._innovation, self._y = nan, expected
             return
         self._y = y
         xi = float(theta @ zeta - filtered[3])
-        eps = self.innovation = y - expected
+        eps = self._innovation = y - expected
         if min(self._v_square, self._u_square) < LEAST_SQUARE:
             return
         scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
@@ -111,17 +117,14 @@ class GradientEstimator:
         status = self._agreement.take(row, m, c_r, c_l)
         self.estimate = Estimate(m, c_r, c_l, old.f, status=status)
 
-    def refine(self, budget_s: float = inf) -> None:
-        """Nothing is left to do after the command."""
-
     def _engage(self, interval: Interval, used: Estimate) -> None:
         """Set phi for the line on which v lies; between lines the last one holds."""
         v, line = interval.v, interval.u_d / used.m
         near = ON_LINE * (abs(v) + abs(line))
         right, left = abs(v - line - used.c_r) <= near, abs(v - line - used.c_l) <= near
         if not (right or left):
-            right = self.u_hat < used.m * (v - used.c_r)
-            left = self.u_hat > used.m * (v - used.c_l)
+            right = self._u_hat < used.m * (v - used.c_r)
+            left = self._u_hat > used.m * (v - used.c_l)
         if right:
             self._phi = np.array([v, -1.0, 0.0])
         elif left:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from backlash_ros.core.estimate import Interval
+from backlash_ros.core.law import Interval
 
 
 class History:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.law import Law
 from backlash_ros.core.laws.agreement import Agreement
 from backlash_ros.core.laws.history import History
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
@@ -19,11 +19,10 @@ STROKE, MOTION_THRESHOLD = 8, 2.0
 LEAST_SHARE = 0.25  # of the mean motion of the stroke, below which the sample itself rests
 
 
-class LaggedLaw:
+class LaggedLaw(Law):
     """Reconstruction of u, what was applied when it acted, and whether estimates agree with it."""
 
     def __init__(self, reconstruction: InputReconstruction) -> None:
-        self.adapting = True
         self._reconstruction = reconstruction
         self._history = History(reconstruction.lag)
         self._threshold = MOTION_THRESHOLD * reconstruction.std
@@ -39,11 +38,6 @@ class LaggedLaw:
     def x_hat(self) -> NDArray[np.float64]:
         """State of G in the coordinates of StateModel, shape (n,)."""
         return self._reconstruction.x_hat
-
-    @property
-    def x_cov(self) -> None:
-        """No covariance."""
-        return None
 
     @property
     def innovation(self) -> float:
@@ -79,6 +73,3 @@ class LaggedLaw:
         """What this sample and those before it say of the estimates."""
         row = (v, -1.0, 0.0, u) if rising else (v, 0.0, -1.0, u)
         return self._agreement.take(row, m, c_r, c_l)
-
-    def refine(self, budget_s: float = inf) -> None:
-        """Nothing is left to do after the command."""

@@ -15,10 +15,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.agreement import LEAST_SQUARE
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lagged_law import LaggedLaw
+from backlash_ros.core.parameters import Parameters
 
 
 class NormalisedLms(LaggedLaw):
@@ -27,6 +29,8 @@ class NormalisedLms(LaggedLaw):
     step: 0 < step < 2. step_f: 0 keeps f. The side comes from the motion of u. Where y moves
     against v nothing is learned.
     """
+
+    RETUNED = ('lms.step', 'lms.step_f')
 
     def __init__(
         self, initial: Estimate, bounds: Bounds, f_bounds: tuple[float, float],
@@ -37,6 +41,10 @@ class NormalisedLms(LaggedLaw):
         self.step, self.step_f = step, step_f
         self._bounds, self._f_bounds = bounds, f_bounds
         self._v_max = 0.0
+
+    def retune(self, p: Parameters) -> None:
+        """Take up new steps."""
+        self.step, self.step_f = p.get_float('lms.step'), p.get_float('lms.step_f')
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 from math import isfinite, nan
 
-from backlash_ros.core.estimate import Bounds, Estimate, Interval
+from backlash_ros.core.estimate import Bounds, Estimate
+from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 from backlash_ros.core.laws.lagged_law import LaggedLaw
 

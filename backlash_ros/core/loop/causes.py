@@ -73,7 +73,7 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
     kinds = {cause.kind for cause in causes}
     # No lateness turns the sign.
     briefly = f.inconsistent_s < PATIENCE_S and not kinds.isdisjoint(LATENESS) \
-        and not f.wrong_sign
+        and not f.law.wrong_sign
     if f.status == Status.INCONSISTENT and (briefly or 'rate' in kinds):
         return Finding(
             Level.WARN, 'held', f'{f.output.name} does not follow from v while samples are late or '
@@ -83,7 +83,7 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
         return GIVEN
     if not f.adapting and f.status != Status.INCONSISTENT:
         return HELD
-    if f.unconfirmed and f.status == Status.ACQUIRING:
+    if f.law.unconfirmed and f.status == Status.ACQUIRING:
         return KNOWN
     return _contradiction(f) if f.status == Status.INCONSISTENT else STATES[f.status]
 
@@ -91,18 +91,18 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
 def _contradiction(f: LoopFigures) -> Finding:
     """What is known of why y does not follow from v."""
     model = STATES[Status.INCONSISTENT]
-    if f.wrong_sign:
+    if f.law.wrong_sign:
         return model._replace(
             text=f'{f.output.name} moves against v: reverse it, or the sign of plant.numerator'
         )
-    if f.coasts:
+    if f.law.coasts:
         return model._replace(
-            text=f'the load coasts in the gap ({100.0 * f.unexplained:.2g} % of m*gap): brake it, '
-            'or move more slowly'
+            text=f'the load coasts in the gap ({100.0 * f.law.unexplained:.2g} % of m*gap): '
+            'brake it, or move more slowly'
         )
-    if UNEXPLAINED <= f.unexplained < inf:
+    if UNEXPLAINED <= f.law.unexplained < inf:
         return model._replace(
-            text=f'{100.0 * f.unexplained:.3g} % of m*gap of the motion of u fits no G and no '
+            text=f'{100.0 * f.law.unexplained:.3g} % of m*gap of the motion of u fits no G and no '
             'backlash: check G(z), load, sensor'
         )
     return model

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Iterator
 from math import isfinite, nan
 from typing import NamedTuple
 
-import numpy as np
-
 from backlash_ros.core.assembly import (
     build_controller,
     build_limits,
@@ -18,15 +16,13 @@ from backlash_ros.core.assembly import (
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.limits import at_rest, plausible
-from backlash_ros.core.estimate import Estimate, Interval
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.laws.lms import NormalisedLms
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.law import Interval
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.report_use import report_use
 from backlash_ros.core.loop.sample_counter import Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.state_model import StateModel
 
 # Live parameters that only a new structure takes up.
 OF_THE_STRUCTURE = (
@@ -86,20 +82,9 @@ class ControlLoop:
         self.told = build_model(p)
 
     @property
-    def learned_model(self) -> StateModel | None:
-        """The G that the law has come to, None for a law that learns none."""
-        estimator = self.core.estimator
-        return estimator.learned_model if isinstance(estimator, MovingHorizon) else None
-
-    @property
     def estimate(self) -> Estimate:
         """What is known of the backlash."""
         return self.core.estimator.estimate
-
-    @property
-    def takes_up_noise(self) -> bool:
-        """Whether the law can change what it takes for the noise on y while it runs."""
-        return isinstance(self.core.estimator, MovingHorizon)
 
     def renew(self, inherited: Estimate | None) -> None:
         """Go on with a new core from the present v: nothing is known of the state of the plant.
@@ -283,14 +268,7 @@ class ControlLoop:
         core.limits = build_limits(p)
         core.inverse.set_band(p.get_float('inverse.direction_band'))
         core.inverse.take_up = p.get_float('inverse.take_up_rate') * p.get_float('sample_period')
-        if isinstance(core.estimator, NormalisedLms):
-            core.estimator.step = p.get_float('lms.step')
-            core.estimator.step_f = p.get_float('lms.step_f')
-        if isinstance(core.estimator, MovingHorizon):
-            core.estimator.set_noise(
-                p.get_float('estimator.output_noise_std'), p.get_float('estimator.input_noise_std'),
-                np.array(p.get_triple('estimator.drift_std')) * p.get_float('sample_period')**0.5,
-            )
+        core.estimator.retune(p)
         if any(p[name] != before[name] for name in OF_THE_STRUCTURE):
             structure = build_structure(p)
             structure.go_on_from(core.structure)

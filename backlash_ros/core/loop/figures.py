@@ -8,6 +8,7 @@ from math import nan
 from typing import NamedTuple
 
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.law import LawReport
 
 
 class Level(IntEnum):
@@ -73,10 +74,7 @@ class LoopFigures:
     standing_down: bool = False  # because of them
     status: Status | None = None  # None before the first command
     inconsistent_s: float = 0.0  # how long that status has been INCONSISTENT
-    unexplained: float = nan  # motion of u that no G and no backlash explains, over m times the gap
-    wrong_sign: bool = False  # whether y moves against v
-    coasts: bool = False  # whether the load runs on within the gap
-    unconfirmed: bool = False  # whether estimates of before this run hold that it does not confirm
+    law: LawReport = field(default_factory=LawReport)
     adapting: bool = True
     given: bool = False  # whether the estimates are taken as the parameters give them
     silent_s: float = 0.0  # timeout that has passed without y, 0 if it has not

@@ -8,8 +8,7 @@ from math import nan
 
 import numpy as np
 
-from backlash_ros.core.estimate import Estimator
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.law import Law
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 # At which the response of G is judged, as shares of the sampling rate: from slow motion to where
@@ -55,21 +54,12 @@ def from_fields(fields: Mapping[str, Sequence[float]]) -> LearnedModel:
     )
 
 
-def learned_model_of(estimator: Estimator, told: TransferFunction) -> LearnedModel:
-    """What the law believes of G now; told: what a law goes by that does not learn it."""
-    if not isinstance(estimator, MovingHorizon):
-        return _described(told)
-    return _described(
-        estimator.learned_model.transfer_function, tuple(estimator.response_std(_POINTS).tolist()),
-        estimator.noise_ratio, estimator.unexplained,
-    )
-
-
-def _described(
-    model: TransferFunction, response_std: tuple[float, ...] = (nan,) * len(FREQUENCIES),
-    noise_ratio: float = nan, unexplained: float = nan,
-) -> LearnedModel:
+def learned_model_of(law: Law, nominal: TransferFunction) -> LearnedModel:
+    """What a law believes of G now; nominal: what it goes by where it does not learn it."""
+    learned, report = law.learned_model, law.report
+    model = nominal if learned is None else learned.transfer_function
     numerator, denominator, delay = model.without_delay()
     return LearnedModel(
-        tuple(numerator), tuple(denominator), delay, response_std, noise_ratio, unexplained
+        tuple(numerator), tuple(denominator), delay, tuple(law.response_std(_POINTS).tolist()),
+        report.noise_ratio, report.unexplained,
     )

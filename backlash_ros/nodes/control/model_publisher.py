@@ -39,8 +39,9 @@ class ModelPublisher:
     def follow(self, loop: ControlLoop, sample_period_s: float) -> None:
         """Publish after a sample, if it is time."""
         self._since += 1
-        if loop.learned_model is not self._told or self._since * sample_period_s >= PERIOD_S:
-            self._told, self._since = loop.learned_model, 0
+        learned = loop.core.estimator.learned_model
+        if learned is not self._told or self._since * sample_period_s >= PERIOD_S:
+            self._told, self._since = learned, 0
             self.publish(loop)
 
     def publish(self, loop: ControlLoop) -> None:

@@ -12,7 +12,6 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.loop.causes import LONGEST_TEXT, findings_of
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer
@@ -72,10 +71,6 @@ class Diagnosis:
         overdue = reference_at_s is not None and not p.get_bool('lockstep') \
             and 0.0 < timeout < time.monotonic() - reference_at_s
         control = io.topics.control
-        estimator = loop.core.estimator
-        unexplained, wrong_sign, coasts, unconfirmed = (
-            estimator.unexplained, estimator.wrong_sign, estimator.coasts, estimator.unconfirmed
-        ) if isinstance(estimator, MovingHorizon) else (nan, False, False, False)
         return LoopFigures(
             p.get_float('sample_period'),
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
@@ -83,8 +78,7 @@ class Diagnosis:
             subscribers_of(node, control, io.topics.control_type), rivals,
             standing_down=loop.standing_down,
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
-            unexplained=unexplained, wrong_sign=wrong_sign, coasts=coasts,
-            unconfirmed=unconfirmed, adapting=loop.adapting,
+            law=loop.core.estimator.report, adapting=loop.adapting,
             given=was_given(loop.estimate),
             silent_s=p.get_float('timeout.plant_output') if loop.silent else 0.0,
             on_timeout=p.get_str('on_timeout'),
@@ -173,19 +167,18 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
 
 
 def _of_the_fit(loop: ControlLoop) -> dict[str, object]:
-    """What the default law knows of its own fit."""
-    estimator = loop.core.estimator
-    if not isinstance(estimator, MovingHorizon):
+    """What a law that learns G knows of its own fit."""
+    learned, report = loop.core.estimator.learned_model, loop.core.estimator.report
+    if learned is None:
         return {}
-    moved = estimator.learned_model.transfer_function
     return {
-        'noise: learned / told': estimator.noise_ratio,
-        'unexplained motion / (m * gap)': estimator.unexplained,
-        'samples that wait for a fit': estimator.waiting,
-        'outliers': estimator.outliers,
-        'commands found to be late': estimator.reattributed,
-        'failed fits': estimator.failed_fits,
-        'G(z)': 'as told' if _same(moved, loop.told) else 'learned',
+        'noise: learned / told': report.noise_ratio,
+        'unexplained motion / (m * gap)': report.unexplained,
+        'samples that wait for a fit': report.waiting,
+        'outliers': report.outliers,
+        'commands found to be late': report.reattributed,
+        'failed fits': report.failed_fits,
+        'G(z)': 'as told' if _same(learned.transfer_function, loop.told) else 'learned',
     }
 
 

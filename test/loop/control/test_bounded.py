@@ -34,7 +34,8 @@ from backlash_ros.core.control.structure import (
 from backlash_ros.core.control.tracking.design import Weights, design, feedback_around
 from backlash_ros.core.control.tracking.rest import TOLERANCE
 from backlash_ros.core.control.tracking.tracking import FADING, Tracking
-from backlash_ros.core.estimate import Estimate, Interval, Status
+from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.law import Interval
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.four_blocks import place_poles
 from backlash_ros.core.plant.state_model import StateModel

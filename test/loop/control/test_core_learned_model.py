@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_model, build_true_model
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.law import LawReport
 from backlash_ros.core.loop.learned_model import (
     FREQUENCIES,
     LearnedModel,
@@ -34,10 +34,8 @@ def learned(loop: ClosedLoop) -> LearnedModel:
     return learned_model_of(loop.controller.estimator, loop.told)
 
 
-def law(loop: ClosedLoop) -> MovingHorizon:
-    estimator = loop.controller.estimator
-    assert isinstance(estimator, MovingHorizon)
-    return estimator
+def report(loop: ClosedLoop) -> LawReport:
+    return loop.controller.estimator.report
 
 
 @given(
@@ -103,7 +101,7 @@ def test_the_structure_gets_a_finer_model_than_the_fit_needs() -> None:
         return float(np.abs(gain * model.response(z) / true.response(z) - 1.0).max())
 
     assert off(adopted.transfer_function) < 0.05 * off(loop.told)
-    assert law(loop).learned_model is adopted
+    assert loop.controller.estimator.learned_model is adopted
 
 
 def test_exact_model_has_no_deviations() -> None:
@@ -137,25 +135,25 @@ def test_wrong_sign_is_told_until_there_is_an_estimate() -> None:
         'truth.denominator': list(MOTOR.get_floats('plant.denominator')),
     }
     loop = build_closed_loop(MOTOR.replaced(turned))
-    assert not law(loop).wrong_sign
+    assert not report(loop).wrong_sign
     loop.run(400)
-    assert law(loop).wrong_sign
+    assert report(loop).wrong_sign
     # Somebody turns the sensor.
     measure = loop.plant.measure
     loop.plant.measure = lambda: -measure()  # type: ignore[method-assign]
     loop.run(800)
-    assert law(loop).estimate.learned
-    assert not law(loop).wrong_sign
+    assert loop.controller.estimator.estimate.learned
+    assert not report(loop).wrong_sign
 
 
 def test_samples_wait_while_there_is_no_time_for_a_fit() -> None:
     loop = build_closed_loop(MOTOR)
     loop.run(400)
-    few = law(loop).waiting
+    few = report(loop).waiting
     assert few < 64
     loop.controller.refine = lambda budget_s=nan: None  # type: ignore[method-assign]
     loop.run(100)
-    assert law(loop).waiting >= 99 + few
+    assert report(loop).waiting >= 99 + few
 
 
 @pytest.mark.parametrize('waveform', ['triangle', 'multisine'])

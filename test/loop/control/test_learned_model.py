@@ -27,7 +27,8 @@ from backlash_ros.core.control.tracking.design import (
 )
 from backlash_ros.core.control.tracking.slope_tolerance import margin_in_pieces
 from backlash_ros.core.control.tracking.tracking import Tracking
-from backlash_ros.core.estimate import Estimate, Interval
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.four_blocks import place_poles
@@ -52,7 +53,7 @@ def motor(scale: float = 1.0, damping: float = 0.5, delay: int = 0) -> TransferF
     return TransferFunction(numerator[0][1:].tolist(), [*denominator.tolist(), *[0.0] * delay])
 
 
-class Learner:
+class Learner(Law):
     """Knows the backlash, and at some time the true G; x_hat is always that of one model."""
 
     def __init__(self, told: StateModel, better: StateModel, after: int, doubt: float) -> None:
@@ -91,9 +92,6 @@ class Learner:
         for observer in self._observers.values():
             observer.update(y, interval)
 
-    def refine(self, budget_s: float = inf) -> None:
-        """Everything is known already."""
-
 
 @dataclass
 class Run:
@@ -125,7 +123,7 @@ def run(
     learner = Learner(model, better, after, doubt)
     structure = Tracking(design(model, WEIGHTS), WEIGHTS, 1.0, NOISE)
     inverse = BacklashInverse()
-    controller = AdaptiveController(learner, structure, inverse, Limits(), learner)
+    controller = AdaptiveController(learner, structure, inverse, Limits(), redesign=True)
     backlash = Backlash(TRUTH.m, TRUTH.c_r, TRUTH.c_l)
     rng = np.random.default_rng(1)
     plant = SimulatedPlant(true, backlash, PERIOD, rng)

@@ -10,7 +10,7 @@ from known_gear import KNOWN, answers, estimator_knowing, learn
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation.moving_horizon.moving_horizon import Law
 from backlash_ros.core.plant.backlash import play_outputs
 
 Array = NDArray[np.float64]
@@ -26,7 +26,7 @@ MOTIONS: dict[str, Array] = {
 
 def run(
     v: Array, known: float = 1.0, late: int = 0, also: Array | float = 0.0,
-) -> tuple[MovingHorizon, Array]:
+) -> tuple[Law, Array]:
     """A gear with a gap of 1, and (gap, its deviation, status) of each sample, shape (N, 3).
 
     known: gap that the estimator begins with. also: what moves y besides.
@@ -48,7 +48,7 @@ def run(
 def test_samples_that_tell_confirm_or_replace_it(known: float, late: int, motion: str) -> None:
     estimator, rows = run(MOTIONS[motion], known, late)
     gap, std, status = rows.T
-    assert not estimator.unconfirmed
+    assert not estimator.report.unconfirmed
     assert status[-1] == Status.TRACKING
     assert gap[-1] == pytest.approx(1.0, abs=2e-3)
     assert std[-1] < 0.5 * std[0]
@@ -65,5 +65,5 @@ def test_samples_that_say_little_leave_it_as_it_is() -> None:
     gap, std, status = rows[20:].T
     assert np.ptp(gap) < 0.01
     assert std.max() <= 1.01 * std[0]
-    assert estimator.unconfirmed
+    assert estimator.report.unconfirmed
     assert not np.any(status == Status.TRACKING)

@@ -15,26 +15,20 @@ from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.estimate import Bounds, Estimate, Interval
+from backlash_ros.core.estimate import Bounds, Estimate
+from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.parameters.errors import ParameterError
 
 PAPER = Estimate(1.3, 3.0, -3.0, 0.22)
 
 
-class Notebook:
+class Notebook(Law):
     """An estimator that writes down what it is told; each update adds 0.1 to c_r."""
 
     def __init__(self, estimate: Estimate = PAPER, learns: float = 0.0) -> None:
         self.estimate = estimate
         self.learns = learns
-        self.u_hat = 0.5
-        self.innovation = 0.25
-        self.x_hat = np.zeros(1)
-        self.x_cov = None
         self.updates: list[tuple[float | None, Interval]] = []
-
-    def refine(self, budget_s: float = inf) -> None:
-        """Nothing to do after the command."""
 
     def update(self, y: float | None, interval: Interval) -> None:
         self.updates.append((y, interval))

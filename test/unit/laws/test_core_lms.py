@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import KnownInput, Play, strokes, usual_plays
 
-from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimate import Bounds, Estimate, Status
+from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.plant.backlash import Backlash, Region
 

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.law import LawReport
 from backlash_ros.core.loop.causes import (
     HELD,
     KNOWN,
@@ -127,11 +128,11 @@ def test_what_is_known_goes_before_the_model(
 def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:
     acquiring = replace(WELL, status=Status.ACQUIRING)
     assert first(acquiring) == STATES[Status.ACQUIRING]
-    assert first(replace(acquiring, unconfirmed=True)) == KNOWN
+    assert first(replace(acquiring, law=LawReport(unconfirmed=True))) == KNOWN
     assert len(KNOWN.text) <= LONGEST_TEXT
     # It is confirmed where the status says so, or asked for.
-    assert first(replace(WELL, unconfirmed=True)) == STATES[Status.TRACKING]
-    assert first(replace(acquiring, unconfirmed=True, adapting=False)) == HELD
+    assert first(replace(WELL, law=LawReport(unconfirmed=True))) == STATES[Status.TRACKING]
+    assert first(replace(acquiring, law=LawReport(unconfirmed=True), adapting=False)) == HELD
 
 
 def test_the_model_is_blamed_where_nothing_else_is_known() -> None:
@@ -140,15 +141,15 @@ def test_the_model_is_blamed_where_nothing_else_is_known() -> None:
 
 
 @pytest.mark.parametrize(('changes', 'text'), [
-    ({'unexplained': 0.234},
+    ({'law': LawReport(unexplained=0.234)},
      '23.4 % of m*gap of the motion of u fits no G and no backlash: check G(z), load, sensor'),
-    ({'coasts': True, 'unexplained': 0.234},
+    ({'law': LawReport(coasts=True, unexplained=0.234)},
      'the load coasts in the gap (23 % of m*gap): brake it, or move more slowly'),
-    ({'wrong_sign': True, 'unexplained': 0.3},
+    ({'law': LawReport(wrong_sign=True, unexplained=0.3)},
      'plant_output moves against v: reverse it, or the sign of plant.numerator'),
     # What noise leaves, or what has no gap to be compared with, is no reason.
-    ({'unexplained': 0.01}, STATES[Status.INCONSISTENT].text),
-    ({'unexplained': inf}, STATES[Status.INCONSISTENT].text),
+    ({'law': LawReport(unexplained=0.01)}, STATES[Status.INCONSISTENT].text),
+    ({'law': LawReport(unexplained=inf)}, STATES[Status.INCONSISTENT].text),
 ])
 def test_a_contradiction_is_named_by_what_the_fit_has_found(
     changes: dict[str, Any], text: str,
@@ -169,13 +170,13 @@ def test_a_loop_that_is_merely_late_is_never_an_error(changes: dict[str, Any]) -
 
 
 def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
-    for known in ({'wrong_sign': True}, {'unexplained': 0.2}):
+    for known in ({'law': LawReport(wrong_sign=True)}, {'law': LawReport(unexplained=0.2)}):
         figures = replace(INCONSISTENT, unreported=30, inconsistent_s=10.0, **known)
         assert [finding.kind for finding in findings_of(figures)] == ['model', 'unreported']
 
 
 def test_no_lateness_turns_the_sign() -> None:
-    finding = first(replace(INCONSISTENT, late=30, wrong_sign=True))
+    finding = first(replace(INCONSISTENT, late=30, law=LawReport(wrong_sign=True)))
     assert finding.text.startswith('plant_output moves against v')
     assert finding.level == Level.ERROR
 

@@ -22,8 +22,8 @@ SHARED = {
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
-    'parameters', 'plant', 'reference', 'estimate', 'laws', 'estimation', 'control', 'scenario',
-    'assembly', 'loop', 'simulation', 'identification', 'driver_check',
+    'parameters', 'plant', 'reference', 'estimate', 'law', 'laws', 'estimation', 'control',
+    'scenario', 'assembly', 'loop', 'simulation', 'identification', 'driver_check',
 )
 ESTIMATION = (
     'constants', 'regression', 'fit', 'observer', 'moving_horizon', 'whole_record',

@@ -30,7 +30,8 @@ from backlash_ros.core.control.tracking.design import (
 )
 from backlash_ros.core.control.tracking.reference_window import ReferenceWindow
 from backlash_ros.core.control.tracking.rest import OFF, TOLERANCE, Mode, Rest
-from backlash_ros.core.estimate import Estimate, StateSource, Status
+from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.state_model import StateModel
 

@@ -17,7 +17,7 @@ from time import perf_counter, thread_time
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Bounds, Estimate, Interval, Status
+from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.constants import (
     BLOCK,
     NO_DATA,
@@ -36,7 +36,9 @@ from backlash_ros.core.estimation.moving_horizon.learning import CAPACITY, Learn
 from backlash_ros.core.estimation.moving_horizon.schedule import next_task
 from backlash_ros.core.estimation.observer.state_following import Sample, StateFollowing
 from backlash_ros.core.estimation.regression.error_model import build_error_model
+from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -44,7 +46,7 @@ Array = NDArray[np.float64]
 AT_REST = 3  # memories of G after which nothing moves any more
 
 
-class MovingHorizon:
+class MovingHorizon(Law):
     """Learns (m, c_r, c_l) and the error of G from y alone.
 
     initial: a first guess, or with its deviations what was learned before. model: G as told.
@@ -54,13 +56,17 @@ class MovingHorizon:
     the state of G until the backlash is known, for structures that want it.
     """
 
+    RETUNED = (
+        'estimator.output_noise_std', 'estimator.input_noise_std', 'estimator.drift_std',
+    )
+
     def __init__(
         self, initial: Estimate, bounds: Bounds, model: StateModel, noise_std: float,
         walk_std: float, drift_std: tuple[float, float, float], sample_period: float,
         uncertainty: float, observer: FixedBacklash | None = None,
     ) -> None:
         self.estimate = replace(initial, status=Status.ACQUIRING)
-        self.failed_fits = 0
+        self._failed_fits = 0
         error = build_error_model(model, uncertainty)
         told = Around(
             error, max(noise_std, SMALLEST_NOISE),
@@ -112,14 +118,21 @@ class MovingHorizon:
         return self._following.innovation
 
     @property
-    def outliers(self) -> int:
-        """Readings so far that were taken for none."""
-        return self._following.outliers + self._learning.outliers
-
-    @property
-    def reattributed(self) -> int:
-        """Intervals so far over which another v acted than was said."""
-        return self._following.reattributed + self._learning.reattributed
+    def report(self) -> LawReport:
+        """How its work goes."""
+        learning, following = self._learning, self._following
+        current, rejected = learning.current, learning.acquisition.rejected
+        return LawReport(
+            noise_ratio=nan if current is None
+            else current.solution.posterior.noise_std / learning.around.told_std,
+            unexplained=self._unexplained, coasts=self._coasts,
+            unconfirmed=current is not None and not learning.confirmed,
+            wrong_sign=rejected is not None and rejected.solution.m < 0.0,
+            waiting=learning.waiting,
+            outliers=following.outliers + learning.outliers,
+            reattributed=following.reattributed + learning.reattributed,
+            failed_fits=self._failed_fits,
+        )
 
     @property
     def proposal(self) -> StateModel | None:
@@ -138,15 +151,7 @@ class MovingHorizon:
         return self._learning.learned.model
 
     @property
-    def noise_ratio(self) -> float:
-        """Deviation of the noise as learned over the one that was told; nan before."""
-        current = self._learning.current
-        if current is None:
-            return nan
-        return current.solution.posterior.noise_std / self._learning.around.told_std
-
-    @property
-    def unexplained(self) -> float:
+    def _unexplained(self) -> float:
         """Motion of u that no backlash and no G explains, over m times the gap.
 
         Where there is no estimate: of the last fit that gave none, nan before.
@@ -154,22 +159,6 @@ class MovingHorizon:
         learning = self._learning
         fitted = learning.contradiction or learning.current or learning.acquisition.rejected
         return fitted.fit.unexplained(fitted.solution) if fitted is not None else nan
-
-    @property
-    def coasts(self) -> bool:
-        """Whether there is no better estimate because the load runs on within the gap."""
-        return self._coasts
-
-    @property
-    def unconfirmed(self) -> bool:
-        """Whether the estimate was learned before, and the samples do not speak for it yet."""
-        return self._learning.current is not None and not self._learning.confirmed
-
-    @property
-    def wrong_sign(self) -> bool:
-        """Whether there is no estimate because y moves against v."""
-        rejected = self._learning.acquisition.rejected
-        return rejected is not None and rejected.solution.m < 0.0
 
     def response_std(self, z: NDArray[np.complex128]) -> Array:
         """Relative deviation of the true response from that of `learned_model` at z (M,).
@@ -180,11 +169,6 @@ class MovingHorizon:
         if current is None:
             return np.full(len(z), nan)
         return response_std(current.fit, current.solution, self.learned_model, z)
-
-    @property
-    def waiting(self) -> int:
-        """Samples of the record that no fit has taken in yet."""
-        return self._learning.waiting
 
     # --- what it is told ------------------------------------------------------------------------
 
@@ -210,14 +194,14 @@ class MovingHorizon:
                 learning.current, self.estimate, learning.record, self.learned_model
             )
 
-    def set_noise(self, noise_std: float, walk_std: float, drift_std: Array) -> None:
-        """Take another first guess of the noise and the walk; whatever was learned stays.
-
-        drift_std: random walk of m, c_r, c_l per square root of a sample, shape (3,).
-        """
+    def retune(self, p: Parameters) -> None:
+        """Take another first guess of the noise and the walk; whatever was learned stays."""
         learning = self._learning
-        learning.told_walk, learning.drift = walk_std, drift_std
-        learning.around = learning.around._replace(told_std=max(noise_std, SMALLEST_NOISE))
+        learning.told_walk = p.get_float('estimator.input_noise_std')
+        drift_std = np.array(p.get_triple('estimator.drift_std'))
+        learning.drift = drift_std * p.get_float('sample_period')**0.5
+        noise_std = max(p.get_float('estimator.output_noise_std'), SMALLEST_NOISE)
+        learning.around = learning.around._replace(told_std=noise_std)
         self._idle_until = 0
 
     # --- at every sample ------------------------------------------------------------------------
@@ -263,7 +247,7 @@ class MovingHorizon:
 
     def _search_afresh(self) -> None:
         """Go on after samples that leave nothing but rounding: others may be better."""
-        self.failed_fits += 1
+        self._failed_fits += 1
         learning = self._learning
         learning.record.forget_before(learning.record.end)
         learning.begin_acquisition(self.estimate if self.estimate.learned else None)
@@ -370,7 +354,7 @@ class MovingHorizon:
         self._coasts = learning.reason is Status.INCONSISTENT and load_coasts(learning, estimate)
         stds = self._stds
         if self._coasts:
-            doubt = 0.5 * self.unexplained * (estimate.c_r - estimate.c_l)  # of each crossing
+            doubt = 0.5 * self._unexplained * (estimate.c_r - estimate.c_l)  # of each crossing
             stds = hypot(stds[0], doubt), hypot(stds[1], doubt)
         if stds != (estimate.std_c_r, estimate.std_c_l) and estimate.learned:
             self.estimate = replace(estimate, std_c_r=stds[0], std_c_l=stds[1])

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimate import Estimate, Interval
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.constants import GATE, OUTLIERS
 from backlash_ros.core.estimation.fit.record import Record
 from backlash_ros.core.estimation.fit.relabelling import Fitted
 from backlash_ros.core.estimation.observer.attribution import Attribution
 from backlash_ros.core.estimation.observer.observer import Observer
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.state_model import StateModel

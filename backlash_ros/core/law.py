@@ -1,0 +1,145 @@
+"""What every law offers: estimates of the backlash, the state of G, and a report of its work."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, nan
+from typing import ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.state_model import StateModel
+
+Array = NDArray[np.float64]
+
+
+class Interval(NamedTuple):
+    """What the controller did between two samples: v was applied, y_m and u_d led to it.
+
+    f: the gain of (3.2) that was in use. other: v that may have been applied instead, nan where
+    there is no doubt.
+    """
+
+    v: float
+    y_m: float
+    u_d: float
+    f: float
+    other: float = nan
+
+
+@dataclass(frozen=True)
+class LawReport:
+    """What a law knows of its own work; the defaults are those of a law that does not learn it.
+
+    noise_ratio: standard deviation of the noise on y as learned over the configured one.
+    unexplained: motion of u that no backlash and no G explains, over m times the gap. coasts: there
+    is no better estimate because the load runs on within the gap. unconfirmed: the estimate was
+    learned before this run, and its samples do not confirm it yet. wrong_sign: there is no
+    estimate because y moves against v. waiting: samples that no fit has taken in yet. outliers:
+    readings rejected so far. reattributed: intervals so far over which another v acted than
+    the one commanded. failed_fits: fits so far without a result.
+    """
+
+    noise_ratio: float = nan
+    unexplained: float = nan
+    coasts: bool = False
+    unconfirmed: bool = False
+    wrong_sign: bool = False
+    waiting: int = 0
+    outliers: int = 0
+    reattributed: int = 0
+    failed_fits: int = 0
+
+
+class StateSource(Protocol):
+    """Knows the state of G."""
+
+    @property
+    def x_hat(self) -> Sequence[float] | Array:
+        """State of G given y(..k) in the coordinates of StateModel, shape (n,)."""
+
+    @property
+    def x_cov(self) -> Array | None:
+        """Covariance of x_hat, shape (n, n); None where the law has none."""
+
+
+class Law:
+    """Learns (m, c_r, c_l), and f where it adapts it, from v and y alone.
+
+    Laws inherit from here what they do not do themselves. estimate: the newest one. adapting:
+    whether it learns; otherwise it goes on following the state of G alone. RETUNED: names of the
+    parameters that `retune` takes up.
+    """
+
+    RETUNED: ClassVar[tuple[str, ...]] = ()
+    estimate: Estimate
+    adapting: bool = True
+
+    # --- at every sample ------------------------------------------------------------------------
+
+    def update(self, y: float | None, interval: Interval) -> None:
+        """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
+
+    def refine(self, budget_s: float = inf) -> None:
+        """Do what the command of this sample need not wait for, for about so long at most."""
+
+    @property
+    def x_hat(self) -> Sequence[float] | Array:
+        """State of G given y(..k) in the coordinates of StateModel, shape (n,); () without one."""
+        return ()
+
+    @property
+    def x_cov(self) -> Array | None:
+        """Covariance of x_hat, shape (n, n); None where the law has none."""
+        return None
+
+    @property
+    def u_hat(self) -> float:
+        """Newest reconstruction of u; nan where there is none."""
+        return nan
+
+    @property
+    def innovation(self) -> float:
+        """y(k) minus its prediction from the samples before; nan where y(k) was lost."""
+        return nan
+
+    # --- of G, for laws that learn it -----------------------------------------------------------
+
+    @property
+    def learned_model(self) -> StateModel | None:
+        """The G behind the newest estimate; None for a law that learns no G."""
+        return None
+
+    @property
+    def proposal(self) -> StateModel | None:
+        """A better G than that of x_hat, of whatever order; None if none is new."""
+        return None
+
+    def adopt(self, model: StateModel) -> None:
+        """Give x_hat in the coordinates of this model from now on."""
+
+    def response_std(self, z: NDArray[np.complex128]) -> Array:
+        """Relative standard deviation of the response of `learned_model` at z, shape (M,).
+
+        nan where nothing was learned, 0 where G is configured to be exact.
+        """
+        return np.full(len(z), nan)
+
+    # --- now and then ---------------------------------------------------------------------------
+
+    @property
+    def covariance(self) -> Array | None:
+        """Covariance of (m, c_r, c_l) behind the deviations, shape (3, 3); None without one."""
+        return None
+
+    @property
+    def report(self) -> LawReport:
+        """How its work goes."""
+        return LawReport()
+
+    def retune(self, p: Parameters) -> None:
+        """Take up new values of the parameters RETUNED; what was learned stays."""
