@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from array import array
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from rclpy.parameter import Parameter
+import yaml
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from ros_processes import Probe, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
@@ -14,6 +16,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.table import PARAMETERS
 
 
 class Client:
@@ -82,3 +85,67 @@ def test_changed_plant_moves_on_from_where_it_was() -> None:
     assert after.measure() == before.measure()
     assert after.step(14.0) == before.step(14.0)
     assert after.measure() == before.measure()
+
+
+def dumped(probe: Probe, node: str) -> dict[str, Any]:
+    """Name and value of every parameter, as `ros2 param dump` asks for them."""
+    client = AsyncParameterClient(probe.node, node)
+    probe.wait_until(client.services_are_ready, f'the parameters of {node}')
+    listed = client.list_parameters()
+    probe.wait_until(listed.done, 'the names')
+    names = sorted(listed.result().result.names)
+    answer = client.get_parameters(names)
+    probe.wait_until(answer.done, 'the values')
+    values = [parameter_value_to_python(value) for value in answer.result().values]
+    assert len(values) == len(names)
+    return dict(zip(names, values, strict=True))
+
+
+def parameter_file(path: Path, node: str, values: dict[str, Any]) -> str:
+    path.write_text(yaml.dump({f'/{node}': {'ros__parameters': {
+        name: value.tolist() if isinstance(value, array) else value
+        for name, value in values.items()
+    }}}))
+    return str(path)
+
+
+def test_what_was_dumped_is_complete_and_loads_without_a_change(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        started = {
+            'controller': {'control.max': 5.0, 'estimator.output_noise_std': 1e-6},
+            'plant': {'backlash.m': 0.9, 'seed': 4}, 'reference': {'amplitude': 3.0},
+            'recorder': {},
+        }
+        probe = world.probe()
+        for name, parameters in started.items():
+            node = world.start(name, {'wait_for_subscribers': 1, **parameters} if name in (
+                'plant', 'reference') else parameters)
+            before = dumped(probe, name)
+            declared = {p.name for p in PARAMETERS if name in p.used_by}
+            assert declared <= before.keys()
+            for key, value in parameters.items():
+                assert before[key] == value
+            client = AsyncParameterClient(probe.node, name)
+            file = parameter_file(tmp_path / f'{name}.yaml', name, before)
+            loaded = client.load_parameter_file(file, True)
+            probe.wait_until(loaded.done, 'an answer')
+            assert [r.reason for r in loaded.result().results if not r.successful] == []
+            assert dumped(probe, name) == before
+            assert node.stop() == 0
+            # A node that starts with it is the same one.
+            again = world.start(name, None, '--ros-args', '--params-file', file)
+            assert dumped(probe, name) == before
+            assert again.stop() == 0
+
+
+def test_values_as_command_lines_send_them_are_taken_or_refused_by_name(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        plant = world.start('plant')
+        client = Client(world.probe(), 'plant')
+        assert client.change(output_noise_std='1e-6', backlash__jump=[1, 2, 3]).successful
+        assert client.change(backlash__rate='[1.0e-05, 0.0, 0]').successful
+        refused = client.change(output_noise_std='little')
+        assert refused.reason == "output_noise_std='little' must be a number"
+        refused = client.change(backlash__jump=[1, 2])
+        assert refused.reason == 'backlash.jump=[1.0, 2.0] must have 3 numbers'
+        assert plant.stop() == 0

@@ -179,9 +179,9 @@ def _reals(parameter: Parameter, value: object) -> tuple[float, ...]:
 
 def _real(parameter: Parameter, value: object) -> float:
     if isinstance(value, str):
-        # YAML 1.1 reads 1e-5 (no point, no sign) as a text.
+        # YAML 1.1 reads 1e-5 (no point, no sign) as a text, and tools of ROS 2 send .inf as one.
         try:
-            value = float(value)
+            value = float(value.replace('.inf', 'inf'))
         except ValueError:
             raise ParameterError(parameter.name, value, 'must be a number') from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):

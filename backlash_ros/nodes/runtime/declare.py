@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import isfinite
-from typing import Any
 
 from rcl_interfaces.msg import (
     FloatingPointRange,
@@ -15,9 +14,9 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import BY_NAME, PARAMETERS, Parameter
+from backlash_ros.core.parameters import Parameters, check_value
+from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
+from backlash_ros.core.parameters.table import BY_NAME, PARAMETERS, Parameter, Value
 
 # Declared by rclpy itself in every node.
 ROS_OWN = {'use_sim_time', 'start_type_description_service'}
@@ -36,20 +35,43 @@ def declare_parameters(
     """Declare what the table says this executable uses; return the complete, checked set.
 
     reconfigurable: whether all but the FIXED ones may change while the node is unconfigured.
-    node: created with automatically_declare_parameters_from_overrides, the public way to learn
-    which names were given: rclpy ignores a given name that nobody declares. Raises ParameterError.
+    Raises ParameterError for what rclpy would ignore (a given name that nobody declares) or refuse.
     """
-    given: dict[str, Any] = {
-        name: parameter.value for name, parameter in _declared(node).items() if name not in ROS_OWN
-    }
-    parameters = Parameters(given)
-    for name in given:
-        node.undeclare_parameter(name)
+    # rclpy has no other way to ask for all names that were given.
+    given = node.handle.get_parameters(RosParameter)
+    parameters = Parameters({
+        name: _given_value(parameter) for name, parameter in given.items() if name not in ROS_OWN
+    })
+    declared = [p for p in PARAMETERS if executable in p.used_by]
     node.declare_parameters('', [
-        (p.name, _ros_value(parameters[p.name]), describe(p, reconfigurable))
-        for p in PARAMETERS if executable in p.used_by
+        (p.name, _declarable(parameters[p.name]), ParameterDescriptor()) for p in declared
     ], ignore_override=True)
+    empty = [_ros_parameter(p.name, ()) for p in declared if parameters[p.name] == ()]
+    # With one value missing rclpy tells none of those that it is asked for.
+    node.set_parameters(empty)
+    for p in declared:
+        node.set_descriptor(p.name, describe(p, reconfigurable))
     return parameters
+
+
+def changed_values(node: Node, requested: Sequence[RosParameter]) -> list[RosParameter]:
+    """Those of the requested values that differ from the present ones, in their declared types.
+
+    Command-line tools send 1e-6 as a text and [1, 2] as integers, and load whole files in which
+    most values are the present ones. Raises ParameterError, which names the parameter.
+    """
+    changes = []
+    for change in requested:
+        present = node.get_parameter(change.name).value if node.has_parameter(change.name) else None
+        parameter = BY_NAME.get(change.name)
+        if parameter is None or present is None:
+            if present is None or change.value != present:
+                changes.append(change)
+            continue
+        value = check_value(parameter, _given_value(change))
+        if value != check_value(parameter, present):
+            changes.append(_ros_parameter(change.name, value))
+    return changes
 
 
 def describe(parameter: Parameter, reconfigurable: bool = False) -> ParameterDescriptor:
@@ -57,7 +79,8 @@ def describe(parameter: Parameter, reconfigurable: bool = False) -> ParameterDes
     changes = parameter.live or (reconfigurable and parameter.name not in FIXED)
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
-        name=parameter.name, description=parameter.description + unit,
+        name=parameter.name, type=_ros_parameter(parameter.name, parameter.default).type_.value,
+        description=parameter.description + unit,
         additional_constraints=_constraints(parameter), read_only=not changes,
     )
     if isfinite(parameter.low) and isfinite(parameter.high):
@@ -85,7 +108,6 @@ class LiveParameters:
     ) -> None:
         self.parameters = parameters
         self._check, self._apply, self._is_free = check, apply, is_free
-        node.add_pre_set_parameters_callback(_as_declared)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._post_set)
 
@@ -112,16 +134,27 @@ class LiveParameters:
         )
 
 
-def _declared(node: Node) -> dict[str, RosParameter]:
-    # rclpy annotates the values of this dictionary as plain values; they are Parameters.
-    declared: dict[str, Any] = dict(node.get_parameters_by_prefix(''))
-    return declared
+def _given_value(parameter: RosParameter) -> object:
+    """The value that somebody has given; rcl reads an empty list as no value at all."""
+    if parameter.value is not None:
+        return parameter.value
+    declared = BY_NAME.get(parameter.name)
+    if declared is not None and (declared.names or declared.may_be_empty):
+        return ()
+    raise ParameterError(
+        parameter.name, UNTOLD, 'has no value', 'give it one or leave it out'
+    )
 
 
-def _ros_value(value: object) -> object:
+def _declarable(value: Value) -> object:
+    """The value, or one in place of an empty list, whose type rclpy could not tell."""
+    return [0.0] if value == () else list(value) if isinstance(value, tuple) else value
+
+
+def _ros_parameter(name: str, value: Value) -> RosParameter:
     if value == ():
-        return RosParameter.Type.DOUBLE_ARRAY  # declared and not set: ROS has no empty lists
-    return list(value) if isinstance(value, tuple) else value
+        return RosParameter(name, RosParameter.Type.DOUBLE_ARRAY, [])
+    return RosParameter(name, value=_declarable(value))
 
 
 def _constraints(parameter: Parameter) -> str:
@@ -133,23 +166,3 @@ def _constraints(parameter: Parameter) -> str:
     if isfinite(parameter.high):
         rules.append(f'<= {parameter.high:g}')
     return ' and '.join(rules)
-
-
-def _as_declared(changes: list[RosParameter]) -> list[RosParameter]:
-    """Turn what rclpy alone would refuse into the declared type.
-
-    Whole numbers given for a float; true and false given for a word that may be 'true'.
-    """
-    return [
-        RosParameter(change.name, value=_in_type_of(BY_NAME[change.name], change))
-        if change.name in BY_NAME else change
-        for change in changes
-    ]
-
-
-def _in_type_of(parameter: Parameter, change: RosParameter) -> Any:
-    if change.type_ == RosParameter.Type.INTEGER and isinstance(parameter.default, float):
-        return float(change.value)
-    if change.type_ == RosParameter.Type.BOOL and 'true' in parameter.choices:
-        return str(change.value).lower()
-    return change.value

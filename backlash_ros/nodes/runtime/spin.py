@@ -14,12 +14,14 @@ from collections.abc import Callable
 from typing import Any, cast
 
 import rclpy
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.exceptions import InvalidHandle, NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
@@ -28,7 +30,7 @@ from rclpy.utilities import remove_ros_args
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import PARAMETERS, as_yaml
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.nodes.runtime.declare import declare_parameters
+from backlash_ros.nodes.runtime.declare import changed_values, declare_parameters
 from backlash_ros.nodes.runtime.forced_exit import exit_at_the_latest
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, make_executor
 from backlash_ros.nodes.runtime.unused_sections import complaints
@@ -52,12 +54,7 @@ class ProcessNode(Node):
 
         reconfigurable: whether parameters may change while the node is unconfigured.
         """
-        try:
-            super().__init__(executable, automatically_declare_parameters_from_overrides=True)
-        except ValueError:
-            raise ParameterError(
-                executable, None, 'has a parameter without a value', 'give it one or leave it out'
-            ) from None
+        super().__init__(executable)
         self.log = Node.get_logger(self)
         self.settings = declare_parameters(
             self, parameters_of or executable, reconfigurable
@@ -76,6 +73,18 @@ class ProcessNode(Node):
         # rclpy takes such callbacks but does not say so in its types.
         plain = cast(Callable[[Any], None], callback)
         return self.create_subscription(message_type, topic, plain, qos, raw=raw)
+
+    def set_parameters_atomically(
+        self, parameter_list: list[Parameter],
+    ) -> SetParametersResult:
+        """Set what differs from the present values; values equal to these are accepted."""
+        try:
+            changes = changed_values(self, parameter_list)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        if not changes:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(changes)
 
     def work(self, executor: NodeExecutor) -> None:
         """Do what the node is for until `stopping`."""
