@@ -192,11 +192,12 @@ class ControllerNode(ManagedNode):
         assert loop is not None
         self._last_commands.end()
         if loop.last is not None:
+            # Before a ramp: whoever stops this process may not wait for its end.
+            self._save(loop)
             if not loop.standing_down:
                 self._last_commands.send_all(
                     loop, p.get_str('on_stop'), p.get_float('timeout.ramp'), self._diagnose
                 )
-            self._save(loop)
             self._model.publish(loop)
         self._rivals.end()
         self._diagnose()

@@ -15,7 +15,7 @@ from backlash_ros.core.assembly import (
 )
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.last_command import last_commands
-from backlash_ros.core.control.limits import at_rest, plausible
+from backlash_ros.core.control.limits import Motion, at_rest, plausible
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import Interval
 from backlash_ros.core.loop.command_history import CommandHistory
@@ -220,6 +220,8 @@ class ControlLoop:
     def send(self, v: float) -> None:
         """Send a command and note when it left; nothing while another controller commands."""
         if not self.standing_down:
+            if v != self.core.motion.v:  # it is none of the core
+                self.core.motion = Motion(v, v - self.v, v)
             self._put_out(v)
             self.commands.publish(v, self._now_ns())
 

@@ -52,24 +52,31 @@ class LastCommandSender:
     def send_all(
         self, loop: ControlLoop, action: str, longest_s: float, tell: Callable[[], None],
     ) -> None:
-        """Send them now, and hold v where that takes longer than longest_s [s].
+        """Send them now; v comes to rest where that takes longer than longest_s [s].
 
+        So it does at a SIGTERM that comes meanwhile: whoever sends it will kill the process next.
         tell: called at least every second, so that who stands down does not take this node for
         gone.
         """
         told = time.monotonic()
         deadline, step_s = told + longest_s, self._step_s
-        for v in loop.last_commands(action):
+        commands, cut_short = loop.last_commands(action), ''
+        while (v := next(commands, None)) is not None:
             loop.send(v)
-            if v == loop.zero:
+            if v == loop.zero and loop.core.motion.move == 0.0:
                 break
-            if time.monotonic() + step_s > deadline:
-                self._node.log.warning(
-                    f'v={v:.6g} is held: it did not reach zero within timeout.ramp={longest_s:g} s'
-                )
-                break
-            time.sleep(step_s)
+            if not cut_short:
+                if self._node.urged.is_set():
+                    cut_short = 'SIGTERM came before it reached zero'
+                elif time.monotonic() + step_s > deadline:
+                    cut_short = f'it did not reach zero within timeout.ramp={longest_s:g} s'
+                if cut_short:
+                    commands = loop.last_commands('hold')
+                    continue
+            time.sleep(step_s) if cut_short else self._node.urged.wait(step_s)
             if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
                 told = time.monotonic()
                 tell()
+        if cut_short:
+            self._node.log.warning(f'v={loop.v:.6g} is held: {cut_short}')
         self._io.wait_until_received(CONFIRMED_WITHIN_S)

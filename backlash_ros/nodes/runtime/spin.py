@@ -62,6 +62,7 @@ class ProcessNode(Node):
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
         self.stopping = False
         self.signals = 0  # SIGINT and SIGTERM that have come
+        self.urged = threading.Event()  # a SIGTERM has come after the first one of them
         self.exit_code = DONE
         self.stop_request = self.create_guard_condition(self._stop)
 
@@ -184,6 +185,9 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
                 rclpy.try_shutdown()
     finally:
         rclpy.try_shutdown()
+        # The interpreter gives handlers back before it ends, but leaves what is ignored.
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)
     return code
 
 
@@ -204,8 +208,10 @@ class _SignalPipe:
     def stop_at_arrival(self, node: ProcessNode) -> None:
         """Ask the node to stop when a signal arrives or has arrived since the construction."""
         def wait() -> None:
-            while os.read(self._read_end, 1):
+            while number := os.read(self._read_end, 1):
                 node.signals += 1
+                if node.signals > 1 and number[0] == signal.SIGTERM:
+                    node.urged.set()
                 # The node may be ending by itself.
                 with contextlib.suppress(InvalidHandle):
                     # An executor that is busy may overlook a single one.
