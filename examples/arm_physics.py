@@ -123,6 +123,11 @@ class ArmPhysics:
         """Positions of the joints as they are [rad], shape (joints,)."""
         return np.array(self.data.qpos[self._links])
 
+    @property
+    def speeds(self) -> NDArray[np.float64]:
+        """Speeds of the joints [rad/s], shape (joints,)."""
+        return np.array(self.data.qvel[self._links])
+
     def encoders(self) -> list[float]:
         """Positions of the joints as they are measured [rad]."""
         return [rounded(float(one), RESOLUTION) for one in self.links]

@@ -1,0 +1,146 @@
+"""The driver of bus servos beside an emulated bus: messages, silence, a pulled plug, the end."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.txt)')
+pytest.importorskip('dynamixel_sdk', reason='the bus needs dynamixel-sdk (requirements/dev.txt)')
+
+from arm_physics import JOINTS, ArmPhysics
+from places import ROOT
+from ros_processes import ros_world
+from sensor_msgs.msg import JointState
+from servo_bus import CENTRE, GOAL, POSITION, RESOLUTION, TORQUE_ENABLE, EmulatedBus, Port
+from std_msgs.msg import Float64MultiArray
+from waiting import DEADLINE_S
+
+NAMES = [joint.name for joint in JOINTS]
+SPEED, RATE = 2.0, 50.0  # [rad/s], [Hz]
+MOST = math.ceil(SPEED * 2.0 / RATE / RESOLUTION)  # steps at once
+
+
+class WatchedBus(EmulatedBus):
+    """Remembers how far a goal under torque was from the one before and from where the joint was.
+
+    A servo is engaged where it stands, even where that is not where it was told to go.
+    """
+
+    largest = 0
+
+    def _write(self, number: int, parameters: bytes) -> int:
+        servo = self.servos[number]
+        near = [servo.get(POSITION)] + [servo.get(GOAL)] * servo.get(TORQUE_ENABLE)
+        error = super()._write(number, parameters)
+        if servo.get(TORQUE_ENABLE):
+            step = min(abs(servo.get(GOAL) - place) for place in near)
+            self.largest = max(self.largest, step)
+        return error
+
+
+class World:
+    """The driver as a process, a bus behind a link, and a node that speaks with the driver."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.world = stack.enter_context(ros_world(folder))
+        self.bus, self.link, self.log = WatchedBus(ArmPhysics()), folder / 'port', folder / 'log'
+        self.port = Port(self.bus, self.link)
+        stack.callback(lambda: self.port.close())
+        self.probe = self.world.probe()
+        self.heard = self.probe.collect('robot_joint_states', JointState)
+        self.applied = self.probe.collect('applied_joint_commands', JointState)
+        self.array = self.probe.publisher(
+            'forward_command_controller/commands', Float64MultiArray
+        )
+        self.by_name = self.probe.publisher('joint_commands', JointState)
+        ids = [f'{name}={i + 1}' for i, name in enumerate(NAMES)]
+        self.driver = subprocess.Popen(
+            [sys.executable, str(ROOT / 'examples' / 'bus_servo_driver.py'), '--port',
+             str(self.link), '--rate', str(RATE), '--speed', str(SPEED), '--patience', '300',
+             '--joints', *ids],
+            env=self.world.environment, stderr=self.log.open('wb'), stdin=subprocess.DEVNULL,
+        )
+        stack.callback(self.driver.wait)
+        stack.callback(self.driver.kill)
+        self.probe.wait_until(
+            lambda: self.heard and self.applied and self.by_name.get_subscription_count()
+            and self.array.get_subscription_count(), 'the driver',
+        )
+
+    def told(self, positions: list[float]) -> bool:
+        """Command all joints; returns whether all were told to go there, and are there."""
+        self.array.publish(Float64MultiArray(data=positions))
+        lost = max(self.bus.arm.lost_motion(joint) for joint in JOINTS)
+        return (
+            list(self.applied[-1].position) == pytest.approx(positions, abs=RESOLUTION)
+            and list(self.heard[-1].name) == NAMES
+            and list(self.heard[-1].position) == pytest.approx(positions, abs=lost)
+        )
+
+    def stop(self) -> str:
+        """End the driver; returns its log."""
+        self.driver.terminate()
+        assert self.driver.wait(DEADLINE_S) == 0, self.log.read_text()
+        return self.log.read_text()
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Iterator[World]:
+    with ExitStack() as stack:
+        yield World(tmp_path, stack)
+
+
+def test_joints_follow_both_forms_of_command_and_are_limp_at_the_end(arm: World) -> None:
+    assert list(arm.heard[0].name) == NAMES
+    goals = [0.3, -0.2, 0.25, 0.5, -0.4, 0.35]
+    arm.probe.wait_until(lambda: arm.told(goals), 'the arm')
+    assert arm.bus.largest <= MOST
+    # Names in another order, one that is nobody's, one without a position; the others stay.
+    message = JointState(name=['elbow', 'nobody', 'waist', 'shoulder'],
+                         position=[0.1, 1.0, -0.1, math.nan])
+    expected = [-0.1, -0.2, 0.1, 0.5, -0.4, 0.35]
+
+    def went() -> bool:
+        arm.by_name.publish(message)
+        return list(arm.applied[-1].position) == pytest.approx(expected, abs=RESOLUTION)
+
+    arm.probe.wait_until(went, 'the named joints')
+    log = arm.stop()
+    assert [servo.get(TORQUE_ENABLE) for servo in arm.bus.servos.values()] == [0] * 6
+    assert re.search(r'\d+ cycles, \d+ of them lost; torque is off$', log, re.MULTILINE)
+
+
+def test_a_silent_servo_is_named_and_comes_back_while_the_others_go_on(arm: World) -> None:
+    goals = [0.2] * 6
+    arm.probe.wait_until(lambda: arm.told(goals), 'the arm')
+    others = [name for name in NAMES if name != 'shoulder']
+    arm.bus.dead.add(2)
+    arm.probe.wait_until(lambda: arm.heard[-1].name == others, 'messages without the joint')
+    arm.probe.wait_until(lambda: 'shoulder is silent' in arm.log.read_text(), 'a word about it')
+    arm.bus.dead.clear()
+    arm.probe.wait_until(lambda: arm.told([0.1] * 6), 'all joints')
+    assert arm.bus.largest <= MOST
+    arm.stop()
+
+
+def test_a_pulled_plug_is_counted_and_its_return_makes_nothing_jump(arm: World) -> None:
+    arm.probe.wait_until(lambda: arm.told([0.3] * 6), 'the arm')
+    arm.port.close()
+    arm.probe.wait_until(lambda: 'waist is silent' in arm.log.read_text(), 'a word about it')
+    arm.port = Port(arm.bus, arm.link)
+    arm.probe.wait_until(lambda: arm.told([-0.3] * 6), 'all joints')
+    assert arm.bus.largest <= MOST
+    found = re.search(r'(\d+) cycles, (\d+) of them lost', arm.stop())
+    assert found
+    assert 0 < int(found[2]) < int(found[1])
+    assert {servo.get(GOAL) for servo in arm.bus.servos.values()} == {
+        CENTRE + round(-0.3 / RESOLUTION)
+    }

@@ -1,0 +1,152 @@
+"""The emulated bus: byte for byte what the protocol's description prints, and what its SDK asks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.txt)')
+pytest.importorskip('dynamixel_sdk', reason='the bus needs dynamixel-sdk (requirements/dev.txt)')
+
+from arm_physics import ArmPhysics
+from dynamixel_bus import PatientPort
+from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PacketHandler
+from servo_bus import (
+    CENTRE,
+    GOAL,
+    MODEL,
+    POSITION,
+    RESOLUTION,
+    TORQUE_ENABLE,
+    WATCHDOG,
+    EmulatedBus,
+    Port,
+    packet,
+)
+from waiting import DEADLINE_S
+
+
+class Clock:
+    """Time that passes when a test says so."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def bus(clock: Clock) -> EmulatedBus:
+    return EmulatedBus(ArmPhysics(), clock)
+
+
+@pytest.mark.parametrize(('asked', 'answered'), [
+    # Of https://emanual.robotis.com/docs/en/dxl/protocol2/: Ping, Read, Write, Sync Read.
+    ('FF FF FD 00 01 03 00 01 19 4E', 'FF FF FD 00 01 07 00 55 00 06 04 26 65 5D'),
+    ('FF FF FD 00 01 07 00 02 84 00 04 00 1D 15', 'FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0'),
+    ('FF FF FD 00 01 09 00 03 74 00 00 02 00 00 CA 89', 'FF FF FD 00 01 04 00 55 00 A1 0C'),
+    ('FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA',
+     'FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0'
+     'FF FF FD 00 02 08 00 55 00 1F 08 00 00 BA BE'),
+])
+def test_the_printed_packets_are_answered_byte_for_byte(
+    bus: EmulatedBus, monkeypatch: pytest.MonkeyPatch, asked: str, answered: str,
+) -> None:
+    monkeypatch.setattr('servo_bus.MODEL', 0x0406)
+    monkeypatch.setattr('servo_bus.FIRMWARE', 0x26)
+    monkeypatch.setattr(bus, '_measure', lambda: None)
+    for servo, position in ((1, 0xA6), (2, 0x81F)):
+        bus.servos[servo].put(POSITION, position)
+    whole = bytes.fromhex(asked)
+    assert bus.answer(whole[:5]) == b''
+    assert bus.answer(whole[5:]) == bytes.fromhex(answered)
+
+
+def test_the_printed_sync_write_sets_both_goals(bus: EmulatedBus) -> None:
+    written = 'FF FF FD 00 FE 11 00 83 74 00 04 00 01 96 00 00 00 02 AA 00 00 00 82 87'
+    assert bus.answer(b'\x00\xff\xff' + bytes.fromhex(written)) == b''
+    assert [bus.servos[one].get(GOAL) for one in (1, 2)] == [150, 170]
+
+
+@pytest.mark.parametrize(('address', 'data', 'torque', 'error'), [
+    (GOAL, (4096).to_bytes(4, 'little'), 1, 0x04), (POSITION, b'\0\0\0\0', 0, 0x07),
+    (7, b'\x09', 1, 0x07), (GOAL, b'\0', 0, 0x07), (TORQUE_ENABLE, b'\2', 0, 0x04),
+])
+def test_what_may_not_be_written_is_refused(
+    bus: EmulatedBus, address: int, data: bytes, torque: int, error: int,
+) -> None:
+    bus.answer(packet(1, 3, bytes((TORQUE_ENABLE, 0, torque))))
+    before = bytes(bus.servos[1].table)
+    status = bus.answer(packet(1, 3, address.to_bytes(2, 'little') + data))
+    assert status == packet(1, 0x55, bytes((error,)))
+    assert bytes(bus.servos[1].table) == before
+
+
+def test_a_header_within_a_packet_is_stuffed_and_a_wrong_byte_noticed(bus: EmulatedBus) -> None:
+    asked = packet(1, 3, bytes((GOAL, 0)) + b'\xff\xff\xfd\x00')
+    assert b'\xff\xff\xfd\xfd' in asked
+    assert bus.answer(asked) == packet(1, 0x55, b'\x04')  # out of range, thus understood
+    assert bus.answer(asked[:-1] + bytes((asked[-1] ^ 1,))) == packet(1, 0x55, b'\x03')
+
+
+def test_the_watchdog_stops_servos_that_nobody_speaks_to(bus: EmulatedBus, clock: Clock) -> None:
+    for address, value in ((TORQUE_ENABLE, 1), (WATCHDOG, 10)):
+        bus.answer(packet(1, 3, bytes((address, 0, value))))
+    goal = bytes((GOAL, 0)) + (CENTRE + 400).to_bytes(4, 'little')
+    bus.answer(packet(1, 3, goal))
+    clock.now += 0.15
+    bus.answer(packet(2, 1, b''))
+    assert bus.servos[1].get(WATCHDOG) == 10
+    clock.now += 0.25
+    assert bus.answer(packet(1, 3, goal)) == packet(1, 0x55, b'\x04')
+    assert bus.servos[1].table[WATCHDOG] == 255
+    assert CENTRE < bus.servos[1].get(GOAL) == bus.servos[1].get(POSITION)
+    bus.answer(packet(1, 3, bytes((WATCHDOG, 0, 0))))
+    assert bus.answer(packet(1, 3, goal)) == packet(1, 0x55, b'\x00')
+
+
+@pytest.fixture
+def port(bus: EmulatedBus, tmp_path: Path) -> Iterator[PatientPort]:
+    line = Port(bus, tmp_path / 'bus')
+    handler = PatientPort(str(tmp_path / 'bus'), 1_000_000, patience_s=DEADLINE_S)
+    yield handler
+    handler.closePort()
+    line.close()
+
+
+def test_the_sdk_moves_the_arm_through_the_terminal(
+    bus: EmulatedBus, clock: Clock, port: PatientPort,
+) -> None:
+    packets, ids = PacketHandler(2.0), list(bus.servos)
+    assert packets.ping(port, 3)[:2] == (MODEL, COMM_SUCCESS)
+    goals = [CENTRE + 20 * one for one in ids]
+    writer = GroupSyncWrite(port, packets, GOAL, 4)
+    reader = GroupSyncRead(port, packets, POSITION, 4)
+    for one, goal in zip(ids, goals, strict=True):
+        assert packets.write1ByteTxRx(port, one, TORQUE_ENABLE, 1) == (COMM_SUCCESS, 0)
+        assert writer.addParam(one, goal.to_bytes(4, 'little'))
+        assert reader.addParam(one)
+    assert writer.txPacket() == COMM_SUCCESS
+    for _ in range(8):
+        assert reader.txRxPacket() == COMM_SUCCESS
+        clock.now += 0.25
+    assert reader.txRxPacket() == COMM_SUCCESS
+    reached = [reader.getData(one, POSITION, 4) for one in ids]
+    lost = [bus.arm.lost_motion(joint) / RESOLUTION for joint in bus.arm.joints]
+    assert reached == pytest.approx(goals, abs=max(lost))
+    assert reached != [CENTRE] * len(ids)
+
+
+def test_a_silent_servo_silences_those_that_wait_for_it(bus: EmulatedBus) -> None:
+    bus.dead.add(3)
+    asked = packet(0xFE, 0x82, bytes((POSITION, 0, 4, 0, 5, 1, 3, 2)))
+    status = b'\0' + CENTRE.to_bytes(4, 'little')
+    assert bus.answer(asked) == packet(5, 0x55, status) + packet(1, 0x55, status)
