@@ -86,7 +86,7 @@ class BusServoDriver(Node):
         except UNPLUGGED:
             self._bus.lose()
         self.lost += self.cycles - before - (len(readings) == len(self._joints))
-        self._tell(readings)
+        self._tell()
 
     def _move(self) -> None:
         """Go on to what is wanted, no faster than allowed."""
@@ -109,12 +109,12 @@ class BusServoDriver(Node):
             self._applied.publish(JointState(header=states.header, name=names, position=goals))
             self._states.publish(states)
 
-    def _tell(self, readings: dict[int, tuple[float, float]]) -> None:
-        """Log which joints are missing, once."""
+    def _tell(self) -> None:
+        """Log which servos are not engaged, once."""
         said = ', '.join(
-            f'{name} is silent' if servo not in readings else f'{name} has switched itself off'
+            f'{name} is silent' if servo not in self._bus.goals else f'{name} has switched off'
             for name, servo in self._joints.items()
-            if servo not in readings or servo in self._bus.alerts
+            if servo not in self._bus.goals or servo in self._bus.alerts
         )
         if said != self._said:
             self._said = said
