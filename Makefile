@@ -26,13 +26,14 @@ KEEP := $(if $(filter file,$(origin PYTHON)),--keep-python)
 CHECK_TYPES := $(if $(ROS_DISTRO),echo 'lint: types are not checked with the libraries of a sourced ROS 2',$(RUN) -m mypy)
 NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 10))
 
-.PHONY: help demo test bench lint docs clean run-environment dev-environment
+.PHONY: help demo test bench accuracy lint docs clean run-environment dev-environment
 .NOTPARALLEL:
 
 help:
 	@echo 'make demo    run the example for 10 s on real ROS 2 processes and write a report to results/latest'
 	@echo 'make test    run ruff, mypy and all tests'
 	@echo 'make bench   measure the controller step, the loop latency and the simulation speed'
+	@echo 'make accuracy measure how right, honest and quick it is, against a reference: 20 min'
 	@echo 'make lint    run ruff and mypy only'
 	@echo 'make docs    regenerate the figures of the documents'
 	@echo 'make clean   remove everything that make created, except results/'
@@ -46,6 +47,9 @@ test: lint
 
 bench: dev-environment
 	@$(RUN) benchmarks/run.py $(ARGS)
+
+accuracy: dev-environment
+	@$(RUN) benchmarks/accuracy.py $(ARGS)
 
 lint: dev-environment
 	@$(RUN) -m ruff check --quiet .

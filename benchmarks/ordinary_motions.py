@@ -28,6 +28,8 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
 import yaml
+from contract.figures import Figure, figure, rms, share, upper
+from contract.judged import FAR, Judged, judged
 from numpy.typing import NDArray
 from reporting import ROOT, parallel, text_table
 from scipy.signal import cont2discrete
@@ -41,8 +43,9 @@ CORNER, DAMPING = 2.0 * pi * 20.0, 0.5  # of the load in config/geared_motor.yam
 AMPLITUDE = 0.5  # of y_m [rad]
 FIVE_PERIODS = 10  # reversals
 IN_TIME = 6  # reversals within which *tracking* is due
-CLOSE, FAR, BEYOND = 0.005, 0.01, 5.0  # error in gaps; in gaps; in published deviations
+CLOSE = 0.005  # error at five periods [gap]
 LEAST_S = 12.0  # of a periodic motion
+FIRST_SEED = 3
 
 PLANTS: dict[str, dict[str, object]] = {
     'exact': {}, 'G known': {'plant.uncertainty': 0.0},
@@ -149,8 +152,9 @@ class Result:
     of error; first: until the first *tracking*; None for never. first_s: the time of that [s].
     at_five: error at five periods (ten reversals, or the end), in gaps; std_five: its published
     deviation in gaps, None without one. Of the *tracking* samples, None without any: rms: RMS of
-    error over deviation; beyond: share with more than five deviations; wrong: share with these and
-    more than 1 % of the gap. shares: of every status. ms: processor time per sample.
+    error over deviation, no larger than ten; beyond: share with more than five deviations; wrong:
+    share with these and more than 1 % of the gap. shares: of every status. ms: processor time per
+    sample.
     """
 
     motion: str
@@ -189,10 +193,8 @@ def all_cases(seeds: Sequence[int]) -> Iterator[Case]:
                 yield from (Case(motion, plant, rate, seed) for seed in seeds)
 
 
-@lru_cache
-def motor() -> dict[str, Any]:
-    """Parameters of config/geared_motor.yaml and its simulated plant, by their flat names."""
-    sections = yaml.safe_load((ROOT / 'config' / 'geared_motor.yaml').read_text())
+def flat(sections: Mapping[str, Any]) -> dict[str, Any]:
+    """Parameters of all sections of a parameter file, by their flat names."""
     found: dict[str, Any] = {}
 
     def flatten(values: Mapping[str, Any], prefix: str) -> None:
@@ -205,6 +207,12 @@ def motor() -> dict[str, Any]:
     for section in sections.values():
         flatten(section['ros__parameters'], '')
     return found
+
+
+@lru_cache
+def motor() -> dict[str, Any]:
+    """Parameters of config/geared_motor.yaml and its simulated plant."""
+    return flat(yaml.safe_load((ROOT / 'config' / 'geared_motor.yaml').read_text()))
 
 
 def random_backlash(seed: int) -> dict[str, float]:
@@ -245,45 +253,31 @@ def run_case(case: Case) -> Result:
                       f'broke off: {error}')
     ms = 1e3 * (time.process_time() - began) / len(y_m)
     # A constant that is added to u moves both crossings.
-    shift = p.get_float('input_disturbance') / backlash['backlash.m']
-    error, std = (
-        np.column_stack(columns) for columns in (
-            [run.column(name) - (backlash[f'backlash.{name}'] - shift) for name in ('c_r', 'c_l')],
-            [run.column(f'std_{name}') for name in ('c_r', 'c_l')],
-        )
-    )
-    return _result(case, y_m, np.abs(error) / gap, std / gap, run.column('status'), ms)
+    found = judged(run, p.get_float('input_disturbance') / backlash['backlash.m'])
+    return _result(case, y_m, found, ms)
 
 
 def _key(case: Case) -> tuple[str, str, float, int]:
     return case.motion, case.plant, case.rate, case.seed
 
 
-def _result(
-    case: Case, y_m: Array, error: Array, std: Array, status: Array, ms: float,
-) -> Result:
-    reversals = reversals_of(y_m)
-    tracking = status == Status.TRACKING
-    worse, z = error.max(axis=1), error / std
-    close = tracking & (worse <= FAR)
+def _result(case: Case, y_m: Array, run: Judged, ms: float) -> Result:
+    reversals, tracking, omega = reversals_of(y_m), run.tracking, _omega(case.motion)
     five = int(np.argmax(reversals >= FIVE_PERIODS)) or len(y_m) - 1
-    five = min(round(5 * 2 * pi * case.rate / _omega(case.motion)), five) \
-        if _omega(case.motion) else five
-    side = int(np.argmax(error[five]))
-    beyond = ~(z.max(axis=1) <= BEYOND)[tracking]
+    if omega:
+        five = min(round(5 * 2 * pi * case.rate / omega), len(y_m) - 1)
+    std = float(run.std[five].max())
 
     def first(rows: NDArray[np.bool_]) -> int | None:
         return int(np.argmax(rows)) if rows.any() else None
 
-    learned, begun = first(close), first(tracking)
+    learned, begun = first(tracking & (run.error <= FAR)), first(tracking)
     return Result(
         *_key(case), None if learned is None else int(reversals[learned]),
         None if begun is None else int(reversals[begun]),
-        None if begun is None else begun / case.rate, float(worse[five]),
-        float(std[five, side]) if np.isfinite(std[five, side]) else None,
-        *((float(np.sqrt(np.mean(z[tracking]**2))), float(beyond.mean()),
-           float((beyond & (worse[tracking] > FAR)).mean())) if tracking.any() else (None,) * 3),
-        {word.word: float(np.mean(status == word)) for word in Status}, ms,
+        None if begun is None else begun / case.rate, float(run.error[five]),
+        std if np.isfinite(std) else None, run.rms, run.beyond, run.wrong_if_tracking,
+        {word.word: float(np.mean(run.status == word)) for word in Status}, ms,
     )
 
 
@@ -300,6 +294,43 @@ def reversals_of(y_m: Array) -> NDArray[np.int_]:
     turned = np.zeros(len(y_m), dtype=int)
     turned[moving[1:]] = moves[moving[1:]] != moves[moving[:-1]]
     return np.asarray(np.cumsum(turned))
+
+
+def contract_cases(scale: float) -> list[Case]:
+    """All cases, once at scale 1."""
+    return list(all_cases(range(FIRST_SEED, FIRST_SEED + max(round(scale), 1))))
+
+
+# Motions that are alike; a row of figures for each at 200 Hz, and one for the other rates.
+ALIKE = {
+    'slow waves': r'sine|triangle', 'squares': r'square', 'moves': r'^moves|^slow|^fast',
+    'small moves': r'^small', 'one-way moves': r'^one-way',
+}
+OTHER_RATES = 'other rates'
+
+
+def contract_figures(results: Sequence[Result]) -> dict[str, Figure]:
+    """Figures of motions that are alike, and of every plant."""
+    found: dict[str, list[Result]] = {}
+    for result in results:
+        kind = next(name for name, words in ALIKE.items() if re.search(words, result.motion))
+        found.setdefault(kind if result.rate == RATES[0] else OTHER_RATES, []).append(result)
+        if result.rate == RATES[0]:
+            found.setdefault(result.plant, []).append(result)
+    return {
+        f'{name}: {what}': one for name, of in found.items() for what, one in {
+            'as due': share([r.good for r in of], 'more'),
+            'learned': share([r.learned is not None for r in of], 'more'),
+            'reversals until learned, median': figure([r.learned for r in of]),
+            'error at five periods, median [gap]': figure([r.at_five for r in of]),
+            'error at five periods, 90 % [gap]': figure([r.at_five for r in of], upper),
+            'tracking': share([r.shares.get('tracking', 0.0) for r in of], 'more'),
+            'inconsistent': share([r.shares.get('inconsistent', 1.0) for r in of]),
+            'error / deviation, RMS': figure([r.rms for r in of], rms, 'one'),
+            'beyond five deviations': share([r.beyond for r in of]),
+            'wrong while tracking': share([r.wrong for r in of]),
+        }.items()
+    }
 
 
 HEADER = ('case', 'good', 'learned', 'reversals', 'error at 5 [% gap]', 'worst',
@@ -333,7 +364,7 @@ def main() -> int:
     parser.add_argument('--cases', nargs='+', default=[], metavar='REGEX',
                         help='cases in whose name each of these is found')
     parser.add_argument('--seeds', type=int, default=1)
-    parser.add_argument('--first-seed', type=int, default=3)
+    parser.add_argument('--first-seed', type=int, default=FIRST_SEED)
     parser.add_argument('--workers', type=int, default=1, help='processes, default 1')
     parser.add_argument('--by', choices=('case', 'motion', 'plant'), default='case',
                         help='what a row of the table is')

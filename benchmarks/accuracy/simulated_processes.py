@@ -2,7 +2,7 @@
 
 What a busy machine does to real processes, the same for the same seed and as often as wanted:
 either of the two waits for the processor before it goes on, so that outputs are late or skipped,
-commands come after the sample that they were for, and fits get little time.
+commands come after the sample that they were for.
 """
 
 from __future__ import annotations
@@ -21,9 +21,7 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 import simulated_motor
 
 from backlash_ros.core.assembly import build_reference
-from backlash_ros.core.control.controller import REFINE_SHARE
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.moving_horizon import moving_horizon
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
@@ -35,7 +33,6 @@ SHORT_WAIT_S = 2e-4
 TRANSPORT_S = (5e-5, 2e-4)  # shortest and longest time that a message is under way
 CALL_S = 3e-5  # to read or to publish
 ANSWER_S, NOTE_S = 3e-4, 1.2e-3  # from y to v, and for what is done about the sample after that
-PIECE_S = 4e-4  # of a fit
 
 
 class Heard(NamedTuple):
@@ -52,7 +49,7 @@ class HeldUpProcesses:
         self.period = p.get_float('sample_period')
         self._load, self._random = load, Random(seed)
         self._reports: deque[tuple[float, int]] | None = deque() if reports else None
-        self._now = self._pieces = 0.0
+        self._now = 0.0
         self._sent = 0.0  # the newest command
         self.loop = ControlLoop(
             p, self._send, lambda: _ns(self._now), None, SampleCounter(self.period, False),
@@ -70,8 +67,7 @@ class HeldUpProcesses:
     def run(self, seconds: float) -> list[Heard]:
         """Go on for so long and tell of every answer."""
         heard = []
-        with patch.multiple(moving_horizon, perf_counter=self._piece, thread_time=self._piece), \
-                patch.object(simulated_motor, 'time', self):
+        with patch.object(simulated_motor, 'time', self):
             motor = simulated_motor.SimulatedMotor(self.period)
             while min(self._driver_at, self._controller_at) < seconds:
                 if self._driver_at <= self._controller_at:
@@ -86,11 +82,6 @@ class HeldUpProcesses:
     def monotonic(self) -> float:
         """Simulated time [s]: the clock of the motor."""
         return self._now
-
-    def _piece(self) -> float:
-        """Time for fits: both clocks are asked after each piece."""
-        self._pieces += 0.5 * PIECE_S
-        return self._pieces
 
     def _wait(self) -> float:
         turn = self._random.random()
@@ -135,7 +126,7 @@ class HeldUpProcesses:
         self.loop.note()
         behind = bool(self._outputs) and self._outputs[0][2] < self._now - self.period
         if step is not None and not behind:
-            self.loop.core.refine(REFINE_SHARE * self.period)
+            self.loop.core.refine()
             self._now += NOTE_S
         self._free = self._now
         self._controller_at = max(self._now, self._outputs[0][2]) + self._wait() \

@@ -1,0 +1,178 @@
+"""Measure how right, honest and quick the package is, and compare with a reference: the contract.
+
+    make accuracy                              every row, against benchmarks/reference_accuracy.json
+    make accuracy ARGS='--only bound faults'   some rows
+    make accuracy ARGS='--scale 5'             five times as many runs, for smaller scatter
+    make accuracy ARGS='--reference'           what was measured becomes the reference
+
+Every row is a fixed set of seeded runs, and its figures have the scatter that other seeds would
+show. What is worse than in the reference by more than three standard deviations ends it with 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+# Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+import ordinary_motions
+from contract import learning_rows, situation_rows, timing_rows
+from contract.figures import COMPARED_HEADER, Row, as_json, compare, from_json, show
+from reporting import ROOT, machine, text_table
+from tqdm import tqdm
+
+REFERENCE = ROOT / 'benchmarks' / 'reference_accuracy.json'
+RESULT = ROOT / 'results' / 'accuracy.json'
+WORKERS, NICENESS = 2, 5
+
+
+@dataclass(frozen=True)
+class Measured:
+    """How a row is measured: its jobs for a scale, what each does, the figures of all results.
+
+    alone: in this process, with nothing beside it, because it is about time.
+    """
+
+    jobs: Callable[[float], Sequence[Any]]
+    run: Callable[[Any], Any]
+    figures: Callable[[Sequence[Any]], Row]
+    alone: bool = False
+
+
+ROWS: dict[str, Measured] = {
+    'step': Measured(
+        timing_rows.step_jobs, timing_rows.run_step, timing_rows.times_figures, alone=True),
+    'latency': Measured(
+        timing_rows.latency_jobs, timing_rows.run_latency, timing_rows.times_figures, alone=True),
+    'simulate': Measured(
+        timing_rows.simulate_jobs, timing_rows.run_simulate, timing_rows.times_figures,
+        alone=True),
+    'bound': Measured(
+        learning_rows.bound_jobs, learning_rows.run_job, learning_rows.bound_figures),
+    'losses': Measured(
+        learning_rows.losses_jobs, learning_rows.run_job, learning_rows.bound_figures),
+    'random': Measured(
+        learning_rows.random_jobs, learning_rows.run_random, learning_rows.random_figures),
+    'plants, open loop': Measured(
+        partial(learning_rows.plants_jobs, 'proportional'), learning_rows.run_job,
+        learning_rows.plants_figures),
+    'plants, closed loop': Measured(
+        partial(learning_rows.plants_jobs, 'tracking'), learning_rows.run_job,
+        learning_rows.plants_figures),
+    'changes': Measured(
+        learning_rows.changes_jobs, learning_rows.run_job, learning_rows.changes_figures),
+    'late': Measured(
+        situation_rows.late_jobs, situation_rows.run_late, situation_rows.late_figures),
+    'faults': Measured(
+        situation_rows.faults_jobs, situation_rows.play, situation_rows.faults_figures),
+    'identification': Measured(
+        situation_rows.identification_jobs, situation_rows.run_identification,
+        situation_rows.identification_figures),
+    'gears': Measured(
+        situation_rows.gears_jobs, situation_rows.run_gear, situation_rows.gears_figures),
+    'ordinary motions': Measured(
+        ordinary_motions.contract_cases, ordinary_motions.run_case,
+        ordinary_motions.contract_figures),
+}
+
+
+def measure(name: str, scale: float, workers: int) -> Row:
+    """The figures of a row."""
+    row = ROWS[name]
+    jobs = row.jobs(scale)
+    progress = partial(tqdm, desc=name, total=len(jobs), unit='run', disable=None)
+    if row.alone:
+        return row.figures([row.run(job) for job in progress(jobs)])
+    # spawn: a fork of a process that has used DDS is none.
+    with get_context('spawn').Pool(workers, _prepare) as pool:
+        return row.figures(list(progress(pool.imap(row.run, jobs, chunksize=1))))
+
+
+def _prepare() -> None:
+    os.nice(NICENESS)
+    warnings.simplefilter('ignore')
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Options of the command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--only', nargs='+', metavar='ROW', default=list(ROWS),
+                        help=f'of: {"; ".join(ROWS)}')
+    parser.add_argument('--scale', type=float, default=1.0,
+                        help='times as many runs as in the reference')
+    parser.add_argument('--workers', type=int, default=WORKERS, metavar='N',
+                        help=f'processes beside each other, default {WORKERS}')
+    parser.add_argument('--out', type=Path, default=RESULT,
+                        help='rows that it holds and that are not measured now stay in it')
+    parser.add_argument('--reference', action='store_true',
+                        help=f'write these rows into {REFERENCE.relative_to(ROOT)}')
+    parser.add_argument('--compare', type=Path, default=REFERENCE, metavar='FILE',
+                        help='another reference')
+    arguments = parser.parse_args()
+    for name in arguments.only:
+        if name not in ROWS:
+            parser.error(f'--only {name!r} must be of: {"; ".join(ROWS)}')
+    if not (arguments.scale > 0.0 and arguments.workers > 0):
+        parser.error('--scale and --workers must be > 0')
+    return arguments
+
+
+def read_rows(path: Path) -> dict[str, Row]:
+    """Rows of a file of results; none where there is no file."""
+    return from_json(json.loads(path.read_text())['rows']) if path.exists() else {}
+
+
+def write_rows(path: Path, rows: dict[str, Row]) -> None:
+    """Add rows to a file of results."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kept = {**read_rows(path), **rows}
+    ordered = {name: kept[name] for name in ROWS if name in kept}
+    path.write_text(json.dumps({'machine': machine(), 'rows': as_json(ordered)}, indent=1) + '\n')
+
+
+def main() -> int:
+    """Return 0 if nothing is worse than the reference, else 1."""
+    arguments = parse_arguments()
+    before = read_rows(arguments.compare)
+    rows: dict[str, Row] = {}
+    for name in ROWS:
+        if name not in arguments.only:
+            continue
+        begun = time.monotonic()
+        rows[name] = row = measure(name, arguments.scale, arguments.workers)
+        # Shown, and kept, as soon as it is known: all of them take minutes.
+        print(f'\n{name} ({time.monotonic() - begun:.0f} s)')
+        known = before.get(name, {})
+        print(text_table(('figure', 'now', 'reference'), [
+            [what, show(one), show(known[what]) if what in known else '–']
+            for what, one in row.items()
+        ]), flush=True)
+        write_rows(arguments.out, {name: row})
+    worse, better = compare(rows, before)
+    for what, found in (('better', better), ('worse', worse)):
+        print(f'\n{what} than the reference: {len(found) or "nothing"}')
+        if found:
+            print(text_table(COMPARED_HEADER, found))
+    if arguments.reference:
+        write_rows(REFERENCE, rows)
+        print(f'wrote {REFERENCE.relative_to(ROOT)}')
+        return 0
+    return 1 if worse else 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,142 @@
+"""Figures with their scatter, and what is worse or better than in a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Better = Literal['less', 'more', 'one']  # one: the nearer to 1 on a logarithmic scale
+
+RESAMPLED, SEED = 400, 1
+BEYOND = 3.0  # standard deviations of a difference that count
+LEAST_SCATTER = 0.02  # relative: a smaller difference is none, however alike the runs are
+FEWEST = 3  # runs that show a scatter
+LARGEST = 1e3  # stands for a value that is not finite, or larger
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number. scatter: its standard deviation. runs: that it is made of."""
+
+    value: float
+    scatter: float
+    runs: int
+    better: Better = 'less'
+
+    @property
+    def badness(self) -> float:
+        """Less is better."""
+        if self.better == 'one':
+            return abs(float(np.log(max(self.value, 1e-9))))
+        return self.value if self.better == 'less' else -self.value
+
+    @property
+    def badness_scatter(self) -> float:
+        """Standard deviation of that."""
+        return self.scatter / max(self.value, 1e-9) if self.better == 'one' else self.scatter
+
+    def beyond(self, reference: Figure) -> float:
+        """By how many standard deviations it is worse, negative where it is better."""
+        scatter = sqrt(self.badness_scatter**2 + reference.badness_scatter**2)
+        difference = self.badness - reference.badness
+        return difference / max(scatter, 1e-12) if difference else 0.0
+
+
+def rms(values: Array) -> float:
+    """Root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def figure(
+    values: Sequence[float | None], how: Callable[[Array], Any] = np.median,
+    better: Better = 'less', least_scatter: float = LEAST_SCATTER,
+) -> Figure:
+    """What `how` makes of one value for each run, and how that scatters over other runs.
+
+    None where a run has no such value.
+    """
+    known = np.array([value for value in values if value is not None], dtype=float)
+    known = np.clip(np.nan_to_num(known, nan=LARGEST, posinf=LARGEST), None, LARGEST)
+    if not known.size:
+        return Figure(LARGEST if better != 'more' else 0.0, 0.0, 0, better)
+    rng = np.random.default_rng(SEED)
+    draws = rng.integers(known.size, size=(RESAMPLED, known.size))
+    scatter = float(np.std([how(known[draw]) for draw in draws]))
+    value = float(how(known))
+    if known.size < FEWEST:
+        scatter = abs(value)
+    return Figure(value, max(scatter, least_scatter * abs(value)), known.size, better)
+
+
+def share(values: Sequence[float | bool | None], better: Better = 'less') -> Figure:
+    """Mean of shares, of which none or all in a few runs is no certainty."""
+    plain = figure(
+        [None if value is None else float(value) for value in values], np.mean, better)
+    if not plain.runs:
+        return plain
+    p = (plain.value * plain.runs + 1.0) / (plain.runs + 2.0)
+    return Figure(plain.value, max(plain.scatter, sqrt(p * (1.0 - p) / plain.runs)), plain.runs,
+                  better)
+
+
+def upper(values: Array) -> float:
+    """The value that nine of ten runs stay below."""
+    return float(np.quantile(values, 0.9))
+
+
+Row = Mapping[str, Figure]
+
+
+def as_json(rows: Mapping[str, Row]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Rounded, for a file."""
+    return {
+        name: {
+            what: {'value': float(f'{one.value:.5g}'), 'scatter': float(f'{one.scatter:.3g}'),
+                   'runs': one.runs, 'better': one.better}
+            for what, one in row.items()
+        } for name, row in rows.items()
+    }
+
+
+def from_json(rows: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> dict[str, Row]:
+    """What stands in a file."""
+    return {
+        name: {what: Figure(**values) for what, values in row.items()}
+        for name, row in rows.items()
+    }
+
+
+COMPARED_HEADER = ('row', 'figure', 'reference', 'now', 'deviations')
+
+
+def compare(
+    rows: Mapping[str, Row], reference: Mapping[str, Row],
+) -> tuple[list[list[str]], list[list[str]]]:
+    """Cells of what is worse, and of what is better, than in the reference, beyond the scatter.
+
+    A figure that the reference has and a row does not is worse.
+    """
+    worse: list[list[str]] = []
+    better: list[list[str]] = []
+    for name, row in rows.items():
+        for what, before in reference.get(name, {}).items():
+            now = row.get(what)
+            if now is None or (before.runs and not now.runs):
+                worse.append([name, what, show(before), 'not there', '–'])
+                continue
+            by = now.beyond(before)
+            if abs(by) > BEYOND:
+                found = worse if by > 0.0 else better
+                found.append([name, what, show(before), show(now), f'{abs(by):.1f}'])
+    return worse, better
+
+
+def show(one: Figure) -> str:
+    """A figure and its scatter as text."""
+    return f'{one.value:.4g} ± {one.scatter:.2g}' if one.runs else '–'

@@ -1,0 +1,309 @@
+"""Rows of what is more than a loop: late commands, faults, identification, gears of physics."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from accuracy.identification_cases import random_case
+from accuracy.motor_crossings import crossing_error
+from accuracy.simulated_processes import HeldUpProcesses
+from faults import Result, play
+from gears.gear_map import gear_of
+from gears.gear_runs import (
+    PRESETS,
+    Gear,
+    close_loop,
+    lost_motion,
+    quasi_static,
+    record,
+    uncompensated,
+)
+from numpy.typing import NDArray
+from ordinary_motions import flat, motor
+
+from backlash_ros.core import Estimate, Parameters, Status, build_controller, fit_record
+from backlash_ros.tools.identify.command import main as identify
+from contract.figures import Figure, figure, share, upper
+
+Array = NDArray[np.float64]
+
+
+# Late commands: driver and controller held up by a busy machine, in simulated time.
+
+HELD_UP_S = 6.0
+
+
+class HeldUp(NamedTuple):
+    """One run of held-up processes; errors of c_r or c_l, relative, the larger one."""
+
+    group: str
+    at_end: float
+    settled_s: float
+    wrong: float
+
+
+def late_jobs(scale: float) -> list[tuple[float, str, int]]:
+    """Load, use of applied_control, seed."""
+    return [(load, use, seed) for load in (0.4, 1.0) for use in ('auto', 'false')
+            for seed in range(1, 1 + max(round(10 * scale), 1))]
+
+
+def run_late(job: tuple[float, str, int]) -> HeldUp:
+    """One seed."""
+    load, use, seed = job
+    p = Parameters({**motor(), 'estimator.use_applied_control': use})
+    heard = HeldUpProcesses(p, load, seed, reports=use != 'false').run(HELD_UP_S)
+    errors = [crossing_error(e.c_r, e.c_l, e.std_c_r, e.std_c_l) for _, e in heard]
+    settled = max((time_s for (time_s, _), error in zip(heard, errors, strict=True)
+                   if not error.relative <= 0.01), default=0.0)
+    wrong = [e.status is Status.TRACKING and error.deviations > 5.0 and error.relative > 0.01
+             for (_, e), error in zip(heard, errors, strict=True)]
+    return HeldUp(f'load {load:g}, reports {use}', errors[-1].relative, settled,
+                  float(np.mean(wrong)))
+
+
+def late_figures(runs: Sequence[HeldUp]) -> dict[str, Figure]:
+    """Figures of each group."""
+    found: dict[str, Figure] = {}
+    for name in dict.fromkeys(run.group for run in runs):
+        of = [run for run in runs if run.group == name]
+        found |= {
+            f'{name}: error at {HELD_UP_S:g} s, median': figure([r.at_end for r in of]),
+            f'{name}: error at {HELD_UP_S:g} s, 90 %': figure([r.at_end for r in of], upper),
+            f'{name}: seconds until within 1 %, median': figure([r.settled_s for r in of]),
+            f'{name}: wrong while tracking': share([r.wrong for r in of]),
+        }
+    return found
+
+
+# Sequences of faults.
+
+HURT = ('outside', 'too_fast', 'jumps', 'unbounded', 'broken')
+FIRST_SEQUENCE = 101
+
+
+def faults_jobs(scale: float) -> list[int]:
+    """Seeds of benchmarks/faults.py."""
+    return list(range(FIRST_SEQUENCE, FIRST_SEQUENCE + round(200 * scale)))
+
+
+def faults_figures(results: Sequence[Result]) -> dict[str, Figure]:
+    """Sequences that hurt, and of those in which a law claimed to know the ones that lied."""
+    claimed = [r for r in results if r.claimed]
+    return {
+        **{kind: share([kind in r.found for r in results]) for kind in HURT},
+        'said tracking': share([r.claimed for r in results], 'more'),
+        **{f'{kind}, of those that said tracking': share([kind in r.found for r in claimed])
+           for kind in ('wrong', 'wrong_uncertain', 'wrong_inherited')},
+    }
+
+
+# Identification.
+
+
+@dataclass(frozen=True)
+class Found:
+    """What `identify` found. files: identified.json, and parameters of identified.yaml."""
+
+    json: Mapping[str, Any]
+    parameters: Parameters | None
+
+    @property
+    def usable(self) -> bool:
+        """Whether it called the result of use."""
+        return bool(self.json.get('usable', False))
+
+    @property
+    def estimate(self) -> Estimate:
+        """What a controller begins with."""
+        assert self.parameters is not None
+        p, std = self.parameters, self.json['std']
+        return Estimate(
+            p.get_float('estimator.initial.m'), p.get_float('estimator.initial.c_r'),
+            p.get_float('estimator.initial.c_l'), p.get_float('proportional.f'),
+            *(max(std[name], 1e-6 * abs(self.json['gap'])) for name in ('m', 'c_r', 'c_l')),
+        )
+
+
+def identified(
+    v: Array, y: Array, period: float, given: Mapping[str, Any] | None = None,
+) -> Found:
+    """Let `identify` read a CSV. given: parameters that it goes on from."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        table = np.column_stack([period * np.arange(len(v)), v, y])
+        np.savetxt(folder / 'record.csv', table, '%.12g', ',', header='t,v,y', comments='')
+        arguments = [str(folder / 'record.csv'), '--out', str(folder / 'out')]
+        if given is not None:
+            text = yaml.safe_dump({'/**': {'ros__parameters': {'sample_period': period, **given}}})
+            (folder / 'given.yaml').write_text(text)
+            arguments += ['--config', str(folder / 'given.yaml')]
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            identify(arguments)
+        out = folder / 'out'
+        found = json.loads((out / 'identified.json').read_text())
+        yaml_file = out / 'identified.yaml'
+        values = flat(yaml.safe_load(yaml_file.read_text())) if yaml_file.exists() else None
+    return Found(found, None if values is None else Parameters(values))
+
+
+class Identified(NamedTuple):
+    """Errors of one random actuator: of the gap or a crossing in gaps, the largest; in deviations.
+
+    fitted: the same by fit_record with the true G, and in deviations of the gap.
+    """
+
+    usable: bool
+    error: float
+    deviations: float
+    delay_right: bool
+    fitted: float
+    fitted_deviations: float
+
+
+def identification_jobs(scale: float) -> list[int]:
+    """Seeds of random actuators."""
+    return list(range(round(32 * scale)))
+
+
+def run_identification(seed: int) -> Identified:
+    """Identify one actuator."""
+    case = random_case(seed)
+    truth = {'gap': case.gap, 'c_r': case.c_r, 'c_l': case.c_l}
+    found = identified(case.v, case.y, case.period).json
+    fit = fit_record(case.v, case.y, _told(case), 0.02, case.level, delays=(case.delay,))
+    fitted = abs(fit.gap - case.gap)
+    known = all(isinstance(found.get(name), float) for name in truth)
+    off = {name: abs(found[name] - true) if known else 1e3 for name, true in truth.items()}
+    return Identified(
+        bool(found['usable']), min(max(off.values()) / case.gap, 1e3),
+        off['gap'] / max(found['std'].get('gap') or 1e-12, 1e-12) if known else 1e3,
+        found.get('delay_samples') == case.delay, min(fitted / case.gap, 1e3),
+        fitted / max(fit.std_gap, 1e-12),
+    )
+
+
+def _told(case: Any) -> Any:
+    from backlash_ros.core.plant.transfer_function import TransferFunction
+    return TransferFunction((case.numerator / case.m).tolist(), case.denominator.tolist())
+
+
+def identification_figures(runs: Sequence[Identified]) -> dict[str, Figure]:
+    """What was promised, and what came out."""
+    good = [run for run in runs if run.usable]
+    return {
+        'called of use': share([run.usable for run in runs], 'more'),
+        'error, median [gap]': figure([run.error for run in good]),
+        'error, 90 % [gap]': figure([run.error for run in good], upper),
+        'beyond 2 % of error': share([run.error > 0.02 for run in good]),
+        'promised wrongly': share([run.deviations > 5.0 for run in good]),
+        'delay right': share([run.delay_right for run in good], 'more'),
+        'fit_record, G given: error, median [gap]': figure([run.fitted for run in runs]),
+        'fit_record, G given: error, 90 % [gap]': figure([run.fitted for run in runs], upper),
+        'fit_record, G given: beyond five deviations':
+            share([run.fitted_deviations > 5.0 for run in runs]),
+    }
+
+
+# Gears that MuJoCo integrates: identified within their limits, then closed to loops.
+
+MOTIONS = ('sine', 'triangle', 'moves and rests')
+INERTIAS, BANDWIDTHS = (0.02, 0.3, 3.0), (4.0, 14.0, 60.0)
+OFF = 0.1  # error of the gap from which on *tracking* is wrong, in lost motions
+
+
+class GearOutcome(NamedTuple):
+    """One gear and motion. gaps: over the lost motion, minus 1. removed: share of the error of y.
+
+    wrong: largest error of the gap while *tracking* is beyond OFF.
+    """
+
+    group: str
+    usable: bool
+    identified: float
+    at_end: float | None
+    removed: float | None
+    tracking: float
+    wrong: bool
+
+
+def gears_jobs(scale: float) -> list[str | tuple[float, float]]:
+    """Presets, and cells of the map of inertia and bandwidth."""
+    return [*PRESETS, *((inertia, bandwidth) for inertia in INERTIAS for bandwidth in BANDWIDTHS)]
+
+
+def run_gear(job: str | tuple[float, float]) -> list[GearOutcome]:
+    """Identify, and close the loop with what was found, for each motion."""
+    if isinstance(job, str):
+        gear, group, motions = PRESETS[job], 'presets', MOTIONS
+        lost = lost_motion(*quasi_static(gear)[::2])
+    else:
+        gear, group, motions = gear_of(*job), 'map', MOTIONS[:1]
+        lost = gear.lost_motion
+    found = _identified_gear(gear)
+    return [_closed(gear, group, motion, found, lost) for motion in motions]
+
+
+def _closed(gear: Gear, group: str, motion: str, found: Found, lost: float) -> GearOutcome:
+    off = abs(float(found.json.get('gap') or 0.0) / lost - 1.0)
+    if found.parameters is None:
+        return GearOutcome(group, found.usable, off, None, None, 0.0, False)
+    try:
+        run = close_loop(gear, build_controller(found.parameters, found.estimate), motion)
+    except (ArithmeticError, ValueError):
+        return GearOutcome(group, found.usable, off, 1e3, 0.0, 0.0, False)
+    removed = None
+    if group == 'presets':
+        none = uncompensated(gear, found.parameters, motion).error
+        removed = max((none - run.error) / none, -1.0)
+    return GearOutcome(
+        group, found.usable, off, abs(float(run.gap[-1]) / lost - 1.0), removed,
+        float(np.mean(run.status[run.first:] == Status.TRACKING)),
+        run.said_tracking_off_by(lost) > OFF,
+    )
+
+
+def _identified_gear(gear: Gear) -> Found:
+    v, _, y = record(gear)
+    reach = gear.scale * gear.reach
+    return identified(v, y, gear.sample_period, {
+        'control.min': -reach, 'control.max': reach, 'control.rate_max': gear.scale * gear.rate,
+        'estimator.use_applied_control': 'false',
+    })
+
+
+def gears_figures(gears: Sequence[Sequence[GearOutcome]]) -> dict[str, Figure]:
+    """Figures of presets and map."""
+    found: dict[str, Figure] = {}
+    runs = [run for gear in gears for run in gear]
+    for name in dict.fromkeys(run.group for run in runs):
+        of = [run for run in runs if run.group == name]
+        found |= {f'{name}: {what}': one for what, one in {
+            'called of use': share([r.usable for r in of], 'more'),
+            'gap identified, median error': figure([r.identified for r in of]),
+            'gap in the loop, median error': figure([r.at_end for r in of]),
+            'gap in the loop, 90 %': figure([r.at_end for r in of], upper),
+            'tracking': share([r.tracking for r in of], 'more'),
+            'wrong while tracking': share([r.wrong for r in of]),
+        }.items()}
+        if name == 'presets':
+            found['presets: share of the error of y removed, median'] = figure(
+                [r.removed for r in of], better='more')
+    return found
+
+
+__all__ = [
+    'faults_figures', 'faults_jobs', 'gears_figures', 'gears_jobs', 'identification_figures',
+    'identification_jobs', 'late_figures', 'late_jobs', 'play', 'run_gear', 'run_identification',
+    'run_late',
+]

@@ -1,0 +1,124 @@
+"""Rows of time, measured alone: steps, refits, 1 kHz over DDS, simulated samples.
+
+Times are in units of one predict + update of filterpy's KalmanFilter with six states, measured in
+the same loop, or of a bare echo node: so they carry over to other machines.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from ordinary_motions import motor
+from real_time.loop_latency import measure_latency
+from real_time.step_times import Sampled, filter_timer
+
+from backlash_ros.core import Parameters, build_closed_loop
+from contract.figures import Figure, figure
+
+LEAST_SCATTER = 0.05  # relative, of a time: what one run of a machine does not show
+QUANTILES = {'p50': 0.5, 'p99': 0.99}
+ACQUISITION, STEADY = 200, 1500  # samples
+LATENCY_S, RATE_HZ = 5.0, 1000.0
+SIMULATED = 8000
+
+
+class Times(NamedTuple):
+    """Ratios of one repetition, by figure."""
+
+    ratios: dict[str, float]
+
+
+def repeated(scale: float, names: Sequence[str], times: int) -> list[tuple[str, int]]:
+    """Every name so often, in turns: a slow moment of the machine hits all."""
+    return [(name, i) for i in range(max(round(times * scale), 2)) for name in names]
+
+
+def times_figures(found: Sequence[Times]) -> dict[str, Figure]:
+    """Medians over the repetitions."""
+    names = dict.fromkeys(name for one in found for name in one.ratios)
+    return {
+        name: figure([one.ratios[name] for one in found if name in one.ratios],
+                     least_scatter=LEAST_SCATTER) for name in names
+    }
+
+
+def _yardstick() -> Callable[[], float]:
+    timer = filter_timer()
+    if timer is None:
+        raise RuntimeError('filterpy is not installed: pip install filterpy')
+    return timer
+
+
+def step_jobs(scale: float) -> list[tuple[str, int]]:
+    """The default law in both structures."""
+    return repeated(scale, ('proportional', 'tracking'), 6)
+
+
+def run_step(job: tuple[str, int]) -> Times:
+    """Step and what follows on it, while the backlash is searched and afterwards."""
+    structure, seed = job
+    sampled = Sampled(Parameters({'structure': structure, 'output_noise_std': 1e-3,
+                                  'seed': seed + 1}))
+    timer = _yardstick()
+    rows = []
+    for _ in range(ACQUISITION + STEADY):
+        step = sampled.step()
+        rows.append((step, sampled.refined, timer()))
+    steps, refits, filters = np.array(rows).T
+    unit = float(np.median(filters))
+    return Times({
+        f'{what}, {structure}, {phase}, {name}': float(np.quantile(times[part], q)) / unit
+        for what, times in (('step', steps), ('refit', refits))
+        for phase, part in (('searching', slice(0, ACQUISITION)),
+                            ('steady', slice(ACQUISITION, None)))
+        for name, q in QUANTILES.items()
+    })
+
+
+def latency_jobs(scale: float) -> list[tuple[str, int]]:
+    """The default law in both structures, and one that fits nothing."""
+    return repeated(scale, ('proportional', 'tracking', 'lms'), 4)
+
+
+def run_latency(job: tuple[str, int]) -> Times:
+    """From y to v beside the echo, a controller process of its own each time."""
+    name, _ = job
+    law = name if name == 'lms' else 'moving_horizon'
+    structure = 'proportional' if name == 'lms' else name
+    found = measure_latency(RATE_HZ, law, LATENCY_S, {'structure': structure})
+    return Times({
+        f'{law}, {structure}, {quantile} / echo': found.ratio(q)
+        for quantile, q in QUANTILES.items()
+    })
+
+
+SIMULATIONS: dict[str, Callable[[], dict[str, Any]]] = {
+    'example of the paper': lambda: {'output_noise_std': 1e-3},
+    'example of the paper, tracking':
+        lambda: {'output_noise_std': 1e-3, 'structure': 'tracking'},
+    'example of the paper, lms': lambda: {'output_noise_std': 1e-3, 'estimator.law': 'lms'},
+    'geared motor': motor,
+    'geared motor, slow moves': lambda: {**motor(), 'waveform': 'triangle', 'frequency': 2.0},
+}
+
+
+def simulate_jobs(scale: float) -> list[tuple[str, int]]:
+    """Several loops."""
+    return repeated(scale, tuple(SIMULATIONS), 4)
+
+
+def run_simulate(job: tuple[str, int]) -> Times:
+    """Processor time of a sample in one process."""
+    name, seed = job
+    loop = build_closed_loop(Parameters({**SIMULATIONS[name](), 'seed': seed + 1}))
+    timer = _yardstick()
+    unit = float(np.median([timer() for _ in range(2000)]))
+    begun = time.process_time()
+    loop.run(SIMULATED)
+    return Times({f'{name}: processor time of a sample':
+                  (time.process_time() - begun) / SIMULATED / unit})
+
+
