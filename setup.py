@@ -42,8 +42,9 @@ setup(
     ],
     extras_require={
         'cluster': ['distributed'],
+        'parquet': ['pyarrow'],
         'test': [
-            'distributed', 'hypothesis', 'mcap-ros2-support', 'pytest', 'pytest-timeout',
+            'distributed', 'hypothesis', 'mcap-ros2-support', 'pyarrow', 'pytest', 'pytest-timeout',
         ],
     },
     entry_points={

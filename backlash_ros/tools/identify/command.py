@@ -18,9 +18,10 @@ from backlash_ros.tools.cli.command_line import (
 )
 from backlash_ros.tools.cli.errors import InputError
 from backlash_ros.tools.identify.names import INTEGRATORS
+from backlash_ros.tools.records.columns import parse_columns
 
 if TYPE_CHECKING:
-    from backlash_ros.tools.identify.measured_record import MeasuredRecord
+    from backlash_ros.core.records.record import Record
     from backlash_ros.tools.run_files.bag_sections import Span
 
 EXECUTABLE = 'identify'
@@ -33,7 +34,13 @@ def make_parser() -> argparse.ArgumentParser:
         epilog='Exit codes: 0 the result is of use, 1 it is not, 2 bad input.',
     )
     parser.add_argument('record', type=Path, nargs='?', metavar='RECORD',
-                        help='a bag, a folder of results, or a CSV with t, v, y (lost y empty)')
+                        help='a bag, a folder of results, or a table (CSV and the like, Parquet) '
+                             'with the time, the command v and the output y')
+    parser.add_argument('--columns', type=parse_columns, default={}, metavar='t=…,v=…,y=…',
+                        help='which columns of the table, or signals of the bag, these are '
+                             '(default: told by their names)')
+    parser.add_argument('--period', type=positive, metavar='S',
+                        help='time from sample to sample [s] (default: told by the stamps)')
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameter file that the result goes on from: limits, topics, axes')
     parser.add_argument('--axis', default='', metavar='NAME',
@@ -126,8 +133,6 @@ def _identify(args: Sequence[str] | None) -> bool:
     span = span_of(parser, options)
     given = given_values(options.config, options.axis)
     record = _recorded(options, span, given, arguments[of_ros:])
-    for note in record.notes:
-        print(f'{EXECUTABLE}: warning: {note}', file=sys.stderr)
     from backlash_ros.tools.identify.outcome import identified, write_outcome
     found = identified(record, options)
     return write_outcome(found, record, given, options)
@@ -136,17 +141,18 @@ def _identify(args: Sequence[str] | None) -> bool:
 def _recorded(
     options: argparse.Namespace, span: Span, given: Mapping[str, Value],
     ros_arguments: Sequence[str],
-) -> MeasuredRecord:
+) -> Record:
     # numpy, scipy and matplotlib are loaded once the options are known to be right.
     if options.drive:
         from backlash_ros.tools.identify.drive import drive
         if options.axis:
             ros_arguments = [*(ros_arguments or ['--ros-args']), '-r', f'__ns:=/{options.axis}']
         return drive(options, given, ros_arguments)
-    from backlash_ros.tools.identify.measured_record import read_measured
-    period = given.get('sample_period')
-    return read_measured(
-        options.record, float(period) if isinstance(period, float) else None, span, options.axis,
+    from backlash_ros.tools.records.reading import read_record
+    period = options.period or given.get('sample_period')
+    return read_record(
+        options.record, period if isinstance(period, float) else None, span, options.axis,
+        options.columns,
     )
 
 

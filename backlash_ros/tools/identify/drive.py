@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 
@@ -25,13 +26,14 @@ from backlash_ros.core.identification.identification import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import BAD_INPUT
 from backlash_ros.tools.cli.errors import BrokenOffError, InputError
 from backlash_ros.tools.cli.stop_requests import StopRequests
 from backlash_ros.tools.config.configuration import write_config
-from backlash_ros.tools.identify.measured_record import MeasuredRecord, from_messages
 from backlash_ros.tools.identify.outcome import options_of
+from backlash_ros.tools.records.messages import from_messages
 
 NODE = 'backlash_ros.nodes.identification_drive'
 LOOK_S = 0.25  # between two looks at the record
@@ -42,7 +44,7 @@ SHARE_OF_TIME = 0.25  # of the time that estimates may take: the actuator needs 
 
 def drive(
     options: argparse.Namespace, given: Mapping[str, Value], ros_arguments: Sequence[str],
-) -> MeasuredRecord:
+) -> Record:
     """Move the actuator and return the record.
 
     Raises InputError where it was refused, BrokenOffError where it was interrupted, where nothing
@@ -133,7 +135,7 @@ class _Estimate:
     found: None until it is known. took_s: how long that was looked for.
     """
 
-    def __init__(self, record: MeasuredRecord, options: Options) -> None:
+    def __init__(self, record: Record, options: Options) -> None:
         self.found: Identification | None = None
         self.took_s = 0.0
         self._work = identifying(record.v, record.y, record.sample_period, options)
@@ -198,7 +200,7 @@ class _Messages:
     def close(self) -> None:
         self._file.close()
 
-    def record(self, sample_period: float | None) -> MeasuredRecord | None:
+    def record(self, sample_period: float | None) -> Record | None:
         """The record, None while it is none yet."""
         *lines, self._unfinished = (self._unfinished + self._file.read()).split('\n')
         for line in lines:
@@ -214,6 +216,6 @@ class _Messages:
         if output is None or len(output[0]) < FEWEST:
             return None
         try:
-            return from_messages(Path('the motion'), heard, sample_period)
-        except InputError:
+            return replace(from_messages(heard, sample_period), source='the motion')
+        except RecordError:
             return None

@@ -22,6 +22,7 @@ from backlash_ros.core.loop.storage import save_estimate
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli.command_line import format_table
 from backlash_ros.tools.cli.errors import BrokenOffError
 from backlash_ros.tools.identify.identified_file import (
@@ -30,10 +31,10 @@ from backlash_ros.tools.identify.identified_file import (
     identified_parameters,
     numbers,
 )
-from backlash_ros.tools.identify.measured_record import COLUMNS, COMMAND, MeasuredRecord
 from backlash_ros.tools.identify.names import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
 from backlash_ros.tools.identify.page import render
 from backlash_ros.tools.identify.pictures import draw
+from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.run_files.results import result_directory, write_summary, write_table
 
 
@@ -45,7 +46,7 @@ def options_of(options: argparse.Namespace) -> Options:
     )
 
 
-def identified(record: MeasuredRecord, options: argparse.Namespace) -> Identification:
+def identified(record: Record, options: argparse.Namespace) -> Identification:
     """Identify, with a bar on a terminal."""
     work = identifying(record.v, record.y, record.sample_period, options_of(options))
     with tqdm(file=sys.stderr, disable=None, leave=False, bar_format='{desc}: {elapsed}') as bar:
@@ -61,7 +62,7 @@ def identified(record: MeasuredRecord, options: argparse.Namespace) -> Identific
 
 
 def write_outcome(
-    found: Identification, record: MeasuredRecord, given: Mapping[str, Value],
+    found: Identification, record: Record, given: Mapping[str, Value],
     options: argparse.Namespace,
 ) -> bool:
     """Write the files, print the outcome; returns whether it is of use."""
@@ -72,7 +73,7 @@ def write_outcome(
             parameters = identified_parameters(found, given, out.resolve() / ESTIMATES)
         except ParameterError as error:
             found = replace(found, reasons=(f'the controller does not take it: {error}',))
-    write_summary(numbers(found), out / JSON)
+    write_summary({**numbers(found), 'timing': record.timing}, out / JSON)
     write_record(record, out / 'record.csv')
     pictures = list(draw(found))
     for picture in pictures:
@@ -87,17 +88,17 @@ def write_outcome(
     return found.usable
 
 
-def write_record(record: MeasuredRecord, path: Path) -> None:
+def write_record(record: Record, path: Path) -> None:
     """Write t, v, y, and the commands where they are others, as a CSV that `identify` reads."""
     columns = [record.v, record.y, *([] if record.commands is None else [record.commands])]
     rows = [
         (k * record.sample_period, *values)
         for k, values in enumerate(np.column_stack(columns).tolist())
     ]
-    write_table(path, (*COLUMNS, COMMAND)[:len(columns) + 1], rows)
+    write_table(path, (*ROLES, COMMAND)[:len(columns) + 1], rows)
 
 
-def _tell(found: Identification, record: MeasuredRecord, out: Path) -> None:
+def _tell(found: Identification, record: Record, out: Path) -> None:
     if found.details is not None:
         print(format_table(('', 'found', '±'), [
             (name, f'{value:.6g}', f'{found.std[name]:.2g}')
@@ -115,7 +116,8 @@ def _tell(found: Identification, record: MeasuredRecord, out: Path) -> None:
         print(f'L(z), from control to applied_control: {actuator.lag.order} poles, gain '
               f'{actuator.gain:.6g}; wind-up {actuator.wind_up[0]:.4g} on the right, '
               f'{actuator.wind_up[1]:.4g} on the left')
-    for text in found.remarks:
+    print(f'time: {record.timing}')
+    for text in (*record.notes, *found.remarks):
         print(f'note: {text}')
     for text in found.reasons:
         print(f'not of use: {text}')

@@ -20,7 +20,7 @@ from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.environment import child_environment
-from backlash_ros.tools.identify.measured_record import read_measured
+from backlash_ros.tools.records.reading import read_record
 from backlash_ros.tools.replay.command import main
 from backlash_ros.tools.report.command import open_source
 from backlash_ros.tools.simulate import command as simulate
@@ -151,7 +151,7 @@ def test_the_bag_of_a_run_in_lockstep_is_replayed_and_read(tmp_path: Path) -> No
     source = open_source(tmp_path / 'run' / 'bag')
     assert source.parameters is not None
     assert parting(source.run, replay(source.run, source.parameters)) is None
-    record = read_measured(tmp_path / 'run')
+    record = read_record(tmp_path / 'run')
     rows = np.round(source.run.column('t') / 0.01).astype(int)
     assert record.v[rows].tolist() == source.run.column('v').tolist()
     assert record.y[rows].tolist() == source.run.column('y').tolist()

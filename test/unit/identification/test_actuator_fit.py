@@ -15,13 +15,11 @@ from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import Identification, Options, identify
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.records.record import Record
 from backlash_ros.tools.identify.identified_file import commented_yaml, identified_parameters
-from backlash_ros.tools.identify.measured_record import (
-    MeasuredRecord,
-    from_messages,
-    read_measured,
-)
 from backlash_ros.tools.identify.outcome import write_record
+from backlash_ros.tools.records.messages import from_messages
+from backlash_ros.tools.records.reading import read_record
 
 PERIOD = 0.005
 TRUE = Parameters({
@@ -94,13 +92,13 @@ def test_the_file_holds_it_and_forgets_one_that_is_not_there() -> None:
 def test_a_csv_keeps_the_commands_beside_v(tmp_path: Path) -> None:
     commands, motor, y = record()
     path = tmp_path / 'record.csv'
-    write_record(MeasuredRecord(motor, y, PERIOD, '', commands=commands), path)
-    read = read_measured(path)
+    write_record(Record(motor, y, PERIOD, '', commands=commands), path)
+    read = read_record(path)
     assert read.commands is not None
     np.testing.assert_allclose(read.commands, commands)
     np.testing.assert_allclose(read.v, motor)
-    write_record(MeasuredRecord(motor, y, PERIOD, ''), path)
-    assert read_measured(path).commands is None
+    write_record(Record(motor, y, PERIOD, ''), path)
+    assert read_record(path).commands is None
 
 
 def test_messages_tell_commands_and_reports_of_each_interval() -> None:
@@ -108,7 +106,7 @@ def test_messages_tell_commands_and_reports_of_each_interval() -> None:
     reports = stamps - 100_000, np.arange(50.0)
     # The first command comes after five reports: until then the motor rests where it is.
     control = stamps[5:] + 300_000, 100.0 + np.arange(5.0, 50.0)
-    read = from_messages(Path('a test'), {
+    read = from_messages({
         'plant_output': (stamps, np.zeros(50)), 'applied_control': reports, 'control': control,
     }, PERIOD)
     assert read.commands is not None

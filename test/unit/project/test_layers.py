@@ -23,7 +23,7 @@ LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
     'parameters', 'plant', 'reference', 'estimate', 'law', 'laws', 'estimation', 'control',
-    'scenario', 'assembly', 'loop', 'simulation', 'identification', 'driver_check',
+    'scenario', 'assembly', 'loop', 'records', 'simulation', 'identification', 'driver_check',
 )
 ESTIMATION = (
     'constants', 'regression', 'fit', 'observer', 'moving_horizon', 'whole_record',

@@ -1,0 +1,49 @@
+"""v and y on one uniform grid: all that an identification needs to know of where they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class RecordError(ValueError):
+    """A record of which no sense can be made: one line says what, where and the cure."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One motion on a uniform grid of sample_period [s], N samples.
+
+    v (N,): acts from sample k to k+1, finite. y (N,): at k; nan where there is no reading of its
+    own: lost, or the one before it repeated. commands (N,): what led to v, where v is that of a
+    motor encoder; None where v is the command itself. timing: one sentence on what was done to the
+    stamps. notes: what else was done, a sentence each. source: where it is from.
+    """
+
+    v: Array
+    y: Array
+    sample_period: float
+    source: str = ''
+    timing: str = ''
+    notes: tuple[str, ...] = ()
+    commands: Array | None = None
+
+    @property
+    def lost(self) -> int:
+        """Samples without a reading of y."""
+        return int(np.isnan(self.y).sum())
+
+    def between(self, from_s: float, to_s: float) -> Record:
+        """The samples from from_s on and before to_s [s]; raises RecordError where none is."""
+        t = self.sample_period * np.arange(len(self.v))
+        # A time that is a sample's up to rounding is that sample's.
+        slack = 1e-6 * self.sample_period
+        kept = (t >= from_s - slack) & (t < to_s - slack)
+        if not kept.any():
+            raise RecordError('there is no sample between --from and --to')
+        commands = None if self.commands is None else self.commands[kept]
+        return replace(self, v=self.v[kept], y=self.y[kept], commands=commands)

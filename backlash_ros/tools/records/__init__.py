@@ -1,0 +1,1 @@
+"""Logs of any kind: tables of text, Parquet, bags, results; what their columns are."""

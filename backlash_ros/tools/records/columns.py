@@ -1,0 +1,124 @@
+"""Which column is the time, which one the command v, which one the output y, by their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.records.table import columns_of
+
+OPTION = '--columns'
+ROLES = ('t', 'v', 'y')
+COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
+
+# Words of names, surest first; of the first line that fits any column, the column is taken.
+PATTERNS: Mapping[str, Sequence[str]] = {
+    't': (
+        r't', r'time|timestamp|time stamp|stamp',
+        r'elapsed( time)?|secs?|seconds|uptime|zeit|date ?time',
+        r'(.* )?(time|timestamp|stamp)( s| sec| us| ms| ns)?', r'(ms|us|ns|millis|micros)',
+    ),
+    'v': (
+        r'v', r'command|cmd|control|goal|target|set ?point|sp|op|soll(wert)?',
+        r'(.* )?(goal|target|commanded|command|cmd|desired|set ?point|set|soll|control)( .*)?',
+    ),
+    'y': (
+        r'y', r'position|pos|actual|measured|present|feedback|output|encoder|angle|pv|ist(wert)?',
+        r'(.* )?(actual|present|measured|feedback|ist)( .*)?',
+        r'(.* )?(position|pos|output|encoder|angle)( .*)?',
+    ),
+}
+# What is neither v nor y, whatever else its name says.
+OTHERS = r'.*\b(speed|velocity|vel|load|current|torque|effort|temp(erature)?|voltage|status|' \
+         r'moving|err(or)?|acceleration|acc|power|rate|direction|duration)\b.*'
+UNITS_S = {
+    'ns': 1e-9, 'nsec': 1e-9, 'nanoseconds': 1e-9, 'us': 1e-6, 'µs': 1e-6, 'μs': 1e-6, 'usec': 1e-6,
+    'microseconds': 1e-6, 'micros': 1e-6, 'ms': 1e-3, 'msec': 1e-3, 'milliseconds': 1e-3,
+    'millis': 1e-3, 's': 1.0, 'sec': 1.0, 'secs': 1.0, 'seconds': 1.0, 'min': 60.0,
+    'minutes': 60.0, 'h': 3600.0, 'hours': 3600.0,
+}
+
+
+class Columns(NamedTuple):
+    """Names of the columns; '' for none. said: what was guessed, '' for nothing."""
+
+    t: str
+    v: str
+    y: str
+    command: str = ''
+    said: str = ''
+
+
+def parse_columns(text: str) -> dict[str, str]:
+    """`t=NAME,v=NAME,y=NAME`, in any order, as a dictionary; raises ValueError."""
+    parts = re.split(rf'(?:^|,)\s*({"|".join((*ROLES, COMMAND))})=', text)
+    if parts[0] or len(parts) < 3:
+        raise ValueError(f'{text!r} must be like t=NAME,v=NAME,y=NAME')
+    given = {role: name.strip() for role, name in zip(parts[1::2], parts[2::2], strict=True)}
+    if len(given) < len(parts) // 2 or not all(given.values()):
+        raise ValueError(f'{text!r} must name one column each')
+    return given
+
+
+def choose_columns(
+    names: Sequence[str], given: Mapping[str, str], source: object,
+) -> Columns:
+    """The columns of a table with these names; given: by role, as the user says.
+
+    Raises InputError that names the columns where one is missing or several may be meant.
+    """
+    for role, name in given.items():
+        if name not in names:
+            raise InputError(f'{source}: {OPTION} {role}={name}: {columns_of(names)}')
+    found = dict(given)
+    for role in ROLES:
+        if role in found:
+            continue
+        fitting = _of(role, names, found)
+        if len(fitting) == 1:
+            found[role] = fitting[0]
+        elif role != 't' or fitting:
+            raise InputError(_asked(source, role, fitting, names))
+    if COMMAND not in found and COMMAND in names and found['v'] == 'v':
+        found[COMMAND] = COMMAND
+    guessed = [role for role in ROLES if role not in given and found.get(role, role) != role]
+    said = ', '.join(f'{role} is {found[role]!r}' for role in guessed)
+    return Columns(found.get('t', ''), found['v'], found['y'], found.get(COMMAND, ''),
+                   f'columns: {said}; {OPTION} chooses others' if said else '')
+
+
+def unit_of(name: str) -> float | None:
+    """Unit [s] of the time that a name tells, like `Time [ms]` or `stamp_ns`; None for none."""
+    bracketed = re.search(r'[\[(]\s*([^\])]+?)\s*[\])]', name)
+    word = bracketed.group(1) if bracketed else re.split(r'[\s_.]', name.strip())[-1]
+    return UNITS_S.get(word.lower())
+
+
+def _of(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[str]:
+    """Columns that may be this, of the surest pattern that fits any."""
+    free = [name for name in names if name not in taken.values()]
+    for pattern in PATTERNS[role]:
+        fitting = [
+            name for name in free if re.fullmatch(pattern, _words(name))
+            and (role == 't' or not re.fullmatch(OTHERS, _words(name)))
+        ]
+        if fitting:
+            return fitting
+    return []
+
+
+def _words(name: str) -> str:
+    """`Goal_Position [deg]`, `/goalPosition` → `goal position`."""
+    name = re.sub(r'[\[(].*?[\])]', ' ', name)
+    name = re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', name)
+    return ' '.join(re.findall(r'[^\W_]+', name.lower()))
+
+
+def _asked(source: object, role: str, fitting: Sequence[str], names: Sequence[str]) -> str:
+    what = {'t': 'the time', 'v': 'the command', 'y': 'the output'}[role]
+    why = f'several columns may be {role}, {what}' if fitting else f'no column is {role}, {what}'
+    return (
+        f'{source}: {why}: {columns_of(names)}; name them: {OPTION} "t=…,v=…,y=…"'
+    )

@@ -1,0 +1,124 @@
+"""Bags: topics of the package, joint states with commands to joints, stamps that are none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from backlash_ros import topics
+from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.records.reading import read_record
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+NUMBER, NUMBERS = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
+JOINTS = 'sensor_msgs/msg/JointState'
+PERIOD_NS = 5_000_000
+COUNT = 200
+V = np.sin(0.1 * np.arange(COUNT))
+Y = 0.9 * np.sin(0.1 * np.arange(COUNT) - 0.1)
+STAMPS = 10**18 + PERIOD_NS * np.arange(COUNT)
+
+
+def message(kind: str, value: Any) -> Any:
+    types = TYPES.types
+    if kind == NUMBER:
+        return types[NUMBER](data=float(value))
+    if kind == NUMBERS:
+        layout = types['std_msgs/msg/MultiArrayLayout'](dim=[], data_offset=0)
+        return types[NUMBERS](layout=layout, data=np.array(value, dtype=float))
+    header = types['std_msgs/msg/Header'](
+        stamp=types['builtin_interfaces/msg/Time'](sec=0, nanosec=0), frame_id='')
+    names, positions = zip(*value.items(), strict=True)
+    none = np.zeros(0)
+    return types[JOINTS](header=header, name=list(names), position=np.array(positions),
+                         velocity=none, effort=none)
+
+
+Topic = tuple[str, NDArray[np.int64], Sequence[Any]]  # type, stamps, values
+
+
+def bag(path: Path, heard: dict[str, Topic]) -> Path:
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for name, (kind, stamps, values) in heard.items():
+            connection = writer.add_connection(name, kind, typestore=TYPES)
+            for stamp, value in zip(stamps.tolist(), values, strict=True):
+                raw = TYPES.serialize_cdr(message(kind, value), kind)
+                writer.write(connection, stamp, bytes(raw))
+    return path
+
+
+LATER = STAMPS + 500_000
+TWO = [{'shoulder': 7.0, 'elbow': y} for y in Y]
+ONE = [{'elbow': y} for y in Y]
+COMMANDS: dict[str, tuple[dict[str, Topic], str]] = {
+    'an array of one': (
+        {'/joint_states': (JOINTS, STAMPS, ONE),
+         '/forward_command_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, ''),
+    'an array, several joints': (
+        {'/joint_states': (JOINTS, STAMPS, TWO),
+         '/forward_command_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, 'elbow'),
+    'joint states as commands': (
+        {'/joint_states': (JOINTS, STAMPS, TWO),
+         '/robot_joint_command': (JOINTS, LATER, [{'elbow': v, 'shoulder': 3.0} for v in V])},
+        'elbow'),
+    'a number': (
+        {'/joint_states': (JOINTS, STAMPS, ONE), '/elbow/command': (NUMBER, LATER, V),
+         '/temperature': (NUMBER, LATER, V)}, ''),
+    'a namespace': (
+        {'/arm/joint_states': (JOINTS, STAMPS, ONE),
+         '/arm/position_controller/commands': (NUMBERS, LATER, [[v] for v in V])}, ''),
+}
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_joint_states_and_commands_are_y_and_v(tmp_path: Path, name: str) -> None:
+    heard, joint = COMMANDS[name]
+    record = read_record(bag(tmp_path / 'bag', heard), axis=joint)
+    assert record.sample_period == pytest.approx(0.005)
+    assert record.v.tolist() == V.tolist()
+    assert record.y.tolist() == Y.tolist()
+    assert 'y is' in record.notes[0]
+
+
+def test_of_several_joints_one_is_asked_for_and_may_be_named(tmp_path: Path) -> None:
+    path = bag(tmp_path / 'bag', {
+        '/joint_states': (JOINTS, STAMPS, TWO),
+        '/commands': (NUMBERS, LATER, [[3.0, v] for v in V]),
+    })
+    with pytest.raises(InputError, match='choose a joint with --axis') as told:
+        read_record(path)
+    assert 'commands[0], commands[1], joint_states/elbow, joint_states/shoulder' in str(told.value)
+    columns = {'v': 'commands[1]', 'y': 'joint_states/elbow'}
+    assert read_record(path, columns=columns).y.tolist() == Y.tolist()
+    with pytest.raises(InputError, match='nothing: the signals are commands'):
+        read_record(path, columns={'v': 'nothing'})
+
+
+@pytest.mark.parametrize('stamp', [0, 2**63 - 1, 10**18 + 3 * 10**16])
+@pytest.mark.parametrize('row', [0, 77, COUNT - 1])
+def test_one_bad_stamp_is_dropped_and_counted(tmp_path: Path, stamp: int, row: int) -> None:
+    stamps = STAMPS.copy()
+    stamps[row] = stamp
+    record = read_record(bag(tmp_path / 'bag', {
+        f'/{topics.PLANT_OUTPUT}': (NUMBER, stamps, Y), f'/{topics.CONTROL}': (NUMBER, LATER, V),
+    }))
+    assert '1 message with a stamp far off left out' in record.timing
+    first = int(row == 0)
+    assert np.isnan(record.y).tolist() == [
+        k == row for k in range(first, COUNT - (row == COUNT - 1))
+    ]
+    # After the last y, the newest command acts.
+    assert record.v[:-1].tolist() == V[first:len(record.v) + first - 1].tolist()
+
+
+def test_nothing_that_may_be_v_or_y_is_told(tmp_path: Path) -> None:
+    path = bag(tmp_path / 'bag', {'/temperature': (NUMBER, STAMPS, Y)})
+    with pytest.raises(InputError, match='temperature'):
+        read_record(path)

@@ -1,0 +1,118 @@
+"""Readings that are none: repeated ones, failed ones, angles that begin anew; and what looks so."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from backlash_ros.core.records.readings import failed, held, quantum, unwrapped
+from backlash_ros.core.records.record import Record
+from backlash_ros.core.records.rows_to_record import record_of
+
+Array = NDArray[np.float64]
+T = 0.005 * np.arange(3000)
+MOTION = np.sin(3.0 * T) + 0.2 * np.sin(7.0 * T)
+SQUARE = np.where(np.sin(3.0 * T) > 0.0, 360.0, 0.0)
+STEPPED = 40.0 * np.round(8.0 * MOTION)  # what jumps from rest to rest
+NOISE = 1e-3 * np.random.default_rng(1).standard_normal(len(T))
+
+
+def repeated(times: int) -> Array:
+    return (MOTION + NOISE)[times * (np.arange(len(T)) // times)]
+
+
+@pytest.mark.parametrize('times', [2, 3, 5, 12])
+def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
+    found = held(T, repeated(times))
+    assert found is not None
+    assert found.own.tolist() == (np.arange(len(T)) % times == 0).tolist()
+    assert found.period == pytest.approx(times * 0.005)
+
+
+def test_a_sensor_with_another_clock_than_the_log_repeats_unevenly() -> None:
+    at = np.floor(T / 0.0233) * 0.0233
+    y = np.round(500.0 * np.sin(3.0 * at))
+    found = held(T, y)
+    assert found is not None
+    assert found.period == pytest.approx(0.0233, rel=0.1)
+    assert np.count_nonzero(found.own) == pytest.approx(T[-1] / 0.0233, rel=0.05)
+
+
+def test_at_rest_one_reading_a_period_is_taken() -> None:
+    y = repeated(5)
+    y[1000:2000] = y[1000]
+    found = held(T, y)
+    assert found is not None
+    assert np.count_nonzero(found.own[1000:2000]) == pytest.approx(200, abs=2)
+
+
+@pytest.mark.parametrize('y', [
+    MOTION + NOISE, np.round(20.0 * MOTION), SQUARE, STEPPED, np.zeros(len(T)), MOTION[:20],
+    np.where(np.arange(len(T)) % 2 == 0, MOTION, np.nan),
+], ids=['noise', 'coarse', 'square', 'stepped', 'rest', 'short', 'every second'])
+def test_what_only_looks_repeated_is_kept(y: Array) -> None:
+    assert held(T[:len(y)], y) is None
+
+
+def test_every_second_reading_lost_leaves_the_others() -> None:
+    y = MOTION.copy()
+    y[1::2] = np.nan
+    record = record_of(T, MOTION, y)
+    assert record.y[::2].tolist() == MOTION[::2].tolist()
+    assert np.isnan(record.y[1::2]).all()
+
+
+@pytest.mark.parametrize('value', [0.0, -1.0, 65535.0])
+@pytest.mark.parametrize('share', [0.002, 0.3])
+def test_reads_that_failed_are_lost(value: float, share: float) -> None:
+    y = 2.0 + MOTION
+    wrong = np.random.default_rng(4).random(len(y)) < share
+    y[wrong] = value
+    found, told = failed(y)
+    assert told == value
+    # Three in a row are rare enough.
+    assert found.tolist() == wrong.tolist()
+    assert np.isnan(record_of(T, MOTION, y).y[wrong]).all()
+
+
+@pytest.mark.parametrize('y', [MOTION, np.round(20.0 * MOTION), SQUARE, STEPPED, MOTION[:8]])
+def test_values_that_a_motion_passes_are_readings(y: Array) -> None:
+    assert not failed(y)[0].any()
+
+
+@pytest.mark.parametrize('turn', [360.0, 2.0 * np.pi, 4096.0])
+@pytest.mark.parametrize('step', [0.0, 0.5])
+def test_an_angle_that_begins_anew_is_unwrapped(turn: float, step: float) -> None:
+    angle = turn * (0.9 * MOTION + 0.3)
+    angle = np.round(angle / step) * step if step * 100 < turn and step else angle
+    found, told = unwrapped(np.mod(angle, turn))
+    assert told == turn
+    assert found - found[0] == pytest.approx(angle - angle[0], abs=1e-9 * turn)
+    record: Record = record_of(T, MOTION, np.mod(angle, turn))
+    assert any('begins anew' in note for note in record.notes)
+
+
+@pytest.mark.parametrize('values', [
+    SQUARE, 360.0 * MOTION, 180.0 * MOTION, STEPPED, MOTION[:8],
+    360.0 * np.mod(np.arange(len(T)) * 0.37, 1.0),
+], ids=['square', 'smooth', 'half', 'stepped', 'short', 'too fast'])
+def test_what_only_jumps_is_not_unwrapped(values: Array) -> None:
+    found, told = unwrapped(values)
+    assert told == 0.0
+    assert found is values
+
+
+@pytest.mark.parametrize(('y', 'step'), [
+    (MOTION, 0.0), (np.round(MOTION, 1), 0.1), (0.25 * np.round(200.0 * MOTION) + 8e8, 0.25),
+    (np.full(9, 3.0), 0.0),
+])
+def test_the_step_of_a_quantised_y_is_told(y: Array, step: float) -> None:
+    assert quantum(y) == pytest.approx(step, rel=1e-3)
+
+
+@pytest.mark.parametrize(('offset', 'scale'), [(8e8, 1.0), (0.0, 5e-8), (-3e5, 1e-3)])
+def test_numbers_of_any_size_are_numbers(offset: float, scale: float) -> None:
+    record = record_of(T, offset + scale * MOTION, offset + scale * (MOTION + NOISE))
+    assert record.v.tolist() == (offset + scale * MOTION).tolist()
+    assert record.lost == 0

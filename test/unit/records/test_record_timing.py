@@ -1,0 +1,209 @@
+"""Rows with stamps of every kind: what comes out is v and y at the instants that were meant."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from backlash_ros.core.records.record import Record, RecordError
+from backlash_ros.core.records.rows_to_record import record_of
+from backlash_ros.core.records.timing import averaged
+
+Array = NDArray[np.float64]
+PERIOD_S = 0.01
+COUNT = 1200
+
+
+def position(t: Array) -> Array:
+    """A motion that is known at any time."""
+    return np.asarray(np.sin(5.0 * t) + 0.4 * np.sin(11.0 * t + 1.0))
+
+
+def command(t: Array) -> Array:
+    return np.asarray(1.2 * np.sin(5.0 * t + 0.1))
+
+
+def log(t: Array, noise: float = 1e-3, stamps: Array | None = None, **more: float) -> Record:
+    y = position(t) + noise * np.random.default_rng(2).standard_normal(len(t))
+    return record_of(t if stamps is None else stamps, command(t), y, **more)
+
+
+def even(count: int = COUNT) -> Array:
+    return PERIOD_S * np.arange(count)
+
+
+def off(record: Record, begin: float = 0.0) -> float:
+    """How far y is from the motion at the instants of the grid, root mean square."""
+    t = begin + record.sample_period * np.arange(len(record.y))
+    return float(np.sqrt(np.nanmean((record.y - position(t))**2)))
+
+
+def test_even_rows_stay_as_they_are() -> None:
+    record = log(even())
+    assert record.sample_period == PERIOD_S
+    assert record.v.tolist() == command(even()).tolist()
+    assert record.lost == 0
+    assert record.timing == '1200 rows, one every 10 ms'
+
+
+@pytest.mark.parametrize('jitter', [0.02, 0.08, 0.2, 0.5])
+def test_readings_are_moved_from_their_true_instants_onto_the_grid(jitter: float) -> None:
+    rng = np.random.default_rng(1)
+    t = np.sort(even() + jitter * PERIOD_S * (rng.random(COUNT) - 0.5) * 2.0)
+    record = log(t)
+    assert 'v and y are taken at them' in record.timing
+    assert record.sample_period == pytest.approx(PERIOD_S, rel=2e-3)
+    assert np.count_nonzero(np.isfinite(record.y)) > 0.9 * COUNT
+    # As good as the noise, where rows by number would be off by the speed times the jitter.
+    begin = t[0] + _begin(record, t)
+    assert off(record, begin) < 1.3e-3
+    assert np.abs(np.asarray(record.v) - command(
+        begin + record.sample_period * np.arange(len(record.v)))).mean() < 0.06
+
+
+def _begin(record: Record, t: Array) -> float:
+    """Time of the first sample after that of the first row, by the v that is known at any time."""
+    shifts = np.linspace(-0.6, 0.6, 241) * PERIOD_S
+    k = record.sample_period * np.arange(len(record.y))
+    errors = [np.nanmean((record.y - position(t[0] + shift + k))**2) for shift in shifts]
+    return float(shifts[int(np.argmin(errors))])
+
+
+def test_steps_that_vary_from_row_to_row_are_true_instants() -> None:
+    steps = PERIOD_S * np.random.default_rng(3).choice([1.0, 1.0, 1.0, 1.4], COUNT)
+    t = np.append(0.0, np.cumsum(steps[1:]))
+    record = log(t)
+    assert off(record, t[0] + _begin(record, t)) < 2e-3
+
+
+def test_late_stamps_of_even_samples_are_numbered() -> None:
+    late = 0.7 * PERIOD_S * np.random.default_rng(1).random(COUNT)
+    record = log(even(), stamps=even() + late)
+    assert 'rows are numbered' in record.timing
+    assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-3)
+    assert record.v.tolist() == command(even()).tolist()
+    assert off(record) < 1.1e-3
+
+
+def test_a_clock_that_is_coarser_than_the_period_numbers_the_rows() -> None:
+    t = 0.004 * np.arange(COUNT)
+    record = log(t, stamps=np.floor(t * 100.0 + 1e-9) / 100.0)
+    assert record.sample_period == pytest.approx(0.004, rel=1e-3)
+    assert record.v.tolist() == command(t).tolist()
+
+
+@pytest.mark.parametrize(('unit_s', 'scale', 'origin'), [
+    (1e-3, 1e3, 0.0), (1e-6, 1e6, 5.0), (None, 1e9, 1.7e9), (None, 1e3, 1.7e9),
+])
+def test_stamps_may_count_other_units(unit_s: float | None, scale: float, origin: float) -> None:
+    stamps = np.round((even() + origin) * scale)
+    record = record_of(stamps, command(even()), position(even()), unit_s=unit_s)
+    assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-3)
+    assert len(record.v) == COUNT
+
+
+def test_stamps_that_count_samples_or_milliseconds_are_told_by_the_period() -> None:
+    for step, said in ((1.0, 't counts the samples'), (10.0, 't counts 1 ms')):
+        record = log(even(), stamps=step * np.arange(COUNT), period=PERIOD_S)
+        assert record.sample_period == PERIOD_S
+        assert len(record.v) == COUNT
+        assert said in record.timing
+    assert '--period' in log(even(), stamps=np.arange(0.0, COUNT)).timing
+
+
+@pytest.mark.parametrize('stamps', [None, np.zeros(COUNT), np.full(COUNT, np.nan)])
+def test_without_a_time_rows_are_counted_with_the_period_alone(stamps: Array | None) -> None:
+    v, y = command(even()), position(even())
+    with pytest.raises(RecordError, match='give --period S'):
+        record_of(stamps, v, y)
+    assert record_of(stamps, v, y, PERIOD_S).v.tolist() == v.tolist()
+
+
+def shuffled(t: Array) -> Array:
+    """A few neighbours swapped."""
+    order = np.arange(len(t))
+    for k in (100, 300, 500):
+        order[[k, k + 1]] = order[[k + 1, k]]
+    return order
+
+
+def test_rows_in_any_order_are_sorted() -> None:
+    t = even()
+    expected = log(t, noise=0.0).y.tolist()
+    for order, said in ((np.arange(COUNT)[::-1], 'turned around'), (shuffled(t), 'sorted')):
+        record = record_of(t[order], command(t)[order], position(t)[order])
+        assert record.y.tolist() == expected
+        assert said in record.timing
+
+
+@pytest.mark.parametrize('bad', [0.0, 3e7, 9.2e18, np.nan])
+@pytest.mark.parametrize('rows', [[0], [600], [COUNT - 1], [200, 201, 700]])
+def test_stamps_that_are_none_are_left_out_and_counted(bad: float, rows: list[int]) -> None:
+    stamps = even() + 1e6
+    stamps[rows] = bad
+    record = log(even(), stamps=stamps)
+    assert f'{len(rows)} row{"s" * (len(rows) > 1)} with' in record.timing
+    kept = np.delete(np.arange(COUNT), rows)
+    assert len(record.v) == kept[-1] - kept[0] + 1
+    assert record.lost == len(record.v) - len(kept)
+    begin = PERIOD_S * kept[0]
+    assert off(record, begin) < 1.1e-3
+
+
+def test_the_longest_run_of_a_log_with_several_is_used() -> None:
+    t = np.concatenate([even(300), even(700), even(200)])
+    record = log(t)
+    assert len(record.v) == 700
+    assert 'begins anew 2 times' in record.timing
+
+
+def test_a_short_gap_is_missing_samples_and_a_long_one_ends_the_record() -> None:
+    t = np.concatenate([even(500), even(500) + 5.1])
+    record = log(t)
+    assert len(record.v) == 1010
+    assert record.lost == 10
+    # v holds over it.
+    assert set(record.v[499:510]) == {command(t[499:500])[0]}
+    t = np.concatenate([even(500), even(700) + 3e5])
+    record = log(t)
+    assert len(record.v) == 700
+    assert 'long gap' in record.timing
+
+
+def test_rows_that_repeat_the_one_before_count_once() -> None:
+    t = np.repeat(even(), 2)
+    record = log(t, noise=0.0)
+    assert record.v.tolist() == command(even()).tolist()
+    assert '1200 rows that repeat' in record.timing
+
+
+def test_where_moving_y_would_show_the_grid_is_finer() -> None:
+    rng = np.random.default_rng(1)
+    t = np.sort(even() + 0.4 * PERIOD_S * (rng.random(COUNT) - 0.5) * 2.0)
+    y = np.sin(90.0 * t)
+    record = record_of(t, 1.1 * np.sin(90.0 * t), y)
+    assert record.sample_period <= 0.51 * PERIOD_S
+    assert np.count_nonzero(np.isfinite(record.y)) > 0.97 * COUNT
+
+
+@given(st.lists(st.floats(0.3, 2.0), min_size=30, max_size=60), st.integers(0, 10**6))
+def test_averaging_keeps_what_v_sums_up_to_at_every_time(steps: list[float], seed: int) -> None:
+    t = np.append(0.0, np.cumsum(steps))
+    v = np.random.default_rng(seed).standard_normal(len(t))
+    grid = averaged(t, v, 0.7, 30)
+    edges = 0.7 * np.arange(1, 31)
+    held = [np.sum(v * np.clip(np.append(t[1:], np.inf).clip(max=edge) - t, 0.0, None))
+            for edge in edges]
+    assert np.cumsum(grid) * 0.7 == pytest.approx(np.array(held), abs=1e-9)
+
+
+@pytest.mark.parametrize(('t', 'said'), [
+    ([0.0], 'which is no motion'), ([0.0, 5.0, 1.0, 7.0, 2.0, 9.0, 0.0] * 9, 'falls back'),
+])
+def test_stamps_without_sense_are_told(t: list[float], said: str) -> None:
+    stamps = np.array(t)
+    with pytest.raises(RecordError, match=said):
+        record_of(stamps, stamps + 1.0, stamps)
