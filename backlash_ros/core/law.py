@@ -85,7 +85,11 @@ class Law:
         """Take in y(k), None if it was lost, and what was applied from k-1 to k."""
 
     def refine(self, budget_s: float = inf) -> None:
-        """Do what the command of this sample need not wait for, for about so long at most."""
+        """Do what the command of this sample need not wait for, for about so long at most.
+
+        A law whose fits are made elsewhere (estimation2/executor.py) takes up those that are
+        finished, and submits the one that is due.
+        """
 
     @property
     def x_hat(self) -> Sequence[float] | Array:
@@ -143,3 +147,6 @@ class Law:
 
     def retune(self, p: Parameters) -> None:
         """Take up new values of the parameters RETUNED; what was learned stays."""
+
+    def close(self) -> None:
+        """Give back what it holds elsewhere: its record in a worker, and a fit under way."""

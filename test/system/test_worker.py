@@ -1,0 +1,245 @@
+"""A worker process: what it computes, what its death costs, and that it outlives nobody."""
+
+from __future__ import annotations
+
+import math
+import operator
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import ROOT
+from waiting import wait_until
+from worker_jobs import checksum, foreign_modules, last_for_ever
+
+from backlash_ros.core.estimation2.executor import (
+    LOST,
+    Channel,
+    Failure,
+    InlineExecutor,
+    Record,
+    Samples,
+)
+from backlash_ros.core.estimation2.worker import NICENESS, WorkerExecutor
+
+KILLED = 20  # times
+PARENT = f"""
+import sys, time
+sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'test')!r}]
+from pathlib import Path
+from backlash_ros.core.estimation2.worker import WorkerExecutor
+from worker_jobs import last_for_ever
+executor = WorkerExecutor()
+channel = executor.open()
+channel.submit(last_for_ever, Path(sys.argv[1]))
+print(executor.pid, flush=True)
+while True:
+    channel.poll()
+    time.sleep(0.01)
+"""
+
+
+@pytest.fixture
+def executor() -> Iterator[WorkerExecutor]:
+    made = WorkerExecutor()
+    yield made
+    made.close()
+
+
+def result_of(channel: Channel) -> object:
+    """The result of a job, when it has come."""
+    assert channel.busy
+    results: list[object] = []
+
+    def has_come() -> bool:
+        results.append(channel.poll())
+        return not channel.busy
+
+    wait_until(has_come, 'a result', lambda: time.sleep(1e-3))
+    return results[-1]
+
+
+def is_there(pid: int) -> bool:
+    """Whether a process runs, which a zombie does not."""
+    try:
+        return Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+def begin(channel: Channel, begun: Path) -> None:
+    """Have the worker compute something that takes for ever, and wait until it does."""
+    begun.unlink(missing_ok=True)
+    assert channel.submit(last_for_ever, begun)
+    wait_until(lambda: channel.poll() is None and begun.exists(), 'the job is under way')
+
+
+def test_results_are_those_of_a_computation_in_place(executor: WorkerExecutor) -> None:
+    rng = np.random.default_rng(1)
+    channels = [place.open(3, 500) for place in (executor, InlineExecutor())]
+    for k in range(40):
+        for row in rng.standard_normal((rng.integers(0, 150), 3)).tolist():
+            for channel in channels:
+                channel.append(*row)
+        for channel in channels:
+            assert channel.submit(checksum, float(k))
+        assert result_of(channels[0]) == result_of(channels[1])
+
+
+def test_channels_do_not_mix(executor: WorkerExecutor) -> None:
+    channels = [executor.open() for _ in range(5)]
+    for number, channel in enumerate(channels):
+        channel.submit(operator.mul, number, 10)
+    channels[2].close()
+    assert [result_of(channels[i]) for i in (4, 3, 1, 0)] == [40, 30, 10, 0]
+
+
+def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(
+    executor: WorkerExecutor,
+) -> None:
+    channel = executor.open()
+    for job, argument, kind in (
+        (math.sqrt, -1.0, 'ValueError'), (open, '/nowhere', 'FileNotFoundError'),
+        (memoryview, b'', 'TypeError'),
+    ):
+        channel.submit(job, argument)
+        failure = result_of(channel)
+        assert isinstance(failure, Failure)
+        assert failure.kind == kind
+    channel.submit(operator.neg, 4)
+    assert result_of(channel) == -4
+
+
+def test_what_a_job_prints_is_no_result(capfd: pytest.CaptureFixture[str]) -> None:
+    executor = WorkerExecutor()  # here: pytest captures the output of a fixture elsewhere
+    channel = executor.open()
+    channel.submit(print, 'said by a job')
+    assert result_of(channel) is None
+    executor.close()
+    assert capfd.readouterr().err == 'said by a job\n'
+
+
+def test_a_worker_imports_neither_ros_nor_the_program_that_started_it(
+    executor: WorkerExecutor,
+) -> None:
+    channel = executor.open()
+    channel.submit(foreign_modules)
+    found = result_of(channel)
+    assert isinstance(found, list)
+    assert {'numpy', 'backlash_ros', 'worker_jobs'} <= set(found)
+    assert not {'rclpy', 'pytest', 'matplotlib', 'rosbags', '__mp_main__'} & set(found)
+
+
+def test_the_loop_goes_before_it(executor: WorkerExecutor) -> None:
+    assert executor.pid is not None
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    assert os.getpriority(os.PRIO_PROCESS, executor.pid) == min(own + NICENESS, 19)
+
+
+def test_a_worker_that_stands_still_holds_up_nobody(executor: WorkerExecutor) -> None:
+    channel, other = executor.open(2, 100_000), executor.open()
+    assert executor.pid is not None
+    os.kill(executor.pid, signal.SIGSTOP)
+    # Ten times what a pipe takes: would any of these calls wait for the worker, it would for ever.
+    for k in range(50_000):
+        channel.append(k, 1.0)
+        assert channel.poll() is None
+    assert channel.submit(checksum, 1.0)
+    assert not channel.submit(checksum, 1.0)
+    assert other.submit(operator.add, b'x' * 1_000_000, b'y')
+    for _ in range(1000):
+        assert channel.poll() is other.poll() is None
+    os.kill(executor.pid, signal.SIGCONT)
+    all_of_them = Samples(0, np.array([np.arange(50_000.0), np.ones(50_000)]))
+    assert result_of(channel) == checksum(all_of_them, 1.0)
+    assert result_of(other) == b'x' * 1_000_000 + b'y'
+
+
+def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(
+    executor: WorkerExecutor, tmp_path: Path,
+) -> None:
+    begun = tmp_path / 'begun'
+    sleeper, channel, third = executor.open(), executor.open(1, 3000), executor.open()
+    rng = np.random.default_rng(2)
+    record = Record(1, 3000)
+    samples = 0
+    for count in range(1, KILLED + 1):
+        begin(sleeper, begun)
+        rows = rng.standard_normal(rng.integers(0, 400))
+        for value in rows.tolist():
+            channel.append(value)
+        record.extend(rows.tobytes())
+        samples += len(rows)
+        assert channel.submit(checksum, 1.0)
+        assert third.submit(operator.neg, count)
+        assert executor.pid is not None
+        os.kill(executor.pid, signal.SIGKILL)
+        failure = result_of(sleeper)
+        assert isinstance(failure, Failure)
+        assert failure.kind == LOST
+        # What is appended while there is no worker belongs to the record, not to the job before.
+        channel.append(7.0)
+        assert result_of(third) == -count
+        assert result_of(channel) == checksum(record.until(samples), 1.0)
+        record.extend(np.array([7.0]).tobytes())
+        samples += 1
+        assert executor.restarts == count
+        assert executor.alive
+
+
+def test_a_job_that_kills_every_worker_is_lost_each_time(executor: WorkerExecutor) -> None:
+    channel = executor.open()
+    for _ in range(3):
+        channel.submit(os.abort)
+        failure = result_of(channel)
+        assert isinstance(failure, Failure)
+        assert failure.kind == LOST
+    channel.submit(operator.neg, 1)
+    assert result_of(channel) == -1
+    assert executor.restarts == 3
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
+def test_a_worker_ends_with_its_parent_though_it_works(tmp_path: Path, number: int) -> None:
+    begun = tmp_path / 'begun'
+    with subprocess.Popen(
+        [sys.executable, '-c', PARENT, str(begun)], stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE, text=True,
+    ) as parent:
+        assert parent.stdout is not None
+        assert parent.stderr is not None
+        try:
+            worker = int(parent.stdout.readline())
+            wait_until(begun.exists, 'the job is under way')
+            assert is_there(worker)
+        finally:
+            parent.send_signal(number)
+        wait_until(lambda: not is_there(worker), 'the worker has ended')
+        assert parent.stderr.read().count('Traceback') == (number == signal.SIGINT)
+
+
+def test_interrupts_are_for_the_loop_alone(executor: WorkerExecutor) -> None:
+    channel = executor.open()
+    channel.submit(operator.neg, 1)
+    assert result_of(channel) == -1
+    assert executor.pid is not None
+    os.kill(executor.pid, signal.SIGINT)
+    channel.submit(operator.neg, 2)
+    assert result_of(channel) == -2
+    assert os.getpgid(executor.pid) != os.getpgid(0)  # nor does a terminal send it any
+
+
+def test_nothing_is_left_of_a_closed_executor(tmp_path: Path) -> None:
+    executor = WorkerExecutor()
+    pid = executor.pid
+    assert pid is not None
+    begin(executor.open(), tmp_path / 'begun')
+    executor.close()
+    assert not is_there(pid)
+    assert not executor.alive
