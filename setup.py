@@ -38,7 +38,7 @@ setup(
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
     install_requires=[
-        'aiohttp', 'matplotlib', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm',
+        'aiohttp', 'matplotlib', 'mcap', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm',
     ],
     extras_require={
         'cluster': ['distributed'],
@@ -54,9 +54,9 @@ setup(
             f'reference = {PACKAGE}.nodes.reference:main',
             f'recorder = {PACKAGE}.nodes.recorder:main',
             f'bringup = {PACKAGE}.tools.bringup.command:main',
-            f'simulate = {PACKAGE}.tools.simulate.command:main',
-            f'report = {PACKAGE}.tools.report.command:main',
-            f'compare = {PACKAGE}.tools.compare.command:main',
+            f'simulate = {PACKAGE}.tools.simulate:main',
+            f'report = {PACKAGE}.tools.report:main',
+            f'compare = {PACKAGE}.tools.compare:main',
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
             f'identify = {PACKAGE}.tools.identify.command:main',
             f'replay = {PACKAGE}.tools.replay.command:main',

@@ -29,7 +29,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
 
 import numpy as np  # noqa: E402
-from cases.random_cases import random_case  # noqa: E402
+from accuracy.random_cases import random_case  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from scipy import signal  # noqa: E402
 
@@ -45,7 +45,7 @@ from backlash_ros.core.simulation.metrics import (  # noqa: E402
     turns,
 )
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord  # noqa: E402
-from backlash_ros.tools.cli.command_line import format_table  # noqa: E402
+from backlash_ros.tools.cli import format_table  # noqa: E402
 
 Array = NDArray[np.float64]
 

@@ -1,1 +1,1 @@
-"""Bags on disk, whole or damaged: their parts, their remains, their repair."""
+"""Bags on disk: written so that a crash leaves them readable, read, repaired."""

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from backlash_ros.bags.content import lock_folder, sync_path
+from backlash_ros.bags.reading import lock_folder
 from backlash_ros.core.parameters.errors import ParameterError
 
 STORAGE = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
@@ -35,14 +35,11 @@ class Bag:
         self.path = Path(path)
         self.saved = 0
         self.saved_ns = 0
-        self._written = 0
-        self._first_ns, self._last_ns = 2**63, 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._lock: int | None = None
-        try:
-            self._writer = Writer(self.path, version=9, storage_plugin=STORAGE[storage])
-        except (WriterError, OSError) as error:
-            raise _refusal(path, error) from None
+        if self.path.exists():
+            raise ParameterError('bag', path, 'exists already', 'name a new folder')
+        self._writer = Writer(self.path, version=9, storage_plugin=STORAGE[storage])
         try:
             self._writer.open()
             self._lock = lock_folder(self.path)
@@ -51,12 +48,14 @@ class Bag:
                 self._flush()
             sync_path(self.path)
             sync_path(self.path.parent)
-        except (WriterError, OSError, sqlite3.Error) as error:
+        except (OSError, sqlite3.Error) as error:
             self._abort()
-            if not isinstance(error, WriterError):
-                # Half a bag would be in the way of the next attempt.
-                shutil.rmtree(self.path, ignore_errors=True)
-            raise _refusal(path, error) from None
+            # Half a bag would be in the way of the next attempt.
+            shutil.rmtree(self.path, ignore_errors=True)
+            raise ParameterError(
+                'bag', path, f'cannot be made: {_reason(error)}',
+                'name a folder where there is room and you may write',
+            ) from None
 
     @property
     def survives_a_crash(self) -> bool:
@@ -65,53 +64,46 @@ class Bag:
 
     def add_topic(self, topic: str, message_type: str) -> Connection:
         """Announce a topic, with a type like std_msgs/msg/Float64; raises RecordingError."""
-        try:
+        with self._closed_on_error():
             return self._writer.add_connection(topic, message_type, typestore=self._types)
-        except (OSError, sqlite3.Error) as error:
-            raise self._broken(error) from error
 
     def write(self, connection: Connection, stamp_ns: int, message: bytes) -> None:
         """Append a message in CDR; raises RecordingError."""
-        try:
+        with self._closed_on_error():
             self._writer.write(connection, stamp_ns, message)
-        except (OSError, sqlite3.Error) as error:
-            raise self._broken(error) from error
-        self._written += 1
-        self._first_ns = min(self._first_ns, stamp_ns)
-        self._last_ns = max(self._last_ns, stamp_ns)
 
     def flush(self) -> None:
         """Let all that was written survive a crash and a power cut; raises RecordingError."""
-        if self._flush is None or self._written == self.saved:
-            return
-        try:
-            self._flush()
-        except (OSError, sqlite3.Error) as error:
-            raise self._broken(error) from error
-        self._note_saved()
+        if self._flush is not None:
+            with self._closed_on_error():
+                self._flush()
+            self._note_saved()
 
     def close(self) -> None:
         """Write what readers need to open the bag; raises RecordingError."""
-        try:
+        with self._closed_on_error():
             self._writer.close()
             for file in (*self.path.iterdir(), self.path):
                 sync_path(file)
-        except (OSError, sqlite3.Error) as error:
-            raise self._broken(error) from error
         self._note_saved()
         self._unlock()
 
     def _note_saved(self) -> None:
-        self.saved = self._written
-        self.saved_ns = max(0, self._last_ns - self._first_ns)
+        writer = self._writer
+        self.saved = sum(writer.counts.values())
+        self.saved_ns = max(0, writer.max_timestamp - writer.min_timestamp)
 
-    def _broken(self, error: OSError | sqlite3.Error) -> RecordingError:
-        self._abort()
-        return RecordingError(_reason(error))
+    @contextmanager
+    def _closed_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error) as error:
+            self._abort()
+            raise RecordingError(_reason(error)) from error
 
     def _abort(self) -> None:
         # What does not fit on the disk now did not a moment ago.
-        with contextlib.suppress(OSError, sqlite3.Error):
+        with suppress(OSError, sqlite3.Error):
             self._writer.abort()
         self._unlock()
 
@@ -147,15 +139,19 @@ def _flush_of(writer: Writer) -> Callable[[], None] | None:
     return flush
 
 
+def sync_path(path: Path) -> None:
+    """Let a file or the entries of a folder survive a power cut; raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        # Some file systems cannot do it for folders.
+        if not path.is_dir():
+            raise
+    finally:
+        os.close(descriptor)
+
+
 def _reason(error: Exception) -> str:
     text = (error.strerror or '') if isinstance(error, OSError) else ''
     return text or ' '.join(str(error).split()) or type(error).__name__
-
-
-def _refusal(path: str, error: Exception) -> ParameterError:
-    if isinstance(error, (WriterError, FileExistsError)):
-        return ParameterError('bag', path, 'exists already', 'name a new folder')
-    return ParameterError(
-        'bag', path, f'cannot be made: {_reason(error)}',
-        'name a folder where there is room and you may write',
-    )

@@ -162,10 +162,14 @@ def _initial(p: Parameters) -> Estimate:
 
 
 def _reconstruction(p: Parameters) -> InputReconstruction:
-    return InputReconstruction(
-        build_model(p), p.get_float('estimator.output_noise_std'), p.get_int('estimator.lag'),
-        LITTLE_SMOOTHING,
-    )
+    noise_std = p.get_float('estimator.output_noise_std') * LITTLE_SMOOTHING
+    try:
+        return InputReconstruction(build_model(p), noise_std, p.get_int('estimator.lag'))
+    except ArithmeticError as error:
+        raise ParameterError(
+            'estimator.output_noise_std', p.get_float('estimator.output_noise_std'), str(error),
+            'give the standard deviation of the noise on y, in the unit of y',
+        ) from None
 
 
 def _moving_horizon(p: Parameters, initial: Estimate) -> Law:

@@ -28,7 +28,7 @@ from backlash_ros.core.simulation.metrics import delayed_reference
 from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.config.configuration import effective_parameters
-from backlash_ros.tools.report.command import open_source
+from backlash_ros.tools.runs.source import read_run
 from gears.gear_runs import (
     AT_FIRST,
     ATTEMPTS,
@@ -123,9 +123,9 @@ class GearProcesses:
             command += ['--set', f'{key}={value}']
         with free_domain() as domain:
             self._tool(command, domain, (0,))
-        source = open_source(out)
+        source = read_run(out)
         assert source.parameters is not None
-        record, delay = source.run, build_controller(source.parameters).structure.delay
+        record, delay = source.record, build_controller(source.parameters).structure.delay
         late = record.column('t') >= FIRST / frequency
         error = (record.column('y') - delayed_reference(record, delay))[late]
         summary = json.loads((out / 'summary.json').read_text())

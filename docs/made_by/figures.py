@@ -22,7 +22,7 @@ from tables import TABLES
 
 from backlash_ros.core.simulation.metrics import delayed_reference
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.pages.drawing import (
+from backlash_ros.tools.figures import (
     COLOURS,
     ESTIMATES,
     STYLES,
@@ -30,6 +30,8 @@ from backlash_ros.tools.pages.drawing import (
     UNITS,
     band,
     curve,
+    draw_hysteresis,
+    draw_laws,
     label,
     legend_above,
     legend_below,
@@ -38,8 +40,7 @@ from backlash_ros.tools.pages.drawing import (
     shade,
     zero_line,
 )
-from backlash_ros.tools.report.analysis import compare_laws, interesting_parts
-from backlash_ros.tools.report.figures import draw_hysteresis, draw_laws
+from backlash_ros.tools.runs.analysis import compare_laws, interesting_parts
 
 DOCS = Path(__file__).resolve().parents[1]
 IMAGES = DOCS / 'images'
@@ -87,8 +88,7 @@ def _draw_shares(axes: Axes, run: RunRecord) -> None:
 def draw_figure_4() -> Figure:
     """Parameter errors of three laws on the paper's example, as Figure 4 and as shares."""
     figure = new_figure(6.6)
-    rows = figure.add_gridspec(2, 1, height_ratios=[1.0, 0.01])
-    grid = np.asarray(rows[0].subgridspec(2, 3).subplots(sharex=True, sharey='row'))
+    grid = np.asarray(figure.subplots(2, 3, sharex=True, sharey='row'))
     for column, law in enumerate(('printed', 'lms', 'moving_horizon')):
         run = simulate(5.0, {'estimator.law': law}).record
         absolute, relative = grid[0][column], grid[1][column]
@@ -109,7 +109,7 @@ def draw_figure_4() -> Figure:
     grid[0][0].set_ylim(-3.0, 3.0)
     label(grid[0][0], y='true minus estimated')
     label(grid[1][0], y='size of the error [%]')
-    legend_below(figure.add_subplot(rows[1]), grid[0][1])
+    legend_below(figure, grid[0][1])
     return figure
 
 
@@ -151,8 +151,7 @@ def draw_convergence() -> Figure:
 def draw_uncertain_plant() -> Figure:
     """Errors of the crossings where the true plant is not G: G believed, and the default."""
     figure = new_figure(6.4)
-    rows = figure.add_gridspec(2, 1, height_ratios=[1.0, 0.01])
-    grid = np.asarray(rows[0].subgridspec(2, 2).subplots(sharex=True, sharey='row'))
+    grid = np.asarray(figure.subplots(2, 2, sharex=True, sharey='row'))
     kinds = (('plant.uncertainty: 0', '0.0', 50.0), ('default', '0.2', 0.4))
     for line, (name, uncertainty, reach) in zip(grid, kinds, strict=True):
         for axes, scale in zip(line, ('0.8', '1.2'), strict=True):
@@ -164,7 +163,7 @@ def draw_uncertain_plant() -> Figure:
         label(line[0], y='error [% of the truth]')
     for axes in grid[1]:
         label(axes, x=TIME)
-    legend_below(figure.add_subplot(rows[1]), grid[0][0])
+    legend_below(figure, grid[0][0])
     return figure
 
 

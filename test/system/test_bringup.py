@@ -24,7 +24,7 @@ from backlash_ros import topics
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config.configuration import effective_parameters
-from backlash_ros.tools.run_files.bag_reading import read_bag
+from backlash_ros.tools.runs.bag import read_bag
 
 TWO_AXES = ROOT / 'config' / 'two_axes.yaml'
 TRUTH = {'pan': (1.3, 3.0, -3.0), 'tilt': (0.8, 1.0, -2.0)}

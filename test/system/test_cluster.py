@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from waiting import DEADLINE_S, wait_until
 
+from backlash_ros.tools import cluster as tools_cluster
 from backlash_ros.tools.bringup.environment import with_source
-from backlash_ros.tools.simulate import cluster as tools_cluster
-from backlash_ros.tools.simulate.command import SEEDS, main
+from backlash_ros.tools.simulate import SEEDS, main
 
 HERE = '127.0.0.1'
 RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']

@@ -24,11 +24,11 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.bags.content import BagError, message_files
-from backlash_ros.bags.remains import damage, open_remains
+from backlash_ros.bags.reading import BagError, BagReader, message_files
+from backlash_ros.bags.repair import damage
 from backlash_ros.bags.writer import STORAGE
-from backlash_ros.tools.report import command as report
-from backlash_ros.tools.run_files.bag_reading import read_bag
+from backlash_ros.tools import report
+from backlash_ros.tools.runs.bag import read_bag
 
 NODES = ('recorder', 'controller', 'reference', 'plant')
 SAMPLE = topics.SIGNAL_LABELS.index('sample')
@@ -78,10 +78,10 @@ def recorded_samples(bag: Path) -> set[int]:
 def count_signals(bag: Path) -> int:
     """Samples of the controller's signals that a recorder has flushed so far."""
     try:
-        messages = open_remains(bag).messages()
-        return sum(message.topic.name == f'/{topics.SIGNALS}' for message in messages)
-    except BagError:
+        messages = BagReader(bag).messages()
+    except BagError:  # not there yet
         return 0
+    return sum(message.topic.name == f'/{topics.SIGNALS}' for message in messages)
 
 
 def recorder(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -107,16 +107,15 @@ def test_killed_recorder_loses_at_most_the_last_second(
         nodes['recorder'].wait()
         listener.wait_for(20)  # nobody waits for a recorder
         assert all(nodes[name].stop() == 0 for name in ('plant', 'reference', 'controller'))
-    before = {path.name: path.read_bytes() for path in bag.iterdir()}
     cure = f'ros2 run backlash_ros recorder --repair {bag}'
     remains = read_bag(bag)
-    assert remains.damage.startswith(f'{bag} was never closed: this is what is left, ')
-    assert remains.damage.endswith(f' To have it complete: {cure}')
+    told = remains.notes[0]
+    assert told.startswith(f'{bag} was never closed: this is what is left, ')
+    assert cure in told
     if storage == 'mcap':  # what it says depends on read_bag alone
         assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
-        assert capsys.readouterr().err == f'report: warning: {remains.damage}\n'
+        assert capsys.readouterr().err.startswith(f'report: warning: {told}\n')
         assert cure in (tmp_path / 'out' / 'report.html').read_text()
-    assert {path.name: path.read_bytes() for path in bag.iterdir()} == before
 
     done = recorder('--repair', bag)
     assert done.returncode == 0, done.stderr
@@ -127,8 +126,8 @@ def test_killed_recorder_loses_at_most_the_last_second(
     assert listener.before(killed - LOST_S) - kept == set()
     assert len(listener.before(killed - LOST_S)) > 50
     repaired = read_bag(bag)
-    assert repaired.damage == ''
-    np.testing.assert_array_equal(repaired.run.rows, remains.run.rows)
+    assert not any('closed' in note for note in repaired.notes)
+    np.testing.assert_array_equal(repaired.record.rows, remains.record.rows)
     if storage == 'mcap':
         with next(bag.glob('*.mcap')).open('rb') as stream:
             reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -144,8 +143,8 @@ def test_recording_that_goes_on_is_read_and_not_repaired(tmp_path: Path, storage
         nodes = start_loop(world, bag, storage)
         probe.wait_until(lambda: count_signals(bag) > 50, 'samples in the bag')
         found = read_bag(bag)
-        assert found.damage.endswith('To have it complete: stop the recorder')
-        assert found.run.samples > 50
+        assert 'was never closed' in found.notes[0]
+        assert found.record.samples > 50
         refused = recorder('--repair', bag)
         assert (refused.returncode, refused.stderr) == (
             1, f'recorder: {bag}: is being recorded: stop its recorder first\n'
@@ -178,7 +177,7 @@ def test_signal_amid_a_flood_ends_with_a_complete_bag(
         assert node.wait() == 0, node.stderr
         counts = node.events('closed')[0]['messages']
     assert damage(bag) == ''
-    values = [message.data for message in open_remains(bag).messages()
+    values = [message.data for message in BagReader(bag).messages()
               if message.topic.name == f'/{topics.CONTROL}']
     assert len(values) == counts[f'/{topics.CONTROL}'] > 0
 
@@ -224,8 +223,8 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path, storage:
     assert 'Traceback' not in log
     assert re.search(r'[1-9]\d* messages came after the recording had stopped', log)
     saved = int(re.search(r'saved are (\d+) messages', reason)[1])
-    assert sum(1 for _ in open_remains(bag).messages()) >= saved > 0
-    assert read_bag(bag).run.samples > 20
+    assert sum(1 for _ in BagReader(bag).messages()) >= saved > 0
+    assert read_bag(bag).record.samples > 20
     assert recorder('--repair', bag).returncode == 0
     assert damage(bag) == ''
 
@@ -273,7 +272,7 @@ def test_disk_that_is_full_at_the_start_is_refused_in_one_line(
 
 FILL = """
 import subprocess, sys
-from backlash_ros.bags.remains import open_remains
+from backlash_ros.bags.reading import BagReader
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.bags.writer import Bag, RecordingError
 bag = Bag(sys.argv[1] + '/bag', sys.argv[2])
@@ -285,10 +284,10 @@ try:
             bag.flush()
 except RecordingError as error:
     print(error)
-left = sum(1 for _ in open_remains(bag.path).messages())
+left = sum(1 for _ in BagReader(bag.path).messages())
 assert left >= bag.saved > 500, (left, bag.saved)
 assert repair_command(bag.path) == 1
-assert sum(1 for _ in open_remains(bag.path).messages()) == left
+assert sum(1 for _ in BagReader(bag.path).messages()) == left
 subprocess.run(['mount', '-o', 'remount,size=4m', sys.argv[1]], check=True)
 assert repair_command(bag.path) == 0
 print(f'{left:>8} messages')
@@ -318,7 +317,7 @@ def test_bag_on_a_disk_that_became_full_is_repaired_once_there_is_room(
     ('arguments', 'words'),
     [
         (['--repair', '/nowhere/bag'], '/nowhere/bag: does not exist'),
-        (['--repair', str(ROOT)], 'is no bag: has no metadata.yaml, no .mcap and no .db3 file'),
+        (['--repair', str(ROOT)], 'holds no .mcap and no .db3 file'),
         (['--repair'], '--repair needs the folder of a bag'),
         (['--repair', 'bag', 'more'], 'unrecognized arguments: --repair bag more'),
     ],

@@ -18,7 +18,7 @@ from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.bringup.progress import ProgressDisplay
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
-from backlash_ros.tools.cli.stop_requests import StopRequests
+from backlash_ros.tools.cli import StopRequests
 from backlash_ros.tools.config.configuration import effective_parameters
 
 READY = (

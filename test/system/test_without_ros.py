@@ -21,9 +21,9 @@ from backlash_ros.core import (
 print(build_closed_loop(Parameters()).run(300).column('c_r')[-1])
 """
 TOOLS = """
-from backlash_ros.tools.compare import command as compare
-from backlash_ros.tools.report import command as report
-from backlash_ros.tools.simulate import command as simulate
+from backlash_ros.tools import compare as compare
+from backlash_ros.tools import report as report
+from backlash_ros.tools import simulate as simulate
 assert simulate.main(['--duration', '1', '--out', 'simulate']) == 0
 assert compare.main(['--duration', '1', '--out', 'compare']) == 0
 assert report.main(['simulate']) == 0

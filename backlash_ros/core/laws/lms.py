@@ -48,8 +48,9 @@ class NormalisedLms(LaggedLaw):
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""
-        u, past = self._follow(y, interval)
-        if past is None:
+        u = self._follow(y)
+        past = self._history.push(interval)
+        if past is None or not (self._reconstruction.ready and self.adapting):
             return
         rising = self._rising(u)
         if rising is None:

@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Sequence
 
 from backlash_ros.options import DONE, OptionParser
-from backlash_ros.tools.cli import command_line
-from backlash_ros.tools.cli.command_line import DEFAULT_DURATION_S
+from backlash_ros.tools import cli
+from backlash_ros.tools.cli import DEFAULT_DURATION_S
 
 EPILOG = """
 driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
@@ -43,7 +43,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         'bringup', description=__doc__, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    command_line.add_common_options(parser)
+    cli.add_common_options(parser)
     parser.add_argument(
         '--duration', type=float, metavar='SECONDS',
         help=f'length of the run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s); '
@@ -87,4 +87,4 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from backlash_ros.tools.bringup.orchestrator import perform, prepare
         code = perform(prepare(options))
 
-    return command_line.run_tool('bringup', bringup) or code
+    return cli.run_tool('bringup', bringup) or code

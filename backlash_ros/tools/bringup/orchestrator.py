@@ -29,15 +29,15 @@ from backlash_ros.tools.bringup.run_plan import (
     plan_processes,
 )
 from backlash_ros.tools.bringup.supervision import Run, complain
-from backlash_ros.tools.cli.command_line import (
-    DEFAULT_DURATION_S,
+from backlash_ros.tools.cli import (
+    BrokenOffError,
+    InputError,
+    StopRequests,
+    number_of_samples,
     print_warnings,
-    whole_samples,
 )
-from backlash_ros.tools.cli.errors import BrokenOffError, InputError
-from backlash_ros.tools.cli.stop_requests import StopRequests
 from backlash_ros.tools.config.configuration import Configuration, read_configuration, write_config
-from backlash_ros.tools.run_files.results import CONFIG, result_directory
+from backlash_ros.tools.runs.files import CONFIG, result_directory
 
 # Each node takes one of the places that discovery on one machine has; some stay for listeners.
 MOST_AXES = 7
@@ -147,14 +147,9 @@ def _check_files(parameters: Mapping[str, Parameters]) -> None:
 
 def _samples(parameters: Parameters, duration: float | None) -> int:
     """Samples of the run, 0 for a run without end."""
-    samples = parameters.get_int('samples')
-    if duration is None and samples > 0:
-        return samples
     if duration is not None and isinf(duration) and duration > 0.0:
         return 0
-    return whole_samples(
-        DEFAULT_DURATION_S if duration is None else duration, parameters.get_float('sample_period')
-    )
+    return number_of_samples(parameters, duration)
 
 
 def _say_unused(configuration: Configuration, parameters: Mapping[str, Parameters]) -> None:
@@ -236,14 +231,14 @@ def report(axis: AxisPlan) -> bool:
         print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
         return True
     # Drawing libraries take a second to load: not before bad input is refused.
-    from backlash_ros.tools.report.command import PAGE, report_bag
-    from backlash_ros.tools.simulate.command import run_table
+    from backlash_ros.tools.report import PAGE, report_bag
+    from backlash_ros.tools.runs.summary import estimate_table
     try:
         summary = report_bag(axis.bag, axis.out, axis.parameters)
     except (InputError, OSError) as error:
         complain(axis.titled(f'no report: {error}'))
         return False
-    print(run_table(summary, axis.name))
+    print(estimate_table(summary, axis.name))
     facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
     latency = summary['loop_latency_ms']
     if latency is not None:

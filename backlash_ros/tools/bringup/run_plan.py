@@ -12,7 +12,7 @@ from backlash_ros.core.parameters import Parameters, missing_limits
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.processes import ProcessPlan
-from backlash_ros.tools.run_files.results import CONFIG
+from backlash_ros.tools.runs.files import CONFIG
 
 BAG, LOGS = 'bag', 'logs'
 DRIVER, ELSEWHERE = 'driver', 'none'

@@ -12,7 +12,7 @@ from backlash_ros.tools.bringup.axis_progress import AxisProgress
 from backlash_ros.tools.bringup.processes import Child, Event, ProcessSupervisor, RunError
 from backlash_ros.tools.bringup.progress import ProgressDisplay, counts
 from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
-from backlash_ros.tools.cli.stop_requests import StopRequests
+from backlash_ros.tools.cli import StopRequests
 
 READY_DEADLINE_S = 30.0  # for the start of every process
 CATCH_UP_DEADLINE_S = 10.0  # for the recorder, after the last sample

@@ -15,7 +15,7 @@ from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PARAMETERS, Parameter, Value
 from backlash_ros.shipped import DEFAULT_CONFIG
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config.parameter_file import (
     AXES,
     EVERY_NODE,

@@ -19,7 +19,7 @@ from backlash_ros.core.parameters.table import (
     NODES,
     Value,
 )
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import InputError
 
 ANY = '**'
 EVERY_NODE = f'/{ANY}'

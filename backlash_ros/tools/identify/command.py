@@ -10,19 +10,19 @@ from typing import TYPE_CHECKING
 
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.options import FAILED, OptionParser, positive
-from backlash_ros.tools.cli.command_line import (
+from backlash_ros.tools.cli import (
+    InputError,
+    Span,
     add_out_option,
     add_span_options,
     run_tool,
     span_of,
 )
-from backlash_ros.tools.cli.errors import InputError
 from backlash_ros.tools.identify.names import INTEGRATORS
 from backlash_ros.tools.records.columns import parse_columns
 
 if TYPE_CHECKING:
     from backlash_ros.core.records.record import Record
-    from backlash_ros.tools.run_files.bag_sections import Span
 
 EXECUTABLE = 'identify'
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.identification.uncertainty import response, response_std, root_covariances
-from backlash_ros.tools.pages.drawing import COLOURS, label, legend_above, new_figure
+from backlash_ros.tools.figures import COLOURS, label, legend_above, new_figure
 
 Array = NDArray[np.float64]
 

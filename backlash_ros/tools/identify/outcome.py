@@ -23,8 +23,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.core.records.record import Record
-from backlash_ros.tools.cli.command_line import format_table
-from backlash_ros.tools.cli.errors import BrokenOffError
+from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.identify.identified_file import (
     as_estimate,
     commented_yaml,
@@ -35,7 +34,7 @@ from backlash_ros.tools.identify.names import ESTIMATES, INTEGRATORS, JSON, PAGE
 from backlash_ros.tools.identify.page import render
 from backlash_ros.tools.identify.pictures import draw
 from backlash_ros.tools.records.columns import COMMAND, ROLES
-from backlash_ros.tools.run_files.results import result_directory, write_summary, write_table
+from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
 
 def options_of(options: argparse.Namespace) -> Options:

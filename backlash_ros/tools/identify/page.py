@@ -9,7 +9,8 @@ from math import isfinite
 import numpy as np
 
 from backlash_ros.core.identification.identification import Identification
-from backlash_ros.tools.pages.html_page import NOTHING, Picture, page, picture_section, table
+from backlash_ros.tools.cli import NOTHING
+from backlash_ros.tools.page import Picture, facts, page, table
 
 TITLE = 'Identification of backlash and G(z)'
 
@@ -18,19 +19,10 @@ def render(
     found: Identification, source: str, pictures: Sequence[Picture], parameters: str | None,
 ) -> str:
     """The page as text. parameters: content of identified.yaml, None where there is none."""
-    parts = [
-        f'<h1>{TITLE}</h1>', f'<p class="lead">{_headline(found, source)}</p>',
-        *(f'<p class="warning">{escape(text)}</p>' for text in (*found.reasons, *found.remarks)),
-    ]
-    if found.details is not None:
-        parts += ['<section>', _numbers(found), _facts(found), '</section>']
-    parts += [picture_section(picture) for picture in pictures]
-    if parameters is not None:
-        parts += [
-            '<section><details><summary>identified.yaml</summary>',
-            f'<pre>{escape(parameters)}</pre></details></section>',
-        ]
-    return page(TITLE, parts)
+    parts = [] if found.details is None else [_numbers(found) + _facts(found)]
+    folded = None if parameters is None else ('identified.yaml', parameters)
+    warnings = (*found.reasons, *found.remarks)
+    return page(TITLE, _headline(found, source), warnings, parts, pictures, folded)
 
 
 def _headline(found: Identification, source: str) -> str:
@@ -57,7 +49,7 @@ def _facts(found: Identification) -> str:
     delays = ' (' + ', '.join(map(str, found.delays)) + ' fit alike)' \
         if len(found.delays) > 1 else ''
     held = found.details.held_out if found.details else None
-    facts = [
+    return facts([
         ('numerator of G', ', '.join(f'{value:.6g}' for value in found.numerator)),
         ('denominator of G', ', '.join(f'{value:.6g}' for value in found.denominator)),
         ('poles', ', '.join(_root(pole) for pole in poles)),
@@ -71,9 +63,7 @@ def _facts(found: Identification) -> str:
         ('correlation of the residual', f'{found.correlation:.2g} from sample to sample'
          if isfinite(found.correlation) else NOTHING),
         ('lost samples, outliers', f'{int(np.isnan(found.y).sum())}, {found.outliers}'),
-    ]
-    body = ''.join(f'<tr><td>{name}</td><td>{value}</td></tr>' for name, value in facts)
-    return f'<table class="facts">{body}</table>'
+    ], columns=1)
 
 
 def _root(root: complex) -> str:

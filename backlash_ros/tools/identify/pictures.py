@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.identification.order_selection import gives_way
 from backlash_ros.core.identification.uncertainty import autocorrelation
-from backlash_ros.tools.identify.model_pictures import SURE, draw_bode, draw_poles
-from backlash_ros.tools.pages.drawing import (
+from backlash_ros.tools.figures import (
     COLOURS,
     TIME,
     curve,
@@ -24,7 +23,8 @@ from backlash_ros.tools.pages.drawing import (
     png,
     zero_line,
 )
-from backlash_ros.tools.pages.html_page import Picture
+from backlash_ros.tools.identify.model_pictures import SURE, draw_bode, draw_poles
+from backlash_ros.tools.page import Picture
 
 Array = NDArray[np.float64]
 

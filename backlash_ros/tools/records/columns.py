@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.records.table import columns_of
 
 OPTION = '--columns'

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros import topics
+from backlash_ros.bags.reading import Topic
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows import in_order
 from backlash_ros.core.records.rows_to_record import record_of_samples, usable
 from backlash_ros.core.records.timing import LONGEST, numbered, rounded, seconds
-from backlash_ros.tools.cli.errors import InputError
-from backlash_ros.tools.report.command import open_source
-from backlash_ros.tools.run_files.bag_content import read_content
-from backlash_ros.tools.run_files.bag_sections import choose_namespace
+from backlash_ros.tools.cli import InputError
+from backlash_ros.tools.runs.bag import choose_namespace, read_topics
+from backlash_ros.tools.runs.source import read_run
 
 Array = NDArray[np.float64]
 Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values
@@ -172,21 +172,21 @@ def _joint_pair(
 
 def _from_signals(path: Path, period: float | None, axis: str) -> Record:
     """From what the controller says that it heard and sent."""
-    source = open_source(path, axis=axis)
-    run = source.run
+    source = read_run(path, axis=axis)
+    run = source.record
     record = record_of_samples(
         run.column('t'), run.column('v'), run.column('y'), period or run.sample_period
     )
-    return replace(record, notes=(*record.notes, *source.notes, *filter(None, [source.damage])))
+    return replace(record, notes=(*record.notes, *source.notes))
 
 
 def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     """Every number of a bag that may be v or y, by name, and what is wrong with the bag."""
-    def wanted(name: str, message_type: str) -> bool:
-        of_joints = message_type == NUMBERS and _is_command(name)
-        return of_joints or message_type in (NUMBER, JOINTS)
+    def wanted(topic: Topic) -> bool:
+        of_joints = topic.message_type == NUMBERS and _is_command(topic.name)
+        return of_joints or topic.message_type in (NUMBER, JOINTS)
 
-    content = read_content(path, wanted)
+    content = read_topics(path, wanted)
     series: dict[tuple[str, str], tuple[list[int], list[float]]] = {}
     for topic, messages in sorted(content.messages.items()):
         for stamp, message in messages:

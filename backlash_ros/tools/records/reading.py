@@ -6,16 +6,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from backlash_ros.bags.content import is_bag
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import record_of, record_of_samples
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import WHOLE, InputError, Span
 from backlash_ros.tools.records.columns import choose_columns, unit_of
 from backlash_ros.tools.records.messages import read_bag_record
 from backlash_ros.tools.records.table import Table, read_table
-from backlash_ros.tools.report.command import BAG, open_source
-from backlash_ros.tools.run_files.bag_sections import WHOLE, Span
-from backlash_ros.tools.run_files.results import RECORD, SAMPLES
+from backlash_ros.tools.runs.files import RECORD, SAMPLES
+from backlash_ros.tools.runs.source import find_bag, read_run
 
 NO_COLUMNS: Mapping[str, str] = {}
 
@@ -40,17 +38,16 @@ def read_record(
 
 
 def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str]) -> Record:
-    if path.is_dir():
-        for folder in (path, path / BAG):
-            if is_bag(folder):
-                return read_bag_record(folder, period, axis, columns)
-        if not any((path / name).is_file() for name in (RECORD, SAMPLES)):
-            raise InputError(
-                f'{path}: holds no bag, no {RECORD} and no {SAMPLES}: give one of them, or a table '
-                'with t, v and y'
-            )
+    bag = find_bag(path)
+    if bag is not None:
+        return read_bag_record(bag, period, axis, columns)
+    if path.is_dir() and not any((path / name).is_file() for name in (RECORD, SAMPLES)):
+        raise InputError(
+            f'{path}: holds no bag, no {RECORD} and no {SAMPLES}: give one of them, or a table '
+            'with t, v and y'
+        )
     if path.is_dir() or path.suffix == '.npz':
-        run = open_source(path).run
+        run = read_run(path).record
         if not run.samples:
             raise InputError(f'{path}: holds no sample')
         return record_of_samples(

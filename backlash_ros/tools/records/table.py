@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import InputError
 
 Array = NDArray[np.float64]
 

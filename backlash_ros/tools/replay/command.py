@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.options import OptionParser
-from backlash_ros.tools.cli.command_line import (
+from backlash_ros.tools.cli import (
+    InputError,
+    Span,
     add_out_option,
     add_span_options,
     format_table,
@@ -20,12 +22,10 @@ from backlash_ros.tools.cli.command_line import (
     run_tool,
     span_of,
 )
-from backlash_ros.tools.cli.errors import InputError
 
 if TYPE_CHECKING:
     from backlash_ros.core.parameters import Parameters
     from backlash_ros.core.simulation.run_record import RunRecord
-    from backlash_ros.tools.run_files.bag_sections import Span
 
 EXECUTABLE = 'replay'
 FIGURE, TABLE = 'replay.png', 'replays.csv'
@@ -69,7 +69,7 @@ def _replay(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
     span = span_of(parser, options)
-    from backlash_ros.tools.simulate.batch import combinations, parse_sweep, value_text
+    from backlash_ros.tools.batch import combinations, parse_sweep, value_text
     changes = combinations([parse_sweep(text) for text in options.sweep])
     runs = [(path, *_opened(path, options, span)) for path in options.runs]
     jobs = []
@@ -88,31 +88,29 @@ def _opened(
     path: Path, options: argparse.Namespace, span: Span,
 ) -> tuple[RunRecord, Parameters, Sequence[Sequence[float]]]:
     """The run, the parameters with which it is to be replayed, and what its driver reported."""
-    from backlash_ros.tools.report.command import open_source
-    source = open_source(path.resolve(), options.config, span, options.axis)
-    for text in (source.damage, *source.notes):
-        if text:
-            print(f'{EXECUTABLE}: warning: {text}', file=sys.stderr)
-    if source.run.samples == 0:
+    from backlash_ros.tools.runs.source import read_run
+    source = read_run(path.resolve(), options.config, span, options.axis)
+    for text in source.notes:
+        print(f'{EXECUTABLE}: warning: {text}', file=sys.stderr)
+    if source.record.samples == 0:
         raise InputError(f'{path}: holds no sample')
     if source.parameters is None:
         raise InputError(f'{path}: no parameters.yaml stands beside it: give --config')
     parameters = _with_settings(source.parameters, options.settings)
-    return source.run, parameters, _reports(path, source.run, parameters, options.axis)
+    return source.record, parameters, _reports(path, source.record, parameters, options.axis)
 
 
 def _reports(
     path: Path, run: RunRecord, parameters: Parameters, axis: str,
 ) -> Sequence[Sequence[float]]:
     """What the driver said to have applied before each row, where the controller uses it."""
-    from backlash_ros.bags.content import is_bag
     from backlash_ros.core.loop.report_use import ReportUse, report_use
-    from backlash_ros.tools.report.command import BAG
-    from backlash_ros.tools.run_files.bag_reading import read_reports
+    from backlash_ros.tools.runs.bag import read_reports
+    from backlash_ros.tools.runs.source import find_bag
     use = report_use(parameters)
     if use is ReportUse.NEVER:
         return ()
-    bag = next((folder for folder in (path, path / BAG) if is_bag(folder)), None)
+    bag = find_bag(path)
     reports = [] if bag is None else read_reports(bag, run.column('y'), axis)
     if not reports and use is ReportUse.ALWAYS:
         print(f'{EXECUTABLE}: warning: {path}: holds no applied_control: v is that of control',
@@ -135,7 +133,7 @@ def _run(job: _Job, title: str) -> RunRecord:
     from tqdm import tqdm
 
     from backlash_ros.core.simulation.replay import replay
-    from backlash_ros.tools.cli.errors import BrokenOffError
+    from backlash_ros.tools.cli import BrokenOffError
     with tqdm(total=job.recorded.samples, file=sys.stderr, disable=None, leave=False, desc=title) \
             as bar:
         try:
@@ -152,10 +150,10 @@ def _one(job: _Job, out: Path | None) -> None:
     print_warnings(EXECUTABLE, parameters)
     replayed = _run(job, job.path.name)
     from backlash_ros.atomic_file import write_atomically
-    from backlash_ros.tools.pages.drawing import png
+    from backlash_ros.tools.figures import png
     from backlash_ros.tools.replay.replay_figure import draw_replay
-    from backlash_ros.tools.report.command import PAGE, report_run
-    from backlash_ros.tools.run_files.results import result_directory
+    from backlash_ros.tools.report import PAGE, report_run
+    from backlash_ros.tools.runs.files import result_directory
     directory = result_directory(out)
     summary = report_run(replayed, directory, parameters)
     write_atomically(directory / FIGURE, png(draw_replay(recorded, replayed)))
@@ -187,7 +185,7 @@ def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
 
 def _several(jobs: Sequence[_Job], out: Path | None) -> None:
     """A table with a row for each run and each value."""
-    from backlash_ros.tools.run_files.results import result_directory, write_table
+    from backlash_ros.tools.runs.files import result_directory, write_table
     rows: list[tuple[object, ...]] = []
     for job in jobs:
         replayed = _run(job, f'{job.path.name} {job.words}')

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.pages.drawing import (
+from backlash_ros.tools.figures import (
     COLOURS,
     ESTIMATES,
     UNITS,

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.compare.command import main
-from backlash_ros.tools.compare.comparison import Result, compare, contenders, row
+from backlash_ros.tools.compare import Result, compare, contenders, main, row
 
 
 @pytest.fixture(scope='module')

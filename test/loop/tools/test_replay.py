@@ -18,12 +18,12 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.bringup.domains import free_domain
 from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.records.reading import read_record
 from backlash_ros.tools.replay.command import main
-from backlash_ros.tools.report.command import open_source
-from backlash_ros.tools.simulate import command as simulate
+from backlash_ros.tools.runs.source import read_run
 
 NOISY = {'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
 # Losses, a structure that feeds y back, a learned G, a law of another kind, a limited v.
@@ -148,13 +148,13 @@ def test_the_bag_of_a_run_in_lockstep_is_replayed_and_read(tmp_path: Path) -> No
             env=child_environment(tmp_path, domain), capture_output=True, text=True, timeout=150.0,
         )
     assert done.returncode == 0, done.stderr
-    source = open_source(tmp_path / 'run' / 'bag')
+    source = read_run(tmp_path / 'run' / 'bag')
     assert source.parameters is not None
-    assert parting(source.run, replay(source.run, source.parameters)) is None
+    assert parting(source.record, replay(source.record, source.parameters)) is None
     record = read_record(tmp_path / 'run')
-    rows = np.round(source.run.column('t') / 0.01).astype(int)
-    assert record.v[rows].tolist() == source.run.column('v').tolist()
-    assert record.y[rows].tolist() == source.run.column('y').tolist()
+    rows = np.round(source.record.column('t') / 0.01).astype(int)
+    assert record.v[rows].tolist() == source.record.column('v').tolist()
+    assert record.y[rows].tolist() == source.record.column('y').tolist()
     assert record.lost == len(record.y) - len(rows)
 
 

@@ -18,8 +18,8 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_d
 from backlash_ros.nodes.runtime.driver_io import Output
 from backlash_ros.tools.config.configuration import write_config
 from backlash_ros.tools.replay.command import main
-from backlash_ros.tools.report.command import open_source
-from backlash_ros.tools.run_files.bag_reading import read_reports
+from backlash_ros.tools.runs.bag import read_reports
+from backlash_ros.tools.runs.source import read_run
 
 FLOAT = 'std_msgs/msg/Float64'
 START_NS, PERIOD_NS = 1_800_000_000_000_000_000, 10_000_000
@@ -110,9 +110,9 @@ def test_the_estimates_of_the_run_come_out_to_the_last_bit(
     driver = LimitingDriver(Parameters({**GIVEN, 'estimator.use_applied_control': use}), reach)
     run = driver.run()
     folder = driver.write(tmp_path, run)
-    source = open_source(folder)
-    assert source.run.column('t') == pytest.approx(run.column('t'))
-    assert source.run.lost_samples == len(LOST)
+    source = read_run(folder)
+    assert source.record.column('t') == pytest.approx(run.column('t'))
+    assert source.record.lost_samples == len(LOST)
     assert main([str(folder), '--out', str(tmp_path / 'out')]) == 0
     told = capsys.readouterr()
     assert 'to the last bit' in told.out

@@ -15,13 +15,13 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.loop.storage import load_estimate
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools import simulate as simulate
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config.configuration import effective_parameters
 from backlash_ros.tools.config.parameter_file import read_parameter_file
 from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.records.messages import from_messages
 from backlash_ros.tools.records.reading import read_record
-from backlash_ros.tools.simulate import command as simulate
 
 QUICK = ('--order', '1-2', '--delay', '0-1')
 FILES = {
@@ -267,7 +267,7 @@ def test_the_sample_period_has_the_digits_that_the_stamps_tell(
 
 
 def test_a_span_is_cut_out(tmp_path: Path) -> None:
-    from backlash_ros.tools.run_files.bag_sections import Span
+    from backlash_ros.tools.cli import Span
     v, y = record(400)
     source = write_csv(tmp_path / 'a.csv', v, y)
     part = read_record(source, span=Span(0.5, 1.5))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
-from backlash_ros.tools.run_files.results import latency_ms
+from backlash_ros.tools.runs.summary import latency_ms
 
 
 def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> None:

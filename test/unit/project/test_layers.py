@@ -79,7 +79,7 @@ def is_allowed(module: str, imported: str) -> bool:
         return known or imported == f'{PACKAGE}.atomic_file'
     if within(module, 'bags'):
         return (
-            top in sys.stdlib_module_names | {'rosbags'} or imported in SHARED
+            top in sys.stdlib_module_names | {'mcap', 'rosbags'} or imported in SHARED
             or within(imported, 'core') or within(imported, 'bags')
         )
     if within(module, 'nodes'):

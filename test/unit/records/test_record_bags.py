@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.records.reading import read_record
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)

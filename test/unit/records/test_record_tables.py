@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.records.columns import choose_columns, parse_columns, unit_of
 from backlash_ros.tools.records.reading import read_record
 from backlash_ros.tools.records.table import read_table

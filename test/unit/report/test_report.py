@@ -18,13 +18,14 @@ from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools import report as report
+from backlash_ros.tools.cli import InputError, Span
 from backlash_ros.tools.config.configuration import write_config
-from backlash_ros.tools.report import analysis
-from backlash_ros.tools.report import command as report
-from backlash_ros.tools.run_files.bag_reading import read_bag
-from backlash_ros.tools.run_files.bag_sections import Span
-from backlash_ros.tools.run_files.results import summarise, write_run, write_summary
+from backlash_ros.tools.runs import analysis
+from backlash_ros.tools.runs.bag import read_bag
+from backlash_ros.tools.runs.files import write_run, write_summary
+from backlash_ros.tools.runs.source import read_run
+from backlash_ros.tools.runs.summary import summarise
 
 
 @pytest.fixture(scope='module')
@@ -77,7 +78,7 @@ def test_page_tells_what_is_known_of_the_fit(run: RunRecord, tmp_path: Path) -> 
         (tmp_path / name).mkdir()
         report.report_run(replace(run, learned=learned), tmp_path / name, PARAMETERS)
         pages[name] = (tmp_path / name / 'report.html').read_text(encoding='utf-8')
-    assert '<td>noise on y, learned / told</td><td>1.23</td>' in pages['known']
+    assert '<td>noise on y, learned / nominal</td><td>1.23</td>' in pages['known']
     assert '<td>unexplained motion of u</td><td>5.67 % of m times the gap</td>' in pages['known']
     assert '<td>unexplained motion of u</td><td>–</td>' in pages['unknown']
     for html in pages.values():
@@ -94,16 +95,16 @@ def test_summary_of_a_bag_tells_latency_losses_and_truth(page: Path) -> None:
 def test_summary_of_a_bag_tells_the_newest_model(run: RunRecord, tmp_path: Path) -> None:
     models = {5: believed([1.0, -0.5]), 50: believed([1.0, -0.6, 0.2]), 70: believed([1.0, -0.7])}
     bag = write_bag(tmp_path / 'bag', run, models=models)
-    found = read_bag(bag, run.sample_period).run
+    found = read_bag(bag, run.sample_period).record
     summary = summarise(found, None)
     assert summary['model'] == {
         'numerator': [0.1], 'denominator': [1.0, -0.7], 'delay_samples': 1,
     }
     assert (summary['noise_ratio'], summary['unexplained']) == (1.2, 0.03)
-    part = read_bag(bag, run.sample_period, Span(to_s=60 * run.sample_period)).run
+    part = read_bag(bag, run.sample_period, Span(to_s=60 * run.sample_period)).record
     assert part.learned is not None
     assert part.learned.denominator == (1.0, -0.6, 0.2)
-    early = read_bag(bag, run.sample_period, Span(to_s=5 * run.sample_period)).run
+    early = read_bag(bag, run.sample_period, Span(to_s=5 * run.sample_period)).record
     assert early.learned is None
 
 
@@ -111,7 +112,7 @@ def test_summary_of_a_bag_tells_the_newest_model(run: RunRecord, tmp_path: Path)
 def test_bag_without_a_whole_model_is_read_all_the_same(
     run: RunRecord, tmp_path: Path, models: dict[int, bytes],
 ) -> None:
-    found = read_bag(write_bag(tmp_path / 'bag', run, models=models), run.sample_period).run
+    found = read_bag(write_bag(tmp_path / 'bag', run, models=models), run.sample_period).record
     assert found.samples == run.samples
     assert found.learned is None
     assert summarise(found, None)['model'] is None
@@ -119,10 +120,10 @@ def test_bag_without_a_whole_model_is_read_all_the_same(
 
 def test_part_of_saved_results_knows_no_model_of_its_end(run: RunRecord, tmp_path: Path) -> None:
     write_run(run, tmp_path)
-    whole = report.open_source(tmp_path / 'record.npz').run
+    whole = read_run(tmp_path / 'record.npz').record
     assert whole.learned == run.learned or repr(whole.learned) == repr(run.learned)
-    assert report.open_source(tmp_path / 'record.npz', span=Span(to_s=0.5)).run.learned is None
-    assert report.open_source(tmp_path / 'record.npz', span=Span(0.5)).run.learned is not None
+    assert read_run(tmp_path / 'record.npz', span=Span(to_s=0.5)).record.learned is None
+    assert read_run(tmp_path / 'record.npz', span=Span(0.5)).record.learned is not None
 
 
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
@@ -133,15 +134,15 @@ def test_bag_gives_back_the_run(tmp_path: Path, storage: StoragePlugin) -> None:
     # The last v was never applied: no u, and the truth of the sample before.
     expected[-1, COLUMNS.index('u')] = nan
     expected[-1, COLUMNS.index('true_m'):] = expected[-2, COLUMNS.index('true_m'):]
-    np.testing.assert_array_equal(found.run.rows, expected)
-    assert found.run.has_truth
-    assert (found.run.lost_samples, found.unpaired) == (0, 0)
+    np.testing.assert_array_equal(found.record.rows, expected)
+    assert found.record.has_truth
+    assert (found.record.lost_samples, found.notes) == (0, ())
     np.testing.assert_array_equal(found.latency_s, LATENCY_S)
 
 
 def test_sample_missing_in_the_bag_is_lost(run: RunRecord, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag', run, lost=frozenset({30, 31, 70}))
-    found = read_bag(bag, run.sample_period).run
+    found = read_bag(bag, run.sample_period).record
     assert found.lost_samples == 3
     kept = np.delete(run.rows, [30, 31, 70], axis=0)
     np.testing.assert_array_equal(found.column('t'), kept[:, 0])
@@ -151,14 +152,15 @@ def test_sample_missing_in_the_bag_is_lost(run: RunRecord, tmp_path: Path) -> No
 def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag', run, unpaired=frozenset({50, 119}))
     found = read_bag(bag, run.sample_period)
-    assert (found.unpaired, found.run.lost_samples, found.run.samples) == (2, 0, 118)
+    assert (found.record.lost_samples, found.record.samples) == (0, 118)
+    assert found.notes[0].startswith('2 samples were left out')
 
 
 def test_bag_of_a_namespace_is_read_without_being_told_the_period(
     run: RunRecord, tmp_path: Path,
 ) -> None:
     bag = write_bag(tmp_path / 'bag', run, namespace='robot1/', lost=frozenset({5}))
-    assert read_bag(bag).run.sample_period == pytest.approx(0.01)
+    assert read_bag(bag).record.sample_period == pytest.approx(0.01)
 
 
 def test_report_without_truth_shows_estimates_and_innovation(
@@ -189,8 +191,8 @@ def saved(run: RunRecord, folder: Path) -> Path:
 
 
 def test_saved_results_are_read_in_full(run: RunRecord, tmp_path: Path) -> None:
-    source = report.open_source(saved(run, tmp_path / 'results'))
-    np.testing.assert_array_equal(source.run.rows, run.rows)
+    source = read_run(saved(run, tmp_path / 'results'))
+    np.testing.assert_array_equal(source.record.rows, run.rows)
     assert source.parameters == PARAMETERS
 
 
@@ -198,7 +200,7 @@ def test_bag_in_the_results_goes_first(run: RunRecord, tmp_path: Path) -> None:
     folder = saved(run, tmp_path / 'results')
     write_bag(folder / 'bag', run)
     for path in (folder, folder / 'bag'):
-        source = report.open_source(path)
+        source = read_run(path)
         assert source.latency_s is not None
         assert source.parameters == PARAMETERS
 
@@ -207,12 +209,12 @@ def test_samples_take_the_truth_from_the_summary_beside_them(
     run: RunRecord, tmp_path: Path,
 ) -> None:
     folder = saved(run, tmp_path / 'results')
-    source = report.open_source(folder / 'samples.csv')
-    assert source.run.has_truth
-    np.testing.assert_array_equal(source.run.column('true_c_l'), run.column('true_c_l'))
+    source = read_run(folder / 'samples.csv')
+    assert source.record.has_truth
+    np.testing.assert_array_equal(source.record.column('true_c_l'), run.column('true_c_l'))
     # Of a truth that wears, the summary knows only the end.
     write_config(PARAMETERS.replaced({'backlash.rate': [0.1, 0, 0]}), folder / 'parameters.yaml')
-    assert not report.open_source(folder / 'samples.csv').run.has_truth
+    assert not read_run(folder / 'samples.csv').record.has_truth
 
 
 def broken_bag(path: Path, run: RunRecord) -> None:
@@ -238,7 +240,7 @@ def empty_folder(path: Path, run: RunRecord) -> None:
     ('make', 'message'),
     [
         (None, 'does not exist'),
-        (broken_bag, 'is damaged (File end magic is invalid.), and nothing of it can be read'),
+        (broken_bag, 'is damaged, and nothing of it can be read'),
         (other_bag, 'holds no controller/signals, only /chatter'),
         (empty_bag, 'holds no message of /controller/signals'),
         (empty_folder, 'holds no bag, no record.npz and no samples.csv'),
@@ -261,8 +263,8 @@ def test_unusable_input_is_one_line_and_leaves_nothing(
 
 def test_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / 'notes.txt').touch()
-    with pytest.raises(InputError, match='is no bag folder'):
-        report.open_source(tmp_path / 'notes.txt')
+    with pytest.raises(InputError, match='is neither a bag'):
+        read_run(tmp_path / 'notes.txt')
 
 
 def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:

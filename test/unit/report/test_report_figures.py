@@ -15,7 +15,8 @@ from matplotlib.transforms import Bbox
 
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.report import analysis, figures
+from backlash_ros.tools import figures
+from backlash_ros.tools.runs import analysis
 
 
 @pytest.fixture(scope='module')
@@ -70,7 +71,7 @@ def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None
     references = [analysis.FollowedReference(late, 0.6, followed) for followed in (True, False)]
     settling = {'m': 0.5, 'c_r': None, 'c_l': 0.9}
     drawn = [
-        figures.draw_estimates(shown), figures.draw_innovation(shown, parts[0]),
+        figures.draw_estimates(shown), figures.draw_innovation(shown, parts),
         figures.draw_hysteresis(shown, parts[1]), figures.draw_input(shown, parts),
         *(figures.draw_output(shown, parts[1], reference) for reference in references),
     ]
@@ -105,15 +106,3 @@ def test_diverging_law_does_not_flatten_the_others(run: RunRecord) -> None:
     figure = figures.draw_laws(traces, analysis.Part('Start', slice(20)))
     low, high = figure.axes[-1].get_ylim()
     assert low < 2.0 < high < 1e5
-
-
-def test_thinned_curve_keeps_every_extreme() -> None:
-    t = np.arange(100_000.0)
-    values = np.sin(t / 50.0)
-    values[[17, 40_000]] = [9.0, -9.0]
-    values[500:600] = nan
-    few_t, few = analysis.thinned(t, values, 1000)
-    assert len(few) <= 1000
-    assert np.all(np.diff(few_t) > 0.0)
-    assert (np.nanmax(few), np.nanmin(few)) == (9.0, -9.0)
-    np.testing.assert_array_equal(few, values[few_t.astype(int)])

@@ -24,9 +24,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
-from backlash_ros.bags.content import BagError
-from backlash_ros.bags.remains import damage, open_remains
-from backlash_ros.bags.repair import repair, repair_command
+from backlash_ros.bags.reading import BagError, BagReader
+from backlash_ros.bags.repair import damage, repair, repair_command
 from backlash_ros.bags.writer import STORAGE, Bag
 
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
@@ -115,18 +114,14 @@ def test_kill_of_the_writer_loses_nothing_that_was_flushed(tmp_path: Path, stora
         lines = [process.stdout.readline() for _ in range(5)]
         process.send_signal(signal.SIGKILL)
         lines += process.stdout.readlines()
-    flushed = int(lines[-1])
-    before = contents(bag)
-    left = [message.data for message in open_remains(bag).messages()]
+    reader = BagReader(bag)
+    left = [message.data for message in reader.messages()]
+    assert reader.damage == 'was never closed'
     assert left == [number_message(i) for i in range(len(left))]
-    assert len(left) >= flushed
-    assert contents(bag) == before
+    assert len(left) >= int(lines[-1])
     done = repair(bag)
     assert done is not None
     assert done.messages == {'/number': len(left)}
-    assert contents(done.original).keys() == {
-        name.replace('/bag/', '/bag.damaged/') for name in before
-    }
     assert damage(bag) == ''
     assert numbers_in(bag) == list(map(float, range(len(left))))
     if storage == 'mcap':
@@ -214,18 +209,7 @@ def test_mcap_cut_at_any_record_keeps_every_block_before_it(
             assert len(found) >= whole.numbers_within(size), size
 
 
-def test_sqlite_cut_at_any_page_gives_what_it_still_can(finished: dict[str, Finished]) -> None:
-    whole = finished['sqlite3']
-    for end in range(0, len(whole.data) + 1, PAGE):
-        for size in (end, max(end - 100, 0)):
-            with whole.with_file(whole.data[:size], metadata=end % (2 * PAGE) == 0) as bag:
-                found = repaired_numbers(bag)
-            assert found == list(map(float, range(len(found)))), size
-            if size == len(whole.data):
-                assert len(found) == MESSAGES
-
-
-@settings(max_examples=120)
+@settings(max_examples=40)
 @given(st.data())
 def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_error(
     finished: dict[str, Finished], data: st.DataObject,
@@ -252,27 +236,12 @@ def test_length_that_is_garbage_is_not_taken_for_a_need_of_memory(
         assert len(repaired_numbers(bag)) >= flushed
 
 
-def test_sqlite_that_lost_its_last_pages_gives_the_messages_before_them(
+def test_sqlite_that_lost_its_end_gives_the_messages_before_it(
     finished: dict[str, Finished],
 ) -> None:
     whole = finished['sqlite3']
     with whole.with_file(whole.data[:-2 * PAGE], metadata=True) as bag:
-        found = repaired_numbers(bag)
-    assert MESSAGES // 2 < len(found) < MESSAGES
-
-
-@pytest.mark.parametrize('storage', STORAGE)
-def test_bag_with_less_than_its_metadata_promise_is_not_complete(
-    finished: dict[str, Finished], storage: str,
-) -> None:
-    with finished[storage].with_file(finished[storage].data, metadata=True) as bag:
-        metadata = bag / 'metadata.yaml'
-        text = metadata.read_text()
-        metadata.write_text(text.replace('message_count: 440', 'message_count: 441'))
-        done = repair(bag)
-        assert done is not None
-        assert done.why == 'holds 440 of 441 messages'
-        assert damage(bag) == ''
+        assert MESSAGES // 2 < len(repaired_numbers(bag)) < MESSAGES
 
 
 def test_page_of_zeros_costs_only_the_block_that_it_lies_in(
@@ -284,25 +253,19 @@ def test_page_of_zeros_costs_only_the_block_that_it_lies_in(
     changed = whole.data[:at] + bytes(600) + whole.data[at + 600:]
     with whole.with_file(changed, metadata=False) as bag:
         found = repaired_numbers(bag)
-    lost = sorted(set(map(float, range(MESSAGES))) - set(found))
-    assert lost
-    assert all(before <= number < after for number in lost)
-    assert found == sorted(found)
+    assert found == [i for i in range(MESSAGES) if not before <= i < after]
 
 
-def test_torn_message_before_a_missing_page_is_not_taken_for_sound(
-    finished: dict[str, Finished],
+def test_files_of_a_split_bag_and_lone_files_are_read_in_their_order(
+    tmp_path: Path, finished: dict[str, Finished],
 ) -> None:
     whole = finished['mcap']
-    (begin, _), (end, _) = whole.flushed[4:6]
-    sound = set(map(float, range(MESSAGES)))
-    for at in range(begin + 100, end - 300, 7):
-        changed = whole.data[:at] + bytes(200) + whole.data[at + 200:]
-        with whole.with_file(changed, metadata=False) as bag:
-            messages = open_remains(bag).messages()
-            found = {struct.unpack('<d', data[4:])[0] for topic, _, data in messages
-                     if topic.name == '/number'}
-        assert found <= sound
+    for number in (10, 9):
+        shutil.copy(message_file(whole.bag), tmp_path / f'bag_{number}.mcap')
+    assert [file.name for file in BagReader(tmp_path).files] == ['bag_9.mcap', 'bag_10.mcap']
+    lone = BagReader(tmp_path / 'bag_9.mcap')
+    assert sum(topic.name == '/number' for topic, *_ in lone.messages()) == MESSAGES
+    assert lone.damage == ''
 
 
 @pytest.mark.parametrize('storage', STORAGE)
@@ -310,9 +273,9 @@ def test_flush_reaches_into_the_installed_rosbags(tmp_path: Path, storage: str) 
     bag = Bag(str(tmp_path / 'bag'), storage)
     assert bag.survives_a_crash, 'rosbags has changed: see _flush_of'
     bag.write(bag.add_topic('/number', FLOAT), 1, number_message(7))
-    assert list(open_remains(bag.path).messages()) == []
+    assert list(BagReader(bag.path).messages()) == []
     bag.flush()
-    assert [message.data for message in open_remains(bag.path).messages()] == [number_message(7)]
+    assert [message.data for message in BagReader(bag.path).messages()] == [number_message(7)]
     bag.close()
     assert damage(bag.path) == ''
 
@@ -362,16 +325,6 @@ def test_bag_that_is_being_recorded_is_left_alone(
     assert repair_command(bag.path) == 0
 
 
-def other_program(bag: Path) -> None:
-    """The beginning of a bag that `ros2 bag record` may have left."""
-    file = message_file(bag)
-    file.write_bytes(file.read_bytes()[:3000].replace(b'rosbags-', b'another-'))
-
-
-def second_file(bag: Path) -> None:
-    (bag / 'more.mcap').touch()
-
-
 def nothing_flushed(bag: Path) -> None:
     file = message_file(bag)
     file.write_bytes(file.read_bytes()[:60])
@@ -386,11 +339,9 @@ def file_gone(bag: Path) -> None:
     [
         (shutil.rmtree, 2, 'does not exist'),
         (lambda bag: (shutil.rmtree(bag), bag.touch()), 2, 'is a file: give the folder'),
-        (lambda bag: (shutil.rmtree(bag), bag.mkdir()), 2, 'is no bag: has no metadata.yaml'),
-        (other_program, 1, 'was not written by the recorder: try `ros2 bag reindex`'),
-        (second_file, 1, 'has 2 files with messages: give each a folder'),
-        (nothing_flushed, 1, 'holds no message that could be saved'),
-        (file_gone, 1, 'its file with the messages is gone'),
+        (lambda bag: (shutil.rmtree(bag), bag.mkdir()), 2, 'holds no .mcap and no .db3 file'),
+                (nothing_flushed, 1, 'holds no message that could be saved'),
+        (file_gone, 2, 'holds no .mcap and no .db3 file'),
     ],
 )
 def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
@@ -417,13 +368,13 @@ def test_second_repair_keeps_both_originals(
     bag = tmp_path / finished['mcap'].bag.name
     shutil.copytree(finished['mcap'].bag, bag)
     originals = []
-    for size in (6000, 4000):
+    for _ in range(2):
         file = message_file(bag)
-        file.write_bytes(file.read_bytes()[:size])
+        file.write_bytes(file.read_bytes()[:-10])
         done = repair(bag)
         assert done is not None
-        originals.append(message_file(done.original).stat().st_size)
-    assert originals == [6000, 4000]
+        originals.append(done.original.name)
+    assert originals == ['mcap_bag.damaged', 'mcap_bag.damaged.1']
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         'mcap_bag', 'mcap_bag.damaged', 'mcap_bag.damaged.1',
     ]

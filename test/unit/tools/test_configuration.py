@@ -11,7 +11,7 @@ from places import ROOT
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.tools.cli.errors import InputError
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config.configuration import (
     Setting,
     effective_parameters,

@@ -16,9 +16,11 @@ from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.cli.errors import InputError
-from backlash_ros.tools.run_files import results
+from backlash_ros.tools.cli import InputError
+from backlash_ros.tools.runs import files as results
+from backlash_ros.tools.runs.summary import summarise
 
+OLD_HEADER = 't,y_m,y,u_d,v,u,m,c_r,c_l,f'  # of samples.csv before version 0.3
 FIELDS = [
     'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'final', 'final_std',
     'truth', 'settling_time_s', 'control_error_rms', 'tracking_error_rms', 'loop_latency_ms',
@@ -50,7 +52,8 @@ def test_samples_are_written_in_full_precision(run: RunRecord, tmp_path: Path) -
     results.write_run(run, tmp_path)
     with (tmp_path / 'samples.csv').open(newline='') as file:
         header, *rows = csv.reader(file)
-    assert header == ['t', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f']
+    assert header[:10] == OLD_HEADER.split(',')
+    assert header[10:] == ['std_m', 'std_c_r', 'std_c_l', 'status']
     again = results.read_samples(tmp_path / 'samples.csv', run.sample_period)
     assert len(rows) == run.samples
     for name in header:
@@ -63,6 +66,16 @@ def test_gaps_in_samples_are_lost_samples(run: RunRecord, tmp_path: Path) -> Non
     again = results.read_samples(tmp_path / 'samples.csv')
     assert again.sample_period == pytest.approx(0.01)
     assert again.lost_samples == run.lost_samples
+
+
+def test_samples_without_the_later_columns_are_read(run: RunRecord, tmp_path: Path) -> None:
+    path = tmp_path / 'samples.csv'
+    path.write_text(f'{OLD_HEADER}\n' + '\n'.join(
+        ','.join(map(repr, row)) for row in run.rows[:, :10].tolist()
+    ))
+    again = results.read_samples(path, run.sample_period)
+    np.testing.assert_array_equal(again.rows[:, :10], run.rows[:, :10])
+    assert np.isnan(again.column('status')).all()
 
 
 def test_u_is_left_empty_where_it_is_unknown(run: RunRecord, tmp_path: Path) -> None:
@@ -88,7 +101,7 @@ def test_record_of_fewer_columns_is_read(run: RunRecord, tmp_path: Path) -> None
 
 
 def test_summary_has_the_agreed_fields(run: RunRecord) -> None:
-    summary = results.summarise(run, Parameters({'estimator.law': 'lms'}))
+    summary = summarise(run, Parameters({'estimator.law': 'lms'}))
     assert list(summary) == FIELDS
     assert list(summary['final']) == ['m', 'c_r', 'c_l', 'f']
     for name in ('final_std', 'truth', 'settling_time_s'):
@@ -102,7 +115,7 @@ def test_what_is_not_finite_becomes_null(run: RunRecord, tmp_path: Path) -> None
     path = tmp_path / 'summary.json'
     results.write_summary({'a': nan, 'b': [1.0, float('inf')], 'c': {'d': -float('inf')}}, path)
     assert strict(path.read_text()) == {'a': None, 'b': [1.0, None], 'c': {'d': None}}
-    results.write_summary(results.summarise(run, None), path)
+    results.write_summary(summarise(run, None), path)
     stored = strict(path.read_text())
     assert isinstance(stored, dict)
     assert stored['final_std'] == {'m': None, 'c_r': None, 'c_l': None}
@@ -110,7 +123,7 @@ def test_what_is_not_finite_becomes_null(run: RunRecord, tmp_path: Path) -> None
 
 
 def test_without_truth_nothing_is_said_to_have_settled(run: RunRecord) -> None:
-    summary = results.summarise(without_truth(run), None)
+    summary = summarise(without_truth(run), None)
     nothing = {'m': None, 'c_r': None, 'c_l': None}
     assert summary['truth'] == nothing
     assert summary['settling_time_s'] == nothing
@@ -123,7 +136,7 @@ def test_summary_tells_the_states_by_their_share(run: RunRecord) -> None:
     codes[:] = 1.0
     codes[:len(codes) // 2] = 0.0
     codes[-1] = 2.0
-    summary = results.summarise(RunRecord(rows, 0.01), None)
+    summary = summarise(RunRecord(rows, 0.01), None)
     assert summary['final_status'] == 'not excited'
     share = summary['status_share']
     assert list(share) == ['acquiring', 'tracking', 'not excited', 'no data', 'inconsistent']
@@ -131,18 +144,18 @@ def test_summary_tells_the_states_by_their_share(run: RunRecord) -> None:
     assert share['not excited'] == 1 / len(codes)
     assert sum(share.values()) == pytest.approx(1.0)
     codes[:] = nan
-    unknown = results.summarise(RunRecord(rows, 0.01), None)
+    unknown = summarise(RunRecord(rows, 0.01), None)
     assert unknown['final_status'] is None
     assert unknown['status_share'] is None
 
 
 def test_summary_tells_the_model_that_was_believed_at_the_end(run: RunRecord) -> None:
-    summary = results.summarise(replace(run, learned=LEARNED), None)
+    summary = summarise(replace(run, learned=LEARNED), None)
     assert summary['model'] == {
         'numerator': [0.1, 0.05], 'denominator': [1.0, -0.9], 'delay_samples': 1,
     }
     assert (summary['noise_ratio'], summary['unexplained']) == (1.1, 0.02)
-    unknown = results.summarise(replace(run, learned=None), None)
+    unknown = summarise(replace(run, learned=None), None)
     assert [unknown[name] for name in ('model', 'noise_ratio', 'unexplained')] == [None] * 3
 
 
@@ -157,14 +170,14 @@ def test_record_keeps_what_was_believed(run: RunRecord, tmp_path: Path) -> None:
 
 def test_latency_is_given_in_milliseconds_without_the_unknown(run: RunRecord) -> None:
     latency = np.array([0.001, nan, 0.002, 0.003])
-    summary = results.summarise(run, None, latency)
+    summary = summarise(run, None, latency)
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 2.0, 'p99': 2.98})
-    assert results.summarise(run, None, np.full(3, nan))['loop_latency_ms'] is None
+    assert summarise(run, None, np.full(3, nan))['loop_latency_ms'] is None
 
 
 def test_run_without_samples_is_refused() -> None:
     with pytest.raises(InputError, match='no sample'):
-        results.summarise(RunRecord(np.empty((0, len(COLUMNS))), 0.01), None)
+        summarise(RunRecord(np.empty((0, len(COLUMNS))), 0.01), None)
 
 
 def test_latest_points_at_the_newest_folder(
@@ -209,11 +222,11 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     [
         ('', 'line 1: must be the header'),
         ('a,b\n1,2\n', 'line 1: must be the header'),
-        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n', 'holds no sample'),
-        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n0,1\n', 'line 2: must hold 10 numbers'),
-        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n0,1,1,1,1,x,1,1,1,1\n', 'line 2: must hold 10 numbers'),
-        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
-        ('t,y_m,y,u_d,v,u,m,c_r,c_l,f\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
+        (f'{OLD_HEADER}\n', 'holds no sample'),
+        (f'{OLD_HEADER}\n0,1\n', 'line 2: must hold 10 numbers'),
+        (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', 'line 2: must hold 10 numbers'),
+        (f'{OLD_HEADER}\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
+        (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
     ],
 )
 def test_mistake_in_samples_names_the_line(tmp_path: Path, text: str, message: str) -> None:

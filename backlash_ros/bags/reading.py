@@ -1,0 +1,172 @@
+"""Reads rosbag2 bags, whole or torn: mcap with its stream reader, SQLite with its own recovery.
+
+Neither needs the index or the metadata.yaml that only a bag that was closed has.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from mcap.records import Channel, Chunk, McapRecord, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+METADATA = 'metadata.yaml'  # written last, when a bag is closed
+SUFFIXES = {'.mcap': 'mcap', '.db3': 'sqlite3'}  # of the file with the messages, and its storage
+CURE = 'ros2 run backlash_ros recorder --repair'
+TOPICS = """
+    SELECT topics.id, name, type, encoded_message_definition FROM topics
+    LEFT JOIN message_definitions ON type = topic_type ORDER BY topics.id
+"""
+# By number, not by time: the index of the times may be the part that is damaged.
+MESSAGES = """
+    SELECT topic_id, timestamp, data FROM messages NOT INDEXED WHERE topic_id IN ({}) ORDER BY id
+"""
+
+
+class BagError(ValueError):
+    """A bag cannot be read or repaired: one line says which, why and, if known, the cure."""
+
+
+class NoBagError(BagError):
+    """There is no bag where one was looked for."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A recorded topic; definition: text of the .msg file with all it refers to, if recorded."""
+
+    name: str
+    message_type: str
+    definition: str
+
+
+class Message(NamedTuple):
+    """A recorded message in CDR."""
+
+    topic: Topic
+    stamp_ns: int
+    data: bytes
+
+
+class BagReader:
+    """The messages of a bag: its folder, or a lone .mcap or .db3 file. Raises NoBagError.
+
+    topics: those of the bag, complete once messages() has ended. damage: what is wrong with the
+    bag, in words, '' for nothing, likewise.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.topics: set[Topic] = set()
+        self.damage = ''
+        if not path.exists():
+            raise NoBagError(f'{path}: does not exist')
+        self.files = message_files(path)
+        if not self.files:
+            rule = 'holds no .mcap and no .db3 file' if path.is_dir() else \
+                'is neither the folder of a bag nor an .mcap or .db3 file'
+            raise NoBagError(f'{path}: {rule}')
+
+    def messages(self, wanted: Callable[[Topic], bool] = lambda topic: True) -> Iterator[Message]:
+        """Every sound message of the wanted topics, in the order in which they were written."""
+        self.damage = ''
+
+        def met(topic: Topic) -> bool:
+            self.topics.add(topic)
+            return wanted(topic)
+
+        for file in self.files:
+            read = _read_mcap if SUFFIXES[file.suffix] == 'mcap' else _read_sqlite
+            try:
+                yield from read(file, met)
+            # Whatever damaged bytes make a library stumble over, the file is damaged.
+            except Exception:
+                closed = (self.path / METADATA).is_file() or self.path.is_file()
+                self.damage = 'is damaged' if closed else 'was never closed'
+
+
+def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Message]:
+    """Messages up to the first record that is not sound; a chunk that is not is left out."""
+    topics: dict[int, Topic] = {}
+    schemas: dict[int, Schema] = {}
+    broken = 0
+    with file.open('rb') as stream:
+        # A length that is garbage may be more than any memory holds.
+        size = os.fstat(stream.fileno()).st_size
+        for found in StreamReader(stream, emit_chunks=True, record_size_limit=size).records:
+            records: list[McapRecord] = [found]
+            if isinstance(found, Chunk):
+                try:
+                    records = breakup_chunk(found, validate_crc=True)
+                except Exception:
+                    broken += 1
+                    continue
+            for record in records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    schema = schemas[record.schema_id]
+                    topic = Topic(record.topic, schema.name, schema.data.decode())
+                    topics[record.id] = topic
+                    wanted(topic)
+                elif isinstance(record, McapMessage) and wanted(topics[record.channel_id]):
+                    yield Message(topics[record.channel_id], record.log_time, record.data)
+    if broken:
+        raise BagError(f'{file}: {broken} chunks are damaged')
+
+
+def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Message]:
+    """Messages of all transactions that were committed, up to the first page that is not sound."""
+    # Opened for writing as well, SQLite takes back what a crash has left half done.
+    uri = f'{file.resolve().as_uri()}?mode=rw'
+    with closing(sqlite3.connect(uri, uri=True)) as database:
+        # Otherwise a file that has lost its end is refused as a whole.
+        database.execute('PRAGMA writable_schema = ON')
+        topics = {number: Topic(*rest) for number, *rest in database.execute(TOPICS)}
+        chosen = [number for number, topic in topics.items() if wanted(topic)]
+        query = MESSAGES.format(', '.join(map(str, chosen)))
+        for number, stamp_ns, data in database.execute(query):
+            yield Message(topics[number], int(stamp_ns), bytes(data))
+        closed = database.execute('SELECT count(*) FROM metadata').fetchone()[0]
+    if not closed:
+        raise BagError(f'{file}: was never closed')
+
+
+def is_bag(path: Path) -> bool:
+    """Whether path is the folder of a bag, properly closed or not, or a file of one."""
+    return (path / METADATA).is_file() or bool(message_files(path))
+
+
+def message_files(path: Path) -> list[Path]:
+    """The files with the messages of a bag in their order; itself, if it is one."""
+    if path.is_file():
+        return [path] if path.suffix in SUFFIXES else []
+    # bag_10 comes after bag_9.
+    return sorted(
+        (file for file in path.glob('*') if file.suffix in SUFFIXES),
+        key=lambda file: (len(file.name), file.name),
+    )
+
+
+def lock_folder(path: Path) -> int | None:
+    """Mark a bag as being written until the descriptor is closed, or the process gone.
+
+    Raises BlockingIOError if another process writes it; None where folders cannot be locked.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        if isinstance(error, BlockingIOError):
+            raise
+        return None
+    return descriptor

@@ -1,0 +1,268 @@
+"""Many simulated runs: seeds and sweeps as jobs, in parallel processes, and what they come to."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import inf, nan
+
+import numpy as np
+import yaml
+from scipy.special import chdtri
+from tqdm import tqdm
+
+from backlash_ros.core.parameters import Parameters, check_names, check_value
+from backlash_ros.core.parameters.table import BY_NAME, Value
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
+from backlash_ros.options import FAILED
+from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples
+from backlash_ros.tools.runs.run import run_loop
+from backlash_ros.tools.runs.summary import summarise
+from backlash_ros.topics import BACKLASH
+
+PATIENCE_S = 5.0  # after an interruption, until the process ends whatever it waits for
+# The matrices are tiny: threads of the linear algebra would only disturb the other processes.
+ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
+UNKNOWN = (nan, nan, nan)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A parameter and the values it takes in turn."""
+
+    name: str
+    values: tuple[Value, ...]
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run: its complete parameters and its length."""
+
+    values: Mapping[str, Value]
+    samples: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Last estimates of (m, c_r, c_l), what they should be, and what else a run came to.
+
+    std: nan where the law has none. settling [s]: inf for never. problem: why a run broke off,
+    all its numbers are nan then.
+    """
+
+    final: tuple[float, ...] = UNKNOWN
+    std: tuple[float, ...] = UNKNOWN
+    truth: tuple[float, ...] = UNKNOWN
+    settling: tuple[float, ...] = UNKNOWN
+    control_error_rms: float | None = None
+    tracking_error_rms: float | None = None
+    lost_samples: int = 0
+    problem: str = ''
+
+
+@dataclass(frozen=True)
+class ParameterStatistics:
+    """Statistics of one estimated parameter over runs.
+
+    settling times [s]: inf for never. within: share of runs within 1 % at the end.
+    nees: mean of (error / std)^2, nan without standard deviations; honest ones put it into
+    nees_interval with 95 %.
+    """
+
+    bias: float
+    rmse: float
+    settling_median: float
+    settling_max: float
+    within: float
+    nees: float
+    nees_interval: tuple[float, float]
+
+
+def parse_sweep(text: str) -> Sweep:
+    """Return the sweep of `KEY=v1,v2,...`; the values are written as in a YAML list."""
+    name, equals, listed = text.partition('=')
+    name = name.strip()
+    if not equals or not listed.strip():
+        raise InputError(f'--sweep {text!r} must be KEY=v1,v2,...')
+    check_names([name])
+    try:
+        values = yaml.safe_load(f'[{listed}]')
+    except yaml.YAMLError:
+        raise InputError(f'--sweep {text!r}: the values are no list in YAML') from None
+    if isinstance(BY_NAME[name].default, str):
+        values = [str(value) for value in values]
+    return Sweep(name, tuple(check_value(BY_NAME[name], value) for value in values))
+
+
+def combinations(sweeps: Sequence[Sweep]) -> list[dict[str, Value]]:
+    """Every combination of the swept values, the last one changing fastest."""
+    names = [sweep.name for sweep in sweeps]
+    if len(set(names)) < len(names):
+        raise InputError(f'--sweep names {max(names, key=names.count)} twice')
+    return [
+        dict(zip(names, values, strict=True))
+        for values in itertools.product(*(sweep.values for sweep in sweeps))
+    ]
+
+
+def value_text(value: Value) -> str:
+    """A parameter value as short text."""
+    if isinstance(value, tuple):
+        return '[' + ', '.join(f'{element:g}' for element in value) + ']'
+    return f'{value:g}' if isinstance(value, float) else str(value)
+
+
+def make_jobs(
+    parameters: Parameters, changes: Sequence[Mapping[str, Value]], seeds: Sequence[int],
+    duration: float | None,
+) -> list[Job]:
+    """One job for each change and, within it, each seed (its own if it changes the seed).
+
+    Every combination is built once, so that a bad one is refused before anything starts.
+    """
+    jobs = []
+    for change in changes:
+        changed = parameters.replaced(change)
+        samples = number_of_samples(changed, duration)
+        build_closed_loop(changed)
+        own = [changed.get_int('seed')] if 'seed' in change else seeds
+        jobs += [Job(dict(changed.replaced({'seed': seed})), samples) for seed in own]
+    return jobs
+
+
+def run_job(job: Job) -> Outcome:
+    """Simulate one run; a run that breaks off is an outcome too."""
+    parameters = Parameters(job.values)
+    try:
+        run = run_loop(build_closed_loop(parameters), job.samples)
+    except BrokenOffError as error:
+        return Outcome(problem=str(error))
+    summary = summarise(run, parameters)
+    settling = summary['settling_time_s']
+    final, std, truth = (
+        tuple(summary[key][name] for name in BACKLASH) for key in ('final', 'final_std', 'truth')
+    )
+    return Outcome(
+        final, std, truth,
+        tuple(inf if settling[name] is None else settling[name] for name in BACKLASH),
+        summary['control_error_rms'], summary['tracking_error_rms'], summary['lost_samples'],
+    )
+
+
+def run_jobs(jobs: Sequence[Job], workers: int | None = None, label: str = '') -> list[Outcome]:
+    """Outcomes in the order of the jobs, whatever the number of processes.
+
+    workers: None takes one process per processor, 1 none besides this one. Call it from the main
+    thread, which alone is told of signals.
+    """
+    if workers is None:
+        workers = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
+            os.cpu_count() or 1)
+    workers = min(workers, len(jobs))
+    # disable=None: no bar where stderr is not a terminal.
+    tqdm.monitor_interval = 0  # a thread would take the signals that are held back below
+    with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
+        outcomes: dict[int, Outcome] = {}
+        if workers <= 1:
+            for i, job in enumerate(jobs):
+                outcomes[i] = run_job(job)
+                bar.update()
+        else:
+            with _pool(workers) as pool:
+                with _signals_held_back():
+                    futures = {pool.submit(run_job, job): i for i, job in enumerate(jobs)}
+                for future in as_completed(futures):
+                    outcomes[futures[future]] = future.result()
+                    bar.update()
+        return [outcomes[i] for i in range(len(jobs))]
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Spawned workers, killed when the caller is interrupted: they have nothing to save."""
+    os.environ.update(ONE_THREAD)  # read when a worker imports numpy
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent
+    )
+    try:
+        yield pool
+    except BrokenProcessPool:
+        raise BrokenOffError('a worker process was killed: is there enough memory?') from None
+    except BaseException as error:
+        for worker in set(multiprocessing.active_children()) - others:
+            worker.kill()
+        if isinstance(error, KeyboardInterrupt):
+            # The thread of the pool may wait for ever for a worker that was killed as it began.
+            pool.shutdown(wait=False, cancel_futures=True)
+            leave = threading.Timer(PATIENCE_S, os._exit, (FAILED,))
+            leave.daemon = True
+            leave.start()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _signals_held_back() -> Iterator[None]:
+    """Let no signal cut short the start of a worker; one that came takes effect afterwards.
+
+    Workers inherit for good what is blocked: Ctrl-C is for their parent alone.
+    """
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
+
+
+def _end_with_parent() -> None:
+    """Let this worker end when its parent does, of whatever cause."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
+    """Statistics of each estimated parameter over the runs that did not break off.
+
+    Raises InputError where all of them did.
+    """
+    whole = [outcome for outcome in outcomes if not outcome.problem]
+    if not whole:
+        raise InputError(f'every run broke off, the first one with: {outcomes[0].problem}')
+    return {name: _statistics(whole, i) for i, name in enumerate(BACKLASH)}
+
+
+def _statistics(outcomes: Sequence[Outcome], i: int) -> ParameterStatistics:
+    final, std, truth, settling = np.array([
+        [outcome.final[i], outcome.std[i], outcome.truth[i], outcome.settling[i]]
+        for outcome in outcomes
+    ]).T
+    error = final - truth
+    # The median of a number and "never" is never, not the nan of inf - inf.
+    median = float(np.sort(settling)[len(settling) // 2])
+    known = bool(np.all(np.isfinite(std) & (std > 0.0)))
+    n = len(outcomes)
+    # Quantiles of chi squared with n degrees of freedom: n times the mean has that distribution.
+    low, high = chdtri(n, [0.975, 0.025]) / n
+    return ParameterStatistics(
+        float(error.mean()), float(np.sqrt(np.mean(error**2))), median, float(settling.max()),
+        float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),
+        float(np.mean((error / std) ** 2)) if known else nan, (float(low), float(high)),
+    )

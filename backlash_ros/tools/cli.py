@@ -1,0 +1,186 @@
+"""What the command lines of all tools share: options, errors, signals, tables."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any
+
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.options import BAD_INPUT, DONE, FAILED
+
+DEFAULT_DURATION_S = 10.0  # of a run
+# A duration may miss a whole number of sample periods by rounding alone.
+WHOLE_TOLERANCE = 1e-6
+NOTHING = '–'  # in a table, where there is no number
+
+
+class InputError(ValueError):
+    """Something the user gave cannot be used: one line says what, why and, if known, the cure."""
+
+
+class BrokenOffError(RuntimeError):
+    """A run could not go on, although everything given was valid: one line says why."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A part of a run, in seconds from its first sample: from_s <= t < to_s."""
+
+    from_s: float = 0.0
+    to_s: float = inf
+
+
+WHOLE = Span()
+
+
+def add_common_options(parser: argparse.ArgumentParser) -> None:
+    """Add what `bringup` and `simulate` have in common."""
+    parser.add_argument(
+        '--config', type=Path, metavar='FILE',
+        help="ROS 2 parameter file, or the name of a shipped one (default: the paper's example)",
+    )
+    parser.add_argument(
+        '--set', action='append', default=[], metavar='[AXIS/]KEY=VALUE', dest='settings',
+        help='change one parameter, of all axes or of one; may be given again',
+    )
+    parser.add_argument(
+        '--axis', default='', metavar='NAME',
+        help='take this axis alone from a file with several axes',
+    )
+    parser.add_argument('--seed', type=int, metavar='N', help='seed of the simulated noise')
+    add_out_option(parser)
+
+
+def add_out_option(parser: argparse.ArgumentParser) -> None:
+    """Add --out, for `files.result_directory`."""
+    parser.add_argument(
+        '--out', type=Path, metavar='DIR',
+        help='folder of the results (default: results/<UTC time>, and results/latest points at it)',
+    )
+
+
+def add_span_options(parser: argparse.ArgumentParser) -> None:
+    """Add --from and --to, for `span_of`."""
+    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
+                        help='leave out what was before this time [s]')
+    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
+                        help='leave out what was from this time [s] on')
+
+
+def span_of(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Span:
+    """The part of a run between --from and --to; ends the process where there is none."""
+    if not options.from_s < options.to_s:
+        parser.error(f'--from {options.from_s:g} must be < --to {options.to_s:g}')
+    return Span(options.from_s, options.to_s)
+
+
+def number_of_samples(parameters: Parameters, duration: float | None) -> int:
+    """Length of a run: duration [s] if given, else the parameter samples, else 10 s.
+
+    Raises InputError unless the duration is a whole number of sample periods, at least one.
+    """
+    if duration is None and parameters.get_int('samples') > 0:
+        return parameters.get_int('samples')
+    if duration is None:
+        duration = DEFAULT_DURATION_S
+    if not 0.0 < duration < inf:
+        raise InputError(f'--duration={duration!r} must be finite and > 0')
+    period = parameters.get_float('sample_period')
+    samples = round(duration / period)
+    if samples < 1 or abs(duration / period - samples) > WHOLE_TOLERANCE * samples:
+        raise InputError(
+            f'--duration={duration!r} must be a whole multiple of sample_period={period!r}'
+        )
+    return samples
+
+
+def run_tool(name: str, tool: Callable[[], None]) -> int:
+    """Run a tool and return its exit code; whatever stops it becomes one line on stderr.
+
+    Call it from the main thread: a SIGTERM stops the tool as a Ctrl-C does.
+    """
+    handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        tool()
+    except (ParameterError, InputError) as error:
+        return _fail(name, str(error), BAD_INPUT)
+    except SystemExit as ended:
+        return int(ended.code or DONE)  # the parser of the options has said why
+    except KeyboardInterrupt:
+        return _fail(name, 'interrupted', FAILED)
+    except (BrokenOffError, OSError) as error:
+        return _fail(name, str(error), FAILED)
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    return DONE
+
+
+def _fail(name: str, message: str, code: int) -> int:
+    print(f'{name}: {message}', file=sys.stderr)
+    return code
+
+
+def print_warnings(name: str, parameters: Parameters) -> None:
+    """Print on stderr what is allowed but will make the estimate hard."""
+    # The options are read before numpy and scipy are loaded.
+    from backlash_ros.core.assembly import warnings_of
+    for warning in warnings_of(parameters):
+        print(f'{name}: warning: {warning}', file=sys.stderr)
+
+
+def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Columns aligned: the first to the left, all others to the right."""
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+    return '\n'.join(
+        '  '.join(
+            cell.rjust(width) if i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in (header, *rows)
+    )
+
+
+def number(value: float | None, digits: int = 4, unit: str = '', scale: float = 1.0) -> str:
+    """A number with its unit as text; NOTHING for None and nan."""
+    if value is None or value != value:
+        return NOTHING
+    return f'{scale * value:.{digits}g}{unit and " "}{unit}'
+
+
+class StopRequests:
+    """Counts SIGINT, SIGTERM and SIGHUP as long as the context lasts, instead of dying of them."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.last = ''
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> StopRequests:
+        for caught in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # Under nohup a hang-up stays ignored.
+            if caught != signal.SIGHUP or signal.getsignal(caught) is not signal.SIG_IGN:
+                self._before[caught] = signal.signal(caught, self._note)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for caught, handler in self._before.items():
+            signal.signal(caught, handler)
+
+    def insist(self) -> bool:
+        """Whether there was a second request."""
+        return self.count > 1
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+        self.last = signal.Signals(number).name

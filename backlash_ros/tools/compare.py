@@ -1,0 +1,270 @@
+"""`compare`: every law and structure on one scenario, as a figure, a table and a document."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core.assembly import build_model
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
+from backlash_ros.core.simulation.metrics import (
+    control_error_rms,
+    delayed_reference,
+    delayed_tracking_error_rms,
+    gap_crossings_per_reversal,
+    total_variation,
+)
+from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.options import OptionParser
+from backlash_ros.tools import cli
+from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
+from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.runs.analysis import ErrorCurves, control_error, moving_rms
+from backlash_ros.tools.runs.files import result_directory
+from backlash_ros.tools.runs.run import run_loop
+
+Array = NDArray[np.float64]
+
+DOCUMENT, FIGURE = Path('comparison.md'), Path('images/comparison.png')
+WINDOW_S = 0.5  # over which the error of a curve is averaged
+HEADER = (
+    'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
+    'crossings per reversal', 'time per step',
+)
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A loop of the comparison: its name and what sets it apart."""
+
+    name: str
+    changes: Mapping[str, object]
+    follows: bool  # whether y is meant to follow y_m; otherwise y_m sets u_d
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a contender; a figure of merit that does not apply is None.
+
+    control_error [unit of u], tracking_error relative, penalty: tracking error that the backlash
+    costs, step_us: median time of a step [us]. note: why the run broke off, if it did.
+    """
+
+    contender: Contender
+    run: RunRecord | None
+    delay: int = 0
+    control_error: float | None = None
+    tracking_error: float | None = None
+    penalty: float | None = None
+    variation: float | None = None
+    crossings: float | None = None
+    step_us: float | None = None
+    note: str = ''
+
+
+def contenders(scenario: Parameters) -> list[Contender]:
+    """The loops to compare, from the paper's to the one without a backlash."""
+    m, c_r, c_l = (scenario.get_float(f'backlash.{name}') for name in ('m', 'c_r', 'c_l'))
+    paper = {'structure': 'proportional'}
+    tracks = {'structure': 'tracking'}
+    return [
+        *(
+            Contender(f'{law}, u_d = y_m + f v', {**paper, 'estimator.law': law}, False)
+            for law in ('printed', 'lms', 'moving_horizon')
+        ),
+        Contender('gradient, four blocks', {
+            'structure': 'pole_placement', 'estimator.law': 'gradient',
+            # With less, y, which they feed back unfiltered, has to be less noisy.
+            'tracking.input_weight': 1.0,
+        }, True),
+        Contender('moving_horizon, tracking', {**tracks, 'estimator.law': 'moving_horizon'}, True),
+        Contender('wrong constants, tracking', {
+            **tracks, **_fixed(m, 1.3 * c_r, 1.3 * c_l), 'fixed.doubt': 0.5,
+        }, True),
+        Contender('no compensation, tracking', {
+            **tracks, **_fixed(m, 0.0, 0.0), 'fixed.doubt': 0.5,
+        }, True),
+        Contender('no backlash, tracking', {
+            **tracks, **_fixed(m, 0.0, 0.0), **_NO_GAP,
+        }, True),
+    ]
+
+
+# A gap is wider than nothing by definition (2.1); this one is as good as none.
+_NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
+
+
+def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
+    return {
+        'estimator.law': 'fixed', 'estimator.initial.m': m, 'estimator.initial.c_r': c_r,
+        'estimator.initial.c_l': c_l,
+    }
+
+
+def compare(scenario: Parameters, samples: int) -> list[Result]:
+    """Run every contender and return its figures of merit.
+
+    Where y follows y_m, y_m is scaled by |G| at its frequency, so that every loop asks about the
+    same motion of G.
+    """
+    results = []
+    for contender in tqdm(contenders(scenario), desc='compare', unit='loop', disable=None):
+        results.append(_measure(contender, _parameters(contender, scenario), samples))
+    return results
+
+
+def _parameters(contender: Contender, scenario: Parameters) -> Parameters:
+    changed = scenario.replaced(contender.changes)
+    if not contender.follows:
+        return changed
+    z = np.exp(1j * scenario.get_float('frequency') * scenario.get_float('sample_period'))
+    gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
+    return changed.replaced({
+        name: gain * scenario.get_float(name) for name in ('amplitude', 'bias')
+    })
+
+
+def _measure(contender: Contender, parameters: Parameters, samples: int) -> Result:
+    loop = build_closed_loop(parameters)
+    delay = loop.controller.structure.delay
+    try:
+        run = run_loop(loop, samples)
+        step_us = 1e6 * median(_step_times(loop))
+    except BrokenOffError as broken:
+        return Result(contender, None, delay, note=str(broken))
+    since = 0.2 * run.samples * run.sample_period
+    result = Result(
+        contender, run, delay, control_error_rms(run),
+        variation=total_variation(run.column('v')[run.column('t') >= since]),
+        crossings=gap_crossings_per_reversal(run, since), step_us=step_us,
+    )
+    if not contender.follows:
+        return result
+    gapless = run_loop(build_closed_loop(parameters.replaced({
+        **_NO_GAP, **_fixed(parameters.get_float('backlash.m'), 0.0, 0.0), 'fixed.doubt': 0.0,
+    })), samples)
+    error, best = (delayed_tracking_error_rms(each, delay, since) for each in (run, gapless))
+    penalty = None if error is None or best is None else error - best
+    return replace(result, tracking_error=error, penalty=penalty)
+
+
+def _step_times(loop: ClosedLoop) -> list[float]:
+    """Times of some further steps of the controller [s]."""
+    times = []
+    for _ in range(100):
+        y, y_m = loop.plant.measure(), loop.reference(loop.plant.sample * loop.sample_period)
+        begin = perf_counter()
+        step = loop.controller.step(y, y_m)
+        times.append(perf_counter() - begin)
+        loop.controller.refine()
+        loop.plant.step(step.v)
+    return times
+
+
+def row(result: Result) -> tuple[str, ...]:
+    """The line of the table for a result."""
+    if result.note:
+        return (result.contender.name, 'broke off', *[NOTHING] * (len(HEADER) - 2))
+    return (
+        result.contender.name, number(result.control_error, 3), number(result.tracking_error, 3),
+        number(result.penalty, 3), number(result.variation, 3), number(result.crossings, 3),
+        number(result.step_us, 2, 'us'),
+    )
+
+
+def error_curves(result: Result) -> ErrorCurves | None:
+    """Moving RMS of the errors of a loop over WINDOW_S; None where it broke off."""
+    run = result.run
+    if run is None:
+        return None
+    samples = max(round(WINDOW_S / run.sample_period), 1)
+    tracking = None
+    if result.contender.follows:
+        tracking = moving_rms(run.column('y') - delayed_reference(run, result.delay), samples)
+    control = moving_rms(control_error(run), samples)
+    # The curve of the loop without backlash comes to lie on that of the one that has learned it.
+    width = 3.4 if tracking is not None and 'moving_horizon' in result.contender.name else 1.7
+    return ErrorCurves(result.contender.name, run.column('t'), control, tracking, width)
+
+
+def comparison_document(
+    scenario: Parameters, results: Sequence[Result], figure: str,
+) -> str:
+    """docs/results/comparison.md as text."""
+    lines = [
+        '# Comparison of laws and structures', '',
+        f'![Control error and tracking error of every loop over time]({figure})', '',
+        '| ' + ' | '.join(HEADER) + ' |', '|---' * len(HEADER) + '|',
+        *('| ' + ' | '.join(row(result)) + ' |' for result in results), '',
+    ]
+    lines += [f'- {result.contender.name}: {result.note}.' for result in results if result.note]
+    noise = scenario.get_float('output_noise_std')
+    lines += [
+        f'Scenario: the plant of the configuration, m = {scenario.get_float("backlash.m"):g}, '
+        f'c_r = {scenario.get_float("backlash.c_r"):g}, '
+        f'c_l = {scenario.get_float("backlash.c_l"):g}, '
+        f'{scenario.get_str("waveform")} at {scenario.get_float("frequency"):g} rad/s, '
+        f'noise on y with standard deviation {noise:g}. Written by `compare --out docs`; '
+        'do not edit.',
+        '',
+        "- In the paper's structure y_m sets u_d, elsewhere y follows y_m scaled by |G| at its "
+        'frequency: every loop asks for about the same motion.',
+        '- Control error: RMS of u - u_d over the last second. Tracking error: relative RMS of '
+        'y - y_m with y_m delayed as the structure says, without the first fifth of the run. '
+        'Backlash penalty: what is left of it when the error of the same structure on a plant '
+        'without backlash is subtracted.',
+        '- Total variation of v: sum of |v(k) - v(k-1)| without the first fifth. Crossings: how '
+        'often v turns back by more than half of the gap, for each reversal of y_m.',
+        '- Time: median of one step of the controller on the machine that wrote this.',
+        '- No compensation and wrong constants (the crossings 30 % too large) know the slope, '
+        'and have an observer that allows for a disturbance of u.',
+        '',
+    ]
+    return '\n'.join(lines)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `compare`."""
+    return cli.run_tool('compare', lambda: _compare(args))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The options of `compare`."""
+    parser = OptionParser('compare', description=__doc__)
+    cli.add_common_options(parser)
+    parser.add_argument('--duration', type=float, default=10.0, metavar='SECONDS',
+                        help='length of each run (default: 10)')
+    return parser
+
+
+def _compare(args: Sequence[str] | None) -> None:
+    options = make_parser().parse_args(args)
+    scenario = effective_parameters(
+        options.config, options.settings, options.seed, options.axis
+    )
+    results = compare(scenario, cli.number_of_samples(scenario, options.duration))
+    # Drawing libraries take a second to load, which bad input should not cost.
+    from backlash_ros.tools.figures import draw_comparison, png
+    print(cli.format_table(HEADER, [row(result) for result in results]))
+    out = result_directory(options.out)
+    (out / FIGURE).parent.mkdir(parents=True, exist_ok=True)
+    curves = [found for found in map(error_curves, results) if found is not None]
+    write_atomically(out / FIGURE, png(draw_comparison(curves, WINDOW_S)))
+    document = comparison_document(scenario, results, FIGURE.as_posix())
+    write_atomically(out / DOCUMENT, document)
+    print(f'document: {out / DOCUMENT}')
+
+
+if __name__ == '__main__':
+    sys.exit(main())

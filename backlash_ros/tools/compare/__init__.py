@@ -1,1 +1,0 @@
-"""`compare`: laws and structures side by side."""

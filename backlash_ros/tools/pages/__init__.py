@@ -1,1 +1,0 @@
-"""What pages and pictures of all tools are made with."""

@@ -1,0 +1,227 @@
+"""`report`: from a bag or saved results to report.html, figures and summary.json."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.options import OptionParser
+from backlash_ros.tools import figures
+from backlash_ros.tools.cli import (
+    NOTHING,
+    InputError,
+    add_out_option,
+    add_span_options,
+    number,
+    run_tool,
+    span_of,
+)
+from backlash_ros.tools.config.configuration import write_config
+from backlash_ros.tools.page import Picture, facts, page, table
+from backlash_ros.tools.runs.analysis import (
+    compare_laws,
+    compared_samples,
+    followed_reference,
+    interesting_parts,
+)
+from backlash_ros.tools.runs.bag import read_bag
+from backlash_ros.tools.runs.files import (
+    CONFIG,
+    SUMMARY,
+    result_directory,
+    write_run,
+    write_summary,
+)
+from backlash_ros.tools.runs.run import Run
+from backlash_ros.tools.runs.source import read_run
+from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
+
+PAGE = 'report.html'
+TITLE = 'Adaptive backlash inverse control'
+SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
+UNITS = {'m': 'of u/v', 'c_r': 'of v', 'c_l': 'of v'}
+
+
+def report_bag(bag: Path, out: Path, parameters: Parameters) -> dict[str, Any]:
+    """Write report, figures, samples.csv and summary.json of a bag to out; return the summary.
+
+    Prints on stderr what is wrong with the bag. Raises InputError for one without a run.
+    """
+    run = read_bag(bag, parameters.get_float('sample_period'))
+    return write_report(replace(run, parameters=parameters), out)
+
+
+def report_run(record: RunRecord, out: Path, parameters: Parameters) -> dict[str, Any]:
+    """Write report, figures, samples.csv and summary.json of a simulation to out."""
+    return write_report(Run(record, parameters), out)
+
+
+def print_notes(tool: str, run: Run) -> None:
+    """Print on stderr what the user has to know about the source of a run."""
+    for note in run.notes:
+        print(f'{tool}: warning: {note}', file=sys.stderr)
+
+
+def write_report(run: Run, out: Path) -> dict[str, Any]:
+    """Write all files of a run to out; return the summary. Raises InputError for an empty one."""
+    print_notes('report', run)
+    summary = summarise(run.record, run.parameters, run.latency_s)
+    write_run(run.record, out)
+    write_summary(summary, out / SUMMARY)
+    folded = None
+    if run.parameters is not None:
+        write_config(run.parameters, out / CONFIG)
+        folded = ('Parameters of this run', (out / CONFIG).read_text(encoding='utf-8'))
+    pictures = list(draw(run.record, run.parameters, summary))
+    for picture in pictures:
+        write_atomically(out / picture.name, picture.data)
+    notes = [f'{note[0].upper()}{note[1:]}.' for note in run.notes]
+    tables = _backlash_table(summary) + _facts(summary)
+    write_atomically(out / PAGE, page(TITLE, headline(summary), notes, [tables], pictures, folded))
+    return summary
+
+
+def draw(
+    run: RunRecord, parameters: Parameters | None, summary: Mapping[str, Any],
+) -> Iterator[Picture]:
+    """Every figure that this run allows, in the order of the page."""
+    start, end = parts = interesting_parts(run, parameters)
+    if run.has_truth:
+        yield Picture(
+            'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
+            'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
+            'the time from which the error stays within 1 %.',
+            figures.png(figures.draw_parameter_errors(run, start, summary['settling_time_s'])),
+        )
+    yield Picture(
+        'estimates.png', 'Estimates over time',
+        'What the controller has learned from v and y alone; a band shows how sure it is where '
+        'the law knows.', figures.png(figures.draw_estimates(run)),
+    )
+    if np.isfinite(run.column('u')).any():
+        yield Picture(
+            'control_error.png', 'Control error of this run',
+            'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
+            figures.png(figures.draw_control_error(run, parts)),
+        )
+    elif np.isfinite(run.column('innovation')).any():
+        yield Picture(
+            'innovation.png', 'Innovation',
+            'y minus its prediction. White and small: the model explains the plant.',
+            figures.png(figures.draw_innovation(run, parts)),
+        )
+    if run.has_truth and parameters is not None:
+        duration = compared_samples(run) * run.sample_period
+        yield Picture(
+            'laws.png', 'Control error of the laws (Figure 5 of the paper)',
+            'This run beside the other laws, simulated with the same parameters, over the first '
+            f'{duration:.6g} s. Each has its own scale; the last panel has all on one.',
+            figures.png(figures.draw_laws(compare_laws(run, parameters), start)),
+        )
+    yield Picture(
+        'hysteresis.png', 'Backlash: the v–u loop',
+        'u follows the right line going up, the left line going down, and is held between them. '
+        'Where a dashed line lies on the wide one, the estimate is right.' if run.has_truth else
+        'The loop as the last estimates see it: u itself was not measured.',
+        figures.png(figures.draw_hysteresis(run, end)),
+    )
+    reference = followed_reference(run, parameters)
+    yield Picture(
+        'output.png', 'Reference and output',
+        'y follows y<sub>m</sub>.' if reference.followed else
+        'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
+        'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
+        figures.png(figures.draw_output(run, end, reference)),
+    )
+    yield Picture(
+        'input.png', 'Desired input and control',
+        'v jumps by the width of the gap whenever u<sub>d</sub> turns.',
+        figures.png(figures.draw_input(run, parts)),
+    )
+
+
+def headline(summary: Mapping[str, Any]) -> str:
+    """The outcome in one sentence of HTML."""
+    law = summary['estimator']
+    who = f'The law <b>{escape(law)}</b>' if law else 'The controller'
+    if summary['truth']['m'] is None:
+        return f'{who} estimated the backlash; no truth was recorded to compare with.'
+    times = summary['settling_time_s']
+    late = [SYMBOLS[name] for name, time in times.items() if time is None]
+    if late:
+        return f'{who} did not bring {" and ".join(late)} to within 1 % of the truth.'
+    return (
+        f'{who} has had m, c<sub>r</sub> and c<sub>l</sub> within 1 % of the truth since '
+        f'<b>{max(times.values()):.4g} s</b>.'
+    )
+
+
+def _backlash_table(summary: Mapping[str, Any]) -> str:
+    rows = [
+        (symbol, *estimate_cells(summary, name), UNITS[name]) for name, symbol in SYMBOLS.items()
+    ]
+    rows.append(('f', number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
+    return table(('', *ESTIMATE_HEADER, 'unit'), rows)
+
+
+def _facts(summary: Mapping[str, Any]) -> str:
+    latency = summary['loop_latency_ms'] or {'p50': None, 'p99': None}
+    duration = (summary['samples'] + summary['lost_samples']) * summary['sample_period']
+    unexplained = summary['unexplained']
+    return facts([
+        ('samples', f'{summary["samples"]} in {duration:.6g} s'),
+        ('lost samples', str(summary['lost_samples'])),
+        ('sample period', f'{summary["sample_period"]:.6g} s'),
+        ('structure', escape(summary['structure'] or NOTHING)),
+        ('control error RMS, last second', number(summary['control_error_rms'], 4, '[unit of u]')),
+        ('tracking error RMS, last half',
+         number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)),
+        ('latency y → v, median', number(latency['p50'], 3, 'ms')),
+        ('latency y → v, 99th percentile', number(latency['p99'], 3, 'ms')),
+        ('state at the end', escape(summary['final_status'] or NOTHING)),
+        ('noise on y, learned / nominal', number(summary['noise_ratio'], 3)),
+        ('unexplained motion of u', NOTHING if unexplained == np.inf else
+         number(unexplained, 3, '% of m times the gap', 100.0)),
+        ('samples in state tracking',
+         number((summary['status_share'] or {}).get('tracking'), 3, '%', 100.0)),
+    ])
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `report`."""
+    return run_tool('report', lambda: _report(args))
+
+
+def _report(args: Sequence[str] | None) -> None:
+    parser = OptionParser('report', description=__doc__)
+    parser.add_argument(
+        'path', type=Path, help='a bag or its .mcap file, a folder of results, or samples.csv'
+    )
+    parser.add_argument(
+        '--config', type=Path, metavar='FILE',
+        help='parameters of the run (default: parameters.yaml beside it)',
+    )
+    add_out_option(parser)
+    add_span_options(parser)
+    parser.add_argument('--axis', default='', metavar='NAME',
+                        help='of a bag with several: the one to report (default: the first)')
+    options = parser.parse_args(args)
+    run = read_run(options.path.resolve(), options.config, span_of(parser, options), options.axis)
+    if run.record.samples == 0:
+        raise InputError(f'{options.path}: holds no sample')
+    out = result_directory(options.out)
+    write_report(run, out)
+    print(out / PAGE)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

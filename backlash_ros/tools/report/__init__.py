@@ -1,1 +1,0 @@
-"""`report`: from a run to numbers, pictures and a page."""

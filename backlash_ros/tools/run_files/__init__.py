@@ -1,1 +1,0 @@
-"""Files of a run, and runs read back from bags."""

@@ -1,0 +1,1 @@
+"""Runs: read from bags and folders of results, judged, written."""

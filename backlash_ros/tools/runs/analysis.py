@@ -1,0 +1,165 @@
+"""What the figures show, computed; drawing is left to figures.py."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.assembly import ESTIMATORS, law_fits
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.reference.signal import PERIODIC
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.metrics import delayed_reference, delayed_tracking_error_rms
+from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools.cli import BrokenOffError, InputError
+from backlash_ros.tools.runs.run import run_loop
+from backlash_ros.tools.runs.summary import reference_delay
+
+Array = NDArray[np.float64]
+
+LONGEST_COMPARISON = 10_000  # samples for which the other laws are simulated
+# RMS of the error over that of the reference below which y counts as following it.
+FOLLOWING = 0.5
+
+
+@dataclass(frozen=True)
+class Part:
+    """A stretch of a run with a name for it."""
+
+    name: str
+    rows: slice
+
+
+@dataclass(frozen=True)
+class LawTrace:
+    """Control error e = u - u_d (3.4) of one law.
+
+    rms: over the period of y_m before each time. recorded: whether it comes from the run itself;
+    the others are simulated. note: why there is no curve, if there is none.
+    """
+
+    law: str
+    t: Array
+    e: Array
+    rms: Array
+    recorded: bool
+    note: str = ''
+
+
+@dataclass(frozen=True)
+class FollowedReference:
+    """values: the reference at each sample, shape (N,), delay [s] late.
+
+    followed: whether y comes close enough to it for both to be drawn on one scale.
+    """
+
+    values: Array
+    delay: float
+    followed: bool
+
+
+@dataclass(frozen=True)
+class ErrorCurves:
+    """Moving RMS of the control error and of the tracking error of a loop, shape (N,) each.
+
+    tracking: None where y is not meant to follow y_m. width: of the line.
+    """
+
+    name: str
+    t: Array
+    control: Array
+    tracking: Array | None
+    width: float = 1.7
+
+
+def control_error(run: RunRecord) -> Array:
+    """e = u - u_d (3.4) of each sample, shape (N,); nan where u is unknown."""
+    return run.column('u') - run.column('u_d')
+
+
+def reference_period(parameters: Parameters | None) -> float | None:
+    """Period of y_m [s]; None where it has none or is not known."""
+    if parameters is None or parameters.get_str('waveform') not in PERIODIC:
+        return None
+    return 2.0 * pi / parameters.get_float('frequency')
+
+
+def interesting_parts(run: RunRecord, parameters: Parameters | None) -> tuple[Part, Part]:
+    """Start and end of a run: two periods of y_m each, or a tenth of the run."""
+    period = reference_period(parameters)
+    samples = round(2.0 * period / run.sample_period) if period else run.samples // 10
+    samples = min(max(samples, 2), run.samples)
+    return Part('Start', slice(0, samples)), Part('End', slice(run.samples - samples, None))
+
+
+def moving_rms(values: Array, samples: int) -> Array:
+    """RMS of the newest `samples` values at each place, fewer at the start; nan is left out."""
+    if values.size == 0:
+        return values
+    known = np.isfinite(values)
+    # Each sum from scratch: a running one would keep the rounding errors of large values long past.
+    window = np.ones(samples)
+    with np.errstate(over='ignore'):  # of a law that diverges
+        squares = np.convolve(np.where(known, values, 0.0) ** 2, window)[:len(values)]
+    count = np.convolve(known.astype(np.float64), window)[:len(values)]
+    return np.where(count > 0.0, np.sqrt(squares / np.maximum(count, 1.0)), np.nan)
+
+
+def compared_samples(run: RunRecord) -> int:
+    """For how many samples the laws are compared: the run with its lost ones, if not too long."""
+    length = round(float(run.column('t')[-1]) / run.sample_period) + 1
+    return min(length, LONGEST_COMPARISON)
+
+
+def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
+    """The run's law beside every other one, simulated with the same parameters (Figure 5)."""
+    samples = compared_samples(run)
+    compared = run.column('t') < (samples - 0.5) * run.sample_period
+    window = max(round((reference_period(parameters) or 1.0) / run.sample_period), 1)
+    own = parameters.get_str('estimator.law')
+    e = control_error(run)[compared]
+    traces = [LawTrace(own, run.column('t')[compared], e, moving_rms(e, window), True)]
+    for law in ESTIMATORS:
+        if law == own or not law_fits(law, parameters.get_str('structure')):
+            continue
+        try:
+            loop = build_closed_loop(parameters.replaced({'estimator.law': law}))
+            simulated = run_loop(loop, samples)
+        except (ParameterError, InputError, BrokenOffError) as error:
+            nothing = np.empty(0)
+            traces.append(LawTrace(law, nothing, nothing, nothing, False, str(error)))
+            continue
+        e = control_error(simulated)
+        traces.append(LawTrace(law, simulated.column('t'), e, moving_rms(e, window), False))
+    return traces
+
+
+def followed_reference(run: RunRecord, parameters: Parameters | None) -> FollowedReference:
+    """What y is to follow: y_m, as late as the structure makes it."""
+    delay = reference_delay(parameters)
+    half = float(run.column('t')[run.samples // 2])
+    error = delayed_tracking_error_rms(run, delay, half)
+    return FollowedReference(
+        delayed_reference(run, delay), delay * run.sample_period,
+        error is not None and error < FOLLOWING,
+    )
+
+
+def estimated_loop(run: RunRecord) -> Array:
+    """u = B[v] as the last estimates see it, for the v of the run, shape (N,)."""
+    m, c_r, c_l = (float(run.column(name)[-1]) for name in ('m', 'c_r', 'c_l'))
+    if c_l >= c_r:
+        return m * (run.column('v') - c_r)  # no gap left, and then no backlash to simulate
+    backlash = Backlash(m, c_r, c_l)
+    return np.array([backlash.step(float(v)) for v in run.column('v')])
+
+
+def frozen(run: RunRecord) -> NDArray[np.bool_]:
+    """Whether the estimates were frozen at each sample, shape (N,)."""
+    return run.column('status') >= float(Status.NOT_EXCITED)

@@ -1,0 +1,159 @@
+"""The files of a run: its folder, samples.csv, record.npz, summary.json."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timezone
+from itertools import count
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from backlash_ros.atomic_file import point_link, write_atomically
+from backlash_ros.core.loop.learned_model import from_fields
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.tools.cli import InputError
+
+RESULTS = Path('results')
+LATEST = 'latest'
+SAMPLES, RECORD, SUMMARY, CONFIG = 'samples.csv', 'record.npz', 'summary.json', 'parameters.yaml'
+LEARNED = 'learned.'  # before the names of what record.npz has of G
+SAMPLE_COLUMNS = (
+    't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
+    'status',
+)
+FEWEST_COLUMNS = 10  # samples.csv once ended with f
+
+
+def result_directory(out: Path | None) -> Path:
+    """Create and return the folder of the results: out, or results/<UTC time>.
+
+    Only the latter is what results/latest then points at. Raises InputError.
+    """
+    if out is not None:
+        _make(out)
+        return out
+    _make(RESULTS)
+    # Two runs within one second need two names.
+    name = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H-%M-%SZ')
+    for number in count(1):
+        directory = RESULTS / (name if number == 1 else f'{name}-{number}')
+        try:
+            directory.mkdir()
+        except FileExistsError:
+            continue
+        point_link(RESULTS / LATEST, directory.name)
+        break
+    return directory
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f'{directory}: cannot be made a folder: {error.strerror}') from None
+
+
+def write_summary(summary: Mapping[str, Any], path: Path) -> None:
+    """Write strict JSON: what is not finite becomes null."""
+    text = json.dumps(_finite_or_null(summary), indent=2, allow_nan=False)
+    write_atomically(path, text + '\n')
+
+
+def _finite_or_null(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite_or_null(element) for key, element in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite_or_null(element) for element in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
+
+
+def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Write a CSV; a float in full precision, nothing for None and nan."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator='\n')
+    writer.writerow(header)
+    writer.writerows([_cell(value) for value in row] for row in rows)
+    write_atomically(path, buffer.getvalue())
+
+
+def _cell(value: object) -> str:
+    if value is None or value != value:
+        return ''
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def write_run(run: RunRecord, directory: Path) -> None:
+    """Write samples.csv for everyone, and record.npz with all that `report` can draw."""
+    columns = [run.column(name) for name in SAMPLE_COLUMNS]
+    write_table(directory / SAMPLES, SAMPLE_COLUMNS, np.column_stack(columns).tolist())
+    learned = run.learned.fields() if run.learned is not None else {}
+    arrays: dict[str, Any] = {
+        f'{LEARNED}{label}': np.array(values) for label, values in learned.items()
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer, columns=np.array(COLUMNS), rows=run.rows, sample_period=run.sample_period,
+        lost_samples=run.lost_samples, **arrays,
+    )
+    write_atomically(directory / RECORD, buffer.getvalue())
+
+
+def read_record(path: Path) -> RunRecord:
+    """Read record.npz; a column that an older one lacks is unknown. Raises InputError."""
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            rows = np.full((len(stored['rows']), len(COLUMNS)), np.nan)
+            for name, column in zip(stored['columns'].tolist(), stored['rows'].T, strict=True):
+                if name in COLUMNS:
+                    rows[:, COLUMNS.index(name)] = column
+            fields = {
+                name.removeprefix(LEARNED): stored[name].tolist()
+                for name in stored.files if name.startswith(LEARNED)
+            }
+            return RunRecord(
+                rows, float(stored['sample_period']), int(stored['lost_samples']),
+                from_fields(fields) if fields else None,
+            )
+    except (OSError, KeyError, ValueError, IndexError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f'{path}: is not a record of a run: {error}') from None
+
+
+def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
+    """Read samples.csv, also one without the later columns; the true backlash is unknown.
+
+    sample_period: None takes the smallest distance of two rows. Raises InputError.
+    """
+    try:
+        with path.open(newline='', encoding='utf-8') as file:
+            header, *lines = list(csv.reader(file)) or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f'{path}: cannot be read: {error}') from None
+    if tuple(header) not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:FEWEST_COLUMNS]):
+        raise InputError(f'{path}: line 1: must be the header {",".join(SAMPLE_COLUMNS)}')
+    if not lines:
+        raise InputError(f'{path}: holds no sample')
+    rows = np.full((len(lines), len(COLUMNS)), np.nan)
+    places = [COLUMNS.index(name) for name in header]
+    for i, line in enumerate(lines):
+        try:
+            rows[i, places] = [float(cell) if cell else np.nan for cell in line]
+        except ValueError:
+            raise InputError(f'{path}: line {i + 2}: must hold {len(header)} numbers') from None
+    t = rows[:, COLUMNS.index('t')]
+    steps = np.diff(t)
+    if not np.all(steps > 0.0):
+        line_number = int(np.flatnonzero(~(steps > 0.0))[0]) + 3
+        raise InputError(f'{path}: line {line_number}: t must rise from row to row')
+    if sample_period is None:
+        if not len(steps):
+            raise InputError(f'{path}: needs two samples to tell the sample period')
+        sample_period = float(steps.min())
+    lost = max(round((t[-1] - t[0]) / sample_period) + 1 - len(t), 0)
+    return RunRecord(rows, sample_period, lost)

@@ -1,0 +1,243 @@
+"""`simulate`: the controller and the plant in one process, once, for many seeds or in a sweep."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from math import inf, isfinite, nan
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.options import OptionParser
+from backlash_ros.tools import batch, cli
+from backlash_ros.tools.batch import Job, Outcome, statistics
+from backlash_ros.tools.cli import DEFAULT_DURATION_S, InputError, format_table
+from backlash_ros.tools.cluster import run_on_cluster
+from backlash_ros.tools.config.configuration import effective_parameters, write_config
+from backlash_ros.tools.runs.files import CONFIG, result_directory, write_table
+from backlash_ros.tools.runs.run import run_loop
+from backlash_ros.tools.runs.summary import estimate_table
+from backlash_ros.topics import BACKLASH
+
+SEEDS, SWEEP, SWEEP_FIGURE = 'seeds.csv', 'sweep.csv', 'sweep.png'
+NAMED_SEEDS = 10  # that an answer lists before it refers to the CSV
+
+Group = tuple[Mapping[str, Value], Sequence[Outcome]]  # a change and the outcomes of its runs
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `simulate`."""
+    return cli.run_tool('simulate', lambda: _simulate(args))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The options of `simulate`."""
+    parser = OptionParser('simulate', description=__doc__)
+    cli.add_common_options(parser)
+    parser.add_argument(
+        '--duration', type=float, metavar='SECONDS',
+        help=f'length of a run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s)',
+    )
+    parser.add_argument(
+        '--seeds', type=int, metavar='N',
+        help='run N seeds, from --seed on, in parallel and print their statistics',
+    )
+    parser.add_argument(
+        '--sweep', action='append', default=[], metavar='KEY=v1,v2,...',
+        help='run every value of a parameter; given again, every combination',
+    )
+    parser.add_argument(
+        '--cluster', metavar='ADDRESS',
+        help='let the workers of this Dask scheduler (tcp://HOST:PORT) do the runs of --seeds and '
+             "--sweep; needs pip install 'backlash_ros[cluster]'",
+    )
+    return parser
+
+
+def _simulate(args: Sequence[str] | None) -> None:
+    options = make_parser().parse_args(args)
+    parameters = effective_parameters(
+        options.config, options.settings, options.seed, options.axis
+    )
+    if options.seeds is not None and options.seeds < 1:
+        raise InputError(f'--seeds={options.seeds} must be >= 1')
+    if options.seeds is not None or options.sweep:
+        _many(parameters, options)
+    elif options.cluster is not None:
+        raise InputError('--cluster does many runs: give --seeds or --sweep as well')
+    else:
+        _once(parameters, options.duration, options.out)
+
+
+def _once(parameters: Parameters, duration: float | None, out: Path | None) -> None:
+    # Drawing libraries take a second to load, which neither a worker nor bad input should cost.
+    from backlash_ros.tools.report import PAGE, report_run
+    samples = cli.number_of_samples(parameters, duration)
+    loop = build_closed_loop(parameters)
+    cli.print_warnings('simulate', parameters)
+    _refuse_bad(out)
+    # disable=None: no bar where stderr is not a terminal.
+    with tqdm(total=samples, desc='simulate', unit='sample', disable=None) as bar:
+        run = run_loop(loop, samples, lambda _: bar.update())
+    directory = result_directory(out)
+    print(estimate_table(report_run(run, directory, parameters)))
+    print(f'report: {directory / PAGE}')
+
+
+def _refuse_bad(out: Path | None) -> None:
+    """Fail before a long run, not after it; a folder of its own is made only for a whole run."""
+    if out is not None:
+        result_directory(out)
+
+
+def _many(parameters: Parameters, options: argparse.Namespace) -> None:
+    sweeps = [batch.parse_sweep(text) for text in options.sweep]
+    swept = [sweep.name for sweep in sweeps]
+    if 'seed' in swept and options.seeds is not None:
+        raise InputError('--seeds and --sweep seed=... exclude each other')
+    changes = batch.combinations(sweeps)
+    first = parameters.get_int('seed')
+    seeds = range(first, first + (options.seeds or 1))
+    jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
+    _refuse_bad(options.out)
+    outcomes = batch.run_jobs(jobs, label='simulate') if options.cluster is None \
+        else run_on_cluster(jobs, options.cluster, label='simulate')
+    directory = result_directory(options.out)
+    write_config(parameters, directory / CONFIG)
+    csv = directory / (SWEEP if swept else SEEDS)
+    write_outcomes(csv, swept, jobs, outcomes)
+    # The jobs of one change stand together.
+    size = len(outcomes) // len(changes)
+    groups = [
+        (change, outcomes[i * size:(i + 1) * size]) for i, change in enumerate(changes)
+    ]
+    if swept:
+        print(_sweep_table(swept, groups))
+        from backlash_ros.tools.figures import draw_sweep, png
+        figure = draw_sweep(swept[0], sweeps[0].values, _lines(swept, groups), ', '.join(swept[1:]))
+        write_atomically(directory / SWEEP_FIGURE, png(figure))
+        print(f'figure: {directory / SWEEP_FIGURE}')
+    else:
+        print(_seeds_table(outcomes))
+    for line in _shortfalls(jobs, outcomes):
+        print(line)
+    print(f'runs: {csv}')
+
+
+def write_outcomes(
+    path: Path, swept: Sequence[str], jobs: Sequence[Job], outcomes: Sequence[Outcome],
+) -> None:
+    """Write a row per run, with nothing where a number is unknown or never reached."""
+    header = [
+        *swept, 'seed',
+        *(f'{prefix}{name}' for prefix in ('', 'std_', 'true_', 'settling_') for name in BACKLASH),
+        'control_error_rms', 'tracking_error_rms', 'lost_samples', 'problem',
+    ]
+    rows: list[list[object]] = []
+    for job, outcome in zip(jobs, outcomes, strict=True):
+        values = [job.values[name] for name in (*swept, 'seed')]
+        rows.append([
+            *(list(value) if isinstance(value, tuple) else value for value in values),
+            *outcome.final, *outcome.std, *outcome.truth,
+            *(time if isfinite(time) else None for time in outcome.settling),
+            outcome.control_error_rms, outcome.tracking_error_rms, outcome.lost_samples,
+            outcome.problem,
+        ])
+    write_table(path, header, rows)
+
+
+def _seeds_table(outcomes: Sequence[Outcome]) -> str:
+    """Statistics of each parameter over the seeds, as text; raises InputError if all broke off."""
+    header = ['', 'bias', 'RMSE', 'settled, median', 'settled, last', 'within 1 %']
+    of = statistics(outcomes)
+    known = all(isfinite(s.nees) for s in of.values())
+    if known:
+        low, high = of['m'].nees_interval
+        header.append(f'NEES ({low:.2f} to {high:.2f})')
+    rows = []
+    for name, s in of.items():
+        row = [name, f'{s.bias:+.3g}', f'{s.rmse:.3g}', _seconds(s.settling_median),
+               _seconds(s.settling_max), f'{100.0 * s.within:.4g} %']
+        rows.append([*row, f'{s.nees:.2f}'] if known else row)
+    return format_table(header, rows)
+
+
+def _sweep_table(swept: Sequence[str], groups: Sequence[Group]) -> str:
+    """A row for each combination: RMSE of each parameter, when the slowest settles, as text."""
+    header = [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %']
+    rows = []
+    for change, outcomes in groups:
+        row = [batch.value_text(change[name]) for name in swept]
+        if all(outcome.problem for outcome in outcomes):
+            rows.append([*row, *['-'] * 3, 'broke off', '-'])
+            continue
+        of = statistics(outcomes)
+        rows.append([
+            *row, *(f'{of[name].rmse:.3g}' for name in BACKLASH),
+            _seconds(max(s.settling_median for s in of.values())),
+            f'{100.0 * min(s.within for s in of.values()):.4g} %',
+        ])
+    return format_table(header, rows)
+
+
+def _lines(swept: Sequence[str], groups: Sequence[Group]) -> dict[str, NDArray[np.float64]]:
+    """RMSE of m, c_r, c_l [% of the truth] and settling time [s] over the first swept parameter.
+
+    A line, shape (4, values), for each combination of the other parameters.
+    """
+    lines: dict[str, list[list[float]]] = {}
+    for change, outcomes in groups:
+        name = ', '.join(batch.value_text(change[other]) for other in swept[1:])
+        line = lines.setdefault(name, [])
+        whole = [outcome for outcome in outcomes if not outcome.problem]
+        if not whole:
+            line.append([nan] * 4)
+            continue
+        final, truth = (np.array([getattr(one, key) for one in whole]) for key in
+                        ('final', 'truth'))
+        # Nothing is a percentage of zero, and the logarithm has no zero.
+        relative = final / np.where(truth == 0.0, nan, truth) - 1.0
+        rmse = np.maximum(100.0 * np.sqrt(np.mean(relative**2, axis=0)), 1e-10)
+        slowest = max(s.settling_median for s in statistics(whole).values())
+        line.append([*rmse.tolist(), nan if slowest == inf else slowest])
+    return {name: np.array(line).T for name, line in lines.items()}
+
+
+def _shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> list[str]:
+    """Lines that name the runs that broke off or did not end within 1 %."""
+    lines = []
+    pairs = list(zip(jobs, outcomes, strict=True))
+    broken = [job for job, outcome in pairs if outcome.problem]
+    if broken:
+        first = next(outcome.problem for outcome in outcomes if outcome.problem)
+        lines.append(f'broke off: {_seeds(broken)}, the first one with: {first}')
+    missed = [
+        job for job, outcome in pairs
+        if not outcome.problem and not all(isfinite(time) for time in outcome.settling)
+    ]
+    if missed:
+        lines.append(f'not within 1 % at the end: {_seeds(missed)}')
+    return lines
+
+
+def _seeds(jobs: Sequence[Job]) -> str:
+    named = list(dict.fromkeys(str(job.values['seed']) for job in jobs))
+    more = ', ...' if len(named) > NAMED_SEEDS else ''
+    runs = '1 run' if len(jobs) == 1 else f'{len(jobs)} runs'
+    return f'{runs}, seed {", ".join(named[:NAMED_SEEDS])}{more}'
+
+
+def _seconds(time: float) -> str:
+    return f'{time:.4g} s' if isfinite(time) else 'never'
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""`simulate`: one run, many seeds, sweeps, in one process."""

@@ -1,0 +1,226 @@
+"""Random plants, gaps and references for the estimation and tracking benchmarks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from accuracy.cramer_rao import cramer_rao
+from backlash_ros.core.assembly import build_true_model
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+
+Array = NDArray[np.float64]
+
+PERIODS = 3
+NOISE_TO_SWING = 0.002  # noise on y over its swing, at most
+TOLD = 0.004  # relative Cramér-Rao bound of the loop that knows the backlash, at most
+TOLD_UNCERTAIN = 0.006  # the same where G is off, and more error is allowed
+SPREAD = 0.1  # by which each time constant is off, up or down, where G is
+UNCERTAINTY = 0.2  # that is told then
+STEP = 1e-3  # of the logarithm of a time constant, for a derivative
+ITERATIONS, CLOSER = 50, 0.99  # to the noise of a bound
+DRAWS = 10  # two for every pole of a plant
+NEAR_ONE = 1e-6  # distance of a pole from 1 that makes it an integrator
+
+
+@dataclass(frozen=True)
+class Case:
+    """One random case: what the package is given, and how long it may take."""
+
+    seed: int
+    parameters: Parameters
+    samples: int  # three periods of the reference
+    kind: str
+
+
+def random_plant(rng: np.random.Generator) -> tuple[Array, Array, str]:
+    """Numerator, denominator and a description of a stable or integrating G of order 1 to 5."""
+    order = int(rng.integers(1, 6))
+    integrating = bool(rng.random() < 0.4)
+    poles: list[complex] = [1.0] if integrating else []
+    while len(poles) < order:
+        if len(poles) + 2 <= order and rng.random() < 0.3:
+            radius, angle = rng.uniform(0.6, 0.97), rng.uniform(0.05, 0.6)
+            poles += [radius * np.exp(1j * angle), radius * np.exp(-1j * angle)]
+        else:
+            poles.append(float(np.exp(-np.exp(rng.uniform(np.log(0.01), np.log(0.5))))))
+    zeros: list[float] = []
+    outside = False
+    for _ in range(int(rng.integers(0, order))):
+        if rng.random() < 0.4:
+            zeros.append(float(rng.choice([-1.0, 1.0]) * rng.uniform(1.15, 4.0)))
+            outside = True
+        else:
+            zeros.append(float(rng.uniform(-0.9, 0.8)))
+    numerator = np.atleast_1d(np.real(np.poly(zeros))) * 10.0 ** rng.uniform(-4.0, 0.0)
+    denominator = np.real(np.poly(poles))
+    kind = f'order {order}{" integrating" if integrating else ""}{" nmp" if outside else ""}'
+    return numerator, denominator, kind
+
+
+def random_case(seed: int, **fixed: object) -> Case:
+    """The case of a seed; `fixed` overrides parameters.
+
+    A case asks what the motion tells. Its noise is 0.2 % of the swing of y, or less where the
+    Cramér-Rao bound of the loop that knows the backlash is beyond 0.4 % for m, c_r or c_l after the
+    three periods, as for a small c_r beside a large c_l. No estimator has a part in that.
+    """
+    case, samples_per_period = _without_noise(seed)
+    return _with_noise(case, _noise(case.parameters, samples_per_period, TOLD), fixed)
+
+
+def uncertain_case(seed: int) -> Case:
+    """The case of a seed with a plant that is another one than G, as `altered` says.
+
+    The reference is slower than every pole, omega tau <= 1: to a faster one a time constant is a
+    gain, which y does not tell from m. The bound that limits the noise is 0.6 %, for time constants
+    and damping that are known as well as they are spread.
+    """
+    case, samples_per_period = _without_noise(seed, below_corners=True)
+    p = case.parameters
+    numerator, denominator = altered(
+        np.array(p.get_floats('plant.numerator')), np.array(p.get_floats('plant.denominator')),
+        _off(np.random.default_rng([seed, 21])),
+    )
+    p = p.replaced({
+        'truth.numerator': numerator.tolist(), 'truth.denominator': denominator.tolist(),
+        'plant.uncertainty': UNCERTAINTY,
+    })
+    case = replace(case, parameters=p)
+    return _with_noise(case, _noise(p, samples_per_period, TOLD_UNCERTAIN), {})
+
+
+def _off(rng: np.random.Generator) -> Array:
+    """Logarithms for `altered`: every time constant off by SPREAD, the damping as it was."""
+    signs = rng.choice([-1.0, 1.0], DRAWS // 2)
+    return np.column_stack([signs * np.log1p(SPREAD), np.zeros(DRAWS // 2)]).ravel()
+
+
+def _without_noise(seed: int, below_corners: bool = False) -> tuple[Case, int]:
+    """The case, and the samples of a period.
+
+    below_corners: whether the reference is no faster than the slowest pole.
+    """
+    rng = np.random.default_rng([seed, 20])
+    numerator, denominator, kind = random_plant(rng)
+    m = float(np.exp(rng.uniform(np.log(0.3), np.log(3.0))))
+    c_r = float(np.exp(rng.uniform(np.log(0.2), np.log(8.0))))
+    c_l = -float(np.exp(rng.uniform(np.log(0.2), np.log(8.0))))
+    factors = 10.0 ** rng.uniform(-1.0, 1.0, 3)
+    first = (m * factors[0], c_r * factors[1], c_l * factors[2])
+    samples_per_period = int(rng.integers(40, 200))
+    if below_corners:
+        samples_per_period = max(samples_per_period, ceil(2.0 * np.pi * _slowest(denominator)))
+    period = 0.01
+    omega = 2.0 * np.pi / (samples_per_period * period)
+    waveform = str(rng.choice(['sine', 'multisine']))
+    f = 0.22 * m if rng.random() < 0.5 else 0.0
+    # Through (3.2) a first slope that is too large makes v small: y_m is chosen so that v swings
+    # over 1.5 to 4 gaps with the true slope and with the first one.
+    slope = max(m, first[0]) - min(f, 0.8 * min(m, first[0]))
+    crest = 1.0 if waveform == 'sine' else 0.5
+    amplitude = float(rng.uniform(1.5, 4.0)) * 0.5 * (c_r - c_l) * slope / crest
+    parameters = Parameters({
+        'plant.numerator': numerator.tolist(), 'plant.denominator': denominator.tolist(),
+        'backlash.m': m, 'backlash.c_r': c_r, 'backlash.c_l': c_l,
+        'backlash.initial_u': float(rng.uniform(-1.0, 1.0) * amplitude),
+        'estimator.initial.m': first[0], 'estimator.initial.c_r': first[1],
+        'estimator.initial.c_l': first[2], 'proportional.f': f,
+        'waveform': waveform, 'amplitude': amplitude, 'frequency': float(omega),
+        'sample_period': period, 'seed': seed, 'plant.uncertainty': 0.0,
+    })
+    samples = PERIODS * samples_per_period
+    return Case(seed, parameters, samples, f'{kind} {waveform}'), samples_per_period
+
+
+def _slowest(denominator: Array) -> float:
+    """Longest time constant of the poles that are no integrators [samples]."""
+    sizes = [abs(pole) for pole in np.roots(denominator) if abs(pole - 1.0) >= NEAR_ONE]
+    return float(-1.0 / np.log(max(sizes))) if sizes else 0.0
+
+
+def _with_noise(case: Case, noise: float, fixed: Mapping[str, object]) -> Case:
+    changes = {'output_noise_std': noise, 'estimator.output_noise_std': noise, **fixed}
+    return replace(case, parameters=case.parameters.replaced(changes))
+
+
+def altered(numerator: Array, denominator: Array, logs: Array) -> tuple[Array, Array]:
+    """G(z) with other time constants and damping; zeros, integrators and gain at rest stay.
+
+    logs: logarithms of two factors for each pole, shape (2 n,) or longer: on its natural frequency
+    and, in complex pairs, on its damping.
+    """
+    poles: list[complex] = []
+    before = np.roots(denominator)
+    factors = np.exp(logs).reshape(-1, 2)
+    for pole, (frequency, damping) in zip(before, factors, strict=False):
+        if abs(pole - 1.0) < NEAR_ONE:
+            poles.append(1.0)
+        elif pole.imag >= 0.0:
+            rate = np.log(complex(pole)) * frequency
+            if pole.imag == 0.0:
+                poles.append(float(np.exp(rate.real)))
+            else:
+                ratio = -damping * rate.real / abs(rate)
+                root = np.sqrt(complex(ratio**2 - 1.0))
+                poles += np.exp(abs(rate) * np.array([root - ratio, -root - ratio])).tolist()
+    gain = np.prod([1.0 - pole for pole in poles if pole != 1.0]) \
+        / np.prod([1.0 - pole for pole in before if abs(pole - 1.0) >= NEAR_ONE])
+    return np.real(gain) * numerator, np.asarray(np.real(np.poly(poles)))
+
+
+def bound_of(p: Parameters, v: Array) -> Array:
+    """Relative Cramér-Rao bounds of (m, c_r, c_l) for v (N,), with what is known of G; (3,)."""
+    truth = p.get_float('backlash.m'), p.get_float('backlash.c_r'), p.get_float('backlash.c_l')
+    model = build_true_model(p)
+    numerator, denominator = model.numerator, model.denominator
+
+    def effects(u: Array) -> Array:
+        steps = SPREAD * STEP * np.eye(2 * model.order)
+        there, back = (
+            np.array([_response(*altered(numerator, denominator, s), u) for s in sign * steps])
+            for sign in (1.0, -1.0)
+        )
+        return np.asarray((there - back).T / (2.0 * STEP))
+
+    bound = cramer_rao(
+        v,
+        numerator,
+        denominator,
+        truth,
+        p.get_float('output_noise_std'),
+        u0=p.get_float('backlash.initial_u'),
+        effects=effects if p.get_float('plant.uncertainty') else None,
+    )
+    return np.asarray(bound / np.abs(truth))
+
+
+def _response(numerator: Array, denominator: Array, u: Array) -> Array:
+    delayed = np.concatenate([np.zeros(len(denominator) - len(numerator)), numerator])
+    return np.asarray(lfilter(delayed, denominator, u))
+
+
+def _noise(p: Parameters, samples_per_period: int, told: float) -> float:
+    """Deviation of the noise on y, from the loop that knows the backlash, without noise.
+
+    told: bound that the noise may lead to.
+    """
+    known = p.replaced({
+        'estimator.law': 'fixed', 'plant.uncertainty': 0.0,
+        **{f'estimator.initial.{name}': p[f'backlash.{name}'] for name in ('m', 'c_r', 'c_l')},
+    })
+    run = build_closed_loop(known).run(PERIODS * samples_per_period + 1)
+    noise = NOISE_TO_SWING * float(np.ptp(run.column('y')[-samples_per_period:]))
+    # With less noise the bound falls, but no faster: what was known before counts less.
+    for _ in range(ITERATIONS):
+        bound = float(bound_of(p.replaced({'output_noise_std': noise}), run.column('v')[:-1]).max())
+        if bound <= told:
+            break
+        noise *= CLOSER * told / bound
+    return noise

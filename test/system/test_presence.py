@@ -1,0 +1,62 @@
+"""Publishers of a command on this machine, known without the middleware."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
+
+DOMAIN = os.getpid() + 1000  # of no ROS, so of nobody else
+LONG = '/a_name' * 30
+
+pytestmark = pytest.mark.skipif(not LISTED.exists(), reason='needs Linux')
+
+
+@pytest.fixture
+def here() -> Iterator[Presence]:
+    with closing(Presence(DOMAIN, '/control', 'a')) as presence:
+        yield presence
+
+
+def test_a_publisher_of_the_same_topic_is_seen_until_it_lets_go(here: Presence) -> None:
+    assert here.others() == frozenset()
+    with closing(Presence(DOMAIN, '/control', 'b')) as other:
+        assert here.others() == {'b'}
+        assert other.others() == {'a'}
+    assert here.others() == frozenset()
+
+
+@pytest.mark.parametrize(('offset', 'topic'), [(1, '/control'), (0, '/x/control')])
+def test_other_domains_and_topics_are_nobodys_business(
+    here: Presence, offset: int, topic: str,
+) -> None:
+    with closing(Presence(DOMAIN + offset, topic, 'b')) as other:
+        assert here.others() == other.others() == frozenset()
+
+
+def test_a_topic_may_have_a_long_name() -> None:
+    with closing(Presence(DOMAIN, LONG, 'a' * 32)), \
+            closing(Presence(DOMAIN, LONG, 'b' * 32)) as other:
+        assert other.others() == {'a' * 32}
+
+
+def test_a_killed_process_is_gone_at_once(here: Presence) -> None:
+    code = (
+        'import sys\nfrom backlash_ros.nodes.diagnostics.presence import Presence\n'
+        f'presence = Presence({DOMAIN}, "/control", "b")\nprint(flush=True)\nsys.stdin.read()'
+    )
+    with subprocess.Popen(
+        [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert here.others() == {'b'}
+        process.kill()
+        process.wait()
+    assert here.others() == frozenset()

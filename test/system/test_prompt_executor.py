@@ -1,0 +1,224 @@
+"""The executor of the nodes: messages at once, and nothing else forgotten over them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from rclpy.context import Context
+from rclpy.node import Node
+from ros_processes import wait_until
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+from backlash_ros.nodes.runtime import prompt_executor
+from backlash_ros.nodes.runtime.inbox import Inbox
+from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, PromptExecutor, make_executor
+from backlash_ros.nodes.runtime.spin import spin_paced
+from backlash_ros.tools.bringup.domains import free_domain
+
+
+class Loop:
+    """A node that talks to itself."""
+
+    def __init__(self, domain: int, executor: type[NodeExecutor]) -> None:
+        self.context = Context()
+        rclpy.init(args=[], context=self.context, domain_id=domain)
+        self.node = Node('loop', context=self.context)
+        self.executor = executor(self.node)
+        self.publisher = self.node.create_publisher(Float64, 'number', 10)
+
+    def spin_until(self, condition: Callable[[], object], what: str) -> None:
+        """Serve until condition holds."""
+        wait_until(condition, what, lambda: self.executor.spin_once(timeout_sec=0.02))
+
+    def say(self, *values: float) -> None:
+        """Publish to whoever has been found."""
+        self.spin_until(self.publisher.get_subscription_count, 'a subscriber')
+        for value in values:
+            self.publisher.publish(Float64(data=value))
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.shutdown(context=self.context)
+
+
+@pytest.fixture(params=[PromptExecutor, NodeExecutor])
+def loop(request: pytest.FixtureRequest) -> Iterator[Loop]:
+    """With the executor for the known versions of rclpy, and with the one for all others."""
+    with free_domain() as domain:
+        loop = Loop(domain, request.param)
+        yield loop
+        loop.close()
+
+
+@pytest.fixture
+def fast_loop() -> Iterator[Loop]:
+    with free_domain() as domain:
+        loop = Loop(domain, PromptExecutor)
+        yield loop
+        loop.close()
+
+
+def test_installed_rclpy_is_one_that_the_fast_executor_is_known_to_work_with(
+    fast_loop: Loop,
+) -> None:
+    warnings: list[str] = []
+    executor = make_executor(fast_loop.node, warnings.append)
+    executor.shutdown()
+    assert type(executor) is PromptExecutor
+    assert warnings == []
+
+
+@pytest.mark.parametrize('other', ['9.1.2', '7.0.4', None])
+def test_another_rclpy_serves_by_itself_and_one_warning_says_so(
+    fast_loop: Loop, monkeypatch: pytest.MonkeyPatch, other: str | None,
+) -> None:
+    def version(name: str) -> str:
+        assert name == 'rclpy'
+        if other is None:
+            raise PackageNotFoundError
+        return other
+
+    monkeypatch.setattr(prompt_executor, 'version', version)
+    warnings: list[str] = []
+    executor = make_executor(fast_loop.node, warnings.append)
+    executor.shutdown()
+    assert type(executor) is NodeExecutor
+    (warning,) = warnings
+    assert f'rclpy {other or "of unknown version"} is not one' in warning
+
+
+def test_every_message_is_served_in_order_with_its_number_where_that_is_wanted(
+    loop: Loop,
+) -> None:
+    plain: list[float] = []
+    numbered: list[tuple[float, int]] = []
+
+    def hear_number(message: Float64, info: dict[str, Any]) -> None:
+        numbered.append((message.data, info['publication_sequence_number']))
+
+    loop.node.create_subscription(Float64, 'number', lambda message: plain.append(message.data), 10)
+    untyped: Any = hear_number
+    loop.node.create_subscription(Float64, 'number', untyped, 10)
+    loop.spin_until(lambda: loop.publisher.get_subscription_count() == 2, 'both subscribers')
+    loop.say(*map(float, range(5)))
+    loop.spin_until(lambda: len(plain) == len(numbered) == 5, 'five messages')
+    assert plain == list(range(5))
+    first = numbered[0][1]
+    assert numbered == [(value, first + value) for value in range(5)]
+
+
+def test_messages_of_an_inbox_wait_until_they_are_taken_and_wake_nobody(loop: Loop) -> None:
+    inbox = Inbox(loop.node, Float64, 'number', 3)
+    other: list[float] = []
+    loop.node.create_subscription(Float64, 'other', lambda message: other.append(message.data), 10)
+    publisher = loop.node.create_publisher(Float64, 'other', 10)
+    loop.spin_until(publisher.get_subscription_count, 'the other subscriber')
+    loop.say(*map(float, range(5)))
+    # What is said later and heard already shows that the numbers have come.
+    publisher.publish(Float64(data=1.0))
+    loop.spin_until(lambda: other, 'the other message')
+    taken = list(inbox.take_all())
+    assert [message.data for message, _ in taken] == [2.0, 3.0, 4.0]
+    numbers = [info['publication_sequence_number'] for _, info in taken]
+    assert numbers == [numbers[0], numbers[0] + 1, numbers[0] + 2]
+    assert list(inbox.take_all()) == []
+
+
+def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> None:
+    heard: list[float] = []
+    ticks: list[int] = []
+
+    def hear_and_say_again(message: Float64) -> None:
+        heard.append(message.data)
+        loop.publisher.publish(message)  # there is always one that waits
+
+    def answer(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        return response
+
+    loop.node.create_subscription(Float64, 'number', hear_and_say_again, 10)
+    loop.node.create_service(Trigger, 'ask', answer)
+    client = loop.node.create_client(Trigger, 'ask')
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    loop.node.create_timer(0.01, lambda: ticks.append(len(heard)), clock=steady)
+    loop.say(1.0)
+    loop.spin_until(lambda: len(ticks) >= 3 and len(heard) >= 3, 'ticks among messages')
+    loop.spin_until(client.service_is_ready, 'the service')
+    answered = client.call_async(Trigger.Request())
+    loop.spin_until(answered.done, 'an answer')
+    assert answered.result().success
+    assert ticks[-1] > ticks[0]  # the messages went on as well
+
+
+def test_a_guard_condition_of_another_thread_ends_a_long_wait(loop: Loop) -> None:
+    called: list[bool] = []
+    guard = loop.node.create_guard_condition(lambda: called.append(True))
+    loop.executor.spin_once(timeout_sec=0.0)
+    threading.Thread(target=guard.trigger).start()
+    loop.spin_until(lambda: called, 'the guard condition')
+    assert called == [True]
+
+
+def test_an_exception_of_a_callback_reaches_the_caller(loop: Loop) -> None:
+    def fail(message: Float64) -> None:
+        raise RuntimeError(f'{message.data:g} is not wanted')
+
+    loop.node.create_subscription(Float64, 'number', fail, 10)
+    loop.say(3.0)
+    with pytest.raises(RuntimeError, match='3 is not wanted'):
+        loop.spin_until(lambda: False, 'the exception')
+    timer = loop.node.create_timer(0.001, lambda: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        loop.spin_until(lambda: False, 'the exception of the timer')
+    loop.node.destroy_timer(timer)
+
+
+def test_what_arrived_before_a_tick_counts_though_none_was_expected(fast_loop: Loop) -> None:
+    # A driver that has heard a command too late expects none; the next one may come all the same.
+    heard: list[float] = []
+    unheard: list[int] = []
+    fast_loop.node.create_subscription(Float64, 'number', lambda msg: heard.append(msg.data), 50)
+    fast_loop.say(0.0)
+    fast_loop.spin_until(lambda: heard, 'the first number')
+
+    def tick(number: int, due_ns: int) -> bool:
+        unheard.append(1 + len(unheard) - len(heard))
+        fast_loop.publisher.publish(Float64(data=1.0))
+        return len(unheard) < 100
+
+    fast_loop.node.stopping = False
+    spin_paced(fast_loop.node, fast_loop.executor, 2e-3, tick, idle=lambda: True)
+    # A message may be on its way still; ten would be twenty milliseconds.
+    assert sorted(unheard)[-10] <= 3
+
+
+def test_what_may_wait_is_served_after_a_tick_and_not_before_one(fast_loop: Loop) -> None:
+    ticked, calls = False, []
+
+    def tick(number: int, due_ns: int) -> bool:
+        nonlocal ticked
+        ticked = True
+        return number < 100
+
+    def idle() -> bool:
+        nonlocal ticked
+        ticked = False
+        return True
+
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    fast_loop.node.create_subscription(Float64, 'number', lambda message: None, 10)
+    fast_loop.node.create_timer(0.01, lambda: calls.append(ticked), clock=steady)
+    fast_loop.node.stopping = False
+    spin_paced(fast_loop.node, fast_loop.executor, 2e-3, tick, idle)
+    assert len(calls) > 10
+    assert all(calls)

@@ -1,0 +1,167 @@
+"""How often y_m leaves, and for which sample, whatever becomes of plant_output."""
+
+from __future__ import annotations
+
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ros_processes import ros_world
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.core.loop.reference_pace import ReferencePace
+from backlash_ros.core.loop.sample_counter import SampleCounter
+
+PERIOD_S = 0.005
+STEP_S = PERIOD_S / 50.0  # by which the tests let time go on
+S_TO_NS = 1e9
+ROUNDING_S = 1e-9
+
+arrival_gaps = st.lists(st.floats(0.05, 6.0), min_size=20, max_size=120)  # periods
+
+
+def messages_of(
+    arrivals_s: list[float], end_s: float, sleeps: bool = True,
+) -> list[tuple[float, int]]:
+    """When y_m left for which sample, with outputs that arrive at these times [s].
+
+    sleeps: whether the node looks for outputs only when it has something to do, as it really does.
+    """
+    pace = ReferencePace(PERIOD_S, begins_with_output=True, now_s=0.0)
+    counter = SampleCounter(PERIOD_S)
+    waiting, sent = list(arrivals_s), []
+    now = 0.0
+    while now < end_s:
+        if not sleeps or pace.listens(now):
+            heard = [at for at in waiting if at <= now]
+            waiting = waiting[len(heard):]
+            for at in heard:
+                if counter.count(int((1.0 + at) * S_TO_NS)).is_sample:
+                    pace.hear(counter.index, at)
+        sample = pace.sample_to_send(now)
+        if sample is not None:
+            sent.append((now, sample))
+        now += STEP_S
+    return sent
+
+
+def times(count: int, period_s: float = PERIOD_S) -> list[float]:
+    return [0.5 * PERIOD_S + k * period_s for k in range(count)]
+
+
+def check_rate(sent: list[tuple[float, int]], end_s: float) -> None:
+    gaps = [later - earlier for (earlier, _), (later, _) in pairwise(sent)]
+    assert min(gaps) >= 0.5 * PERIOD_S - ROUNDING_S
+    assert len(sent) <= end_s / PERIOD_S + 2
+
+
+def test_reference_of_the_next_sample_leaves_half_a_period_after_each_output() -> None:
+    arrivals = times(100)
+    sent = messages_of(arrivals, 100 * PERIOD_S)[2:]
+    for at, sample in sent:
+        # y(sample - 1) came half a period before.
+        assert at - arrivals[sample - 1] == pytest.approx(0.5 * PERIOD_S, abs=2 * STEP_S)
+    assert [sample for _, sample in sent] == list(range(sent[0][1], sent[0][1] + len(sent)))
+
+
+def test_output_at_a_quarter_of_the_rate_brings_a_message_per_period_for_the_right_sample() -> None:
+    end_s = 100 * 4 * PERIOD_S
+    sent = messages_of(times(100, 4 * PERIOD_S), end_s)
+    check_rate(sent, end_s)
+    assert len(sent) == pytest.approx(400, abs=8)
+    for at, sample in sent[10:]:
+        assert (at - 0.5 * PERIOD_S) / PERIOD_S == pytest.approx(sample - 0.5, abs=0.6)
+
+
+@given(arrival_gaps, st.booleans())
+def test_there_is_never_more_than_a_message_per_period_nor_two_close_together(
+    gaps: list[float], sleeps: bool,
+) -> None:
+    arrivals, at = [], 0.0
+    for gap in gaps:
+        at += gap * PERIOD_S
+        arrivals.append(at)
+    end_s = at + 10 * PERIOD_S
+    sent = messages_of(arrivals, end_s, sleeps)
+    check_rate(sent, end_s)
+    samples = [sample for _, sample in sent]
+    begun = [sample for sample in samples if sample > 0]
+    assert begun == sorted(set(begun))
+
+
+def test_a_single_late_output_is_waited_for_and_then_answered_at_once() -> None:
+    arrivals = times(40)
+    arrivals[20] += 0.7 * PERIOD_S
+    sent = messages_of(arrivals, 40 * PERIOD_S)
+    check_rate(sent, 40 * PERIOD_S)
+    (at,) = [at for at, sample in sent if sample == 21]
+    assert at == pytest.approx(arrivals[20], abs=2 * STEP_S)
+
+
+def test_silence_is_gone_through_by_the_own_clock_and_leaves_no_shift() -> None:
+    arrivals = [at for at in times(300) if not 50 * PERIOD_S < at < 200 * PERIOD_S]
+    sent = messages_of(arrivals, 300 * PERIOD_S)
+    check_rate(sent, 300 * PERIOD_S)
+    assert len(sent) == pytest.approx(300, abs=3)
+    assert sent[-1][1] == pytest.approx(299, abs=1)
+
+
+def test_before_the_first_output_the_first_value_is_repeated_once_per_period() -> None:
+    sent = messages_of([], 20 * PERIOD_S)
+    assert [sample for _, sample in sent] == [0] * len(sent)
+    assert len(sent) == pytest.approx(20, abs=1)
+
+
+def test_a_node_that_waits_for_nobody_goes_on_by_its_own_clock() -> None:
+    pace = ReferencePace(PERIOD_S, begins_with_output=False, now_s=0.0)
+    sent = [pace.sample_to_send(k * STEP_S) for k in range(1000)]
+    assert [sample for sample in sent if sample is not None] == list(range(20))
+    pace.hear(7, 1000 * STEP_S)
+    assert pace.sample_to_send(1001 * STEP_S) == 20
+    pace.hear(8, 1050 * STEP_S)
+    assert pace.sample_to_send(1060 * STEP_S) is None
+    assert pace.sample_to_send(1076 * STEP_S) == 21
+
+
+def test_on_simulated_time_only_outputs_move_the_reference() -> None:
+    pace = ReferencePace(PERIOD_S, begins_with_output=True, now_s=0.0, own_clock=False)
+    pace.hear(0, 0.0)
+    sent = [pace.sample_to_send(k * STEP_S) for k in range(1000)]
+    assert {sample for sample in sent if sample is not None} == {1}
+    assert len([sample for sample in sent if sample is not None]) == pytest.approx(20, abs=1)
+
+
+@pytest.mark.parametrize('rate_hz', [50.0, 150.0])
+def test_a_driver_that_is_too_slow_does_not_make_the_node_flood(
+    tmp_path: Path, rate_hz: float,
+) -> None:
+    with ros_world(tmp_path) as world:
+        world.start('reference', {'sample_period': PERIOD_S, 'wait_for_subscribers': 1})
+        probe = world.probe()
+        heard = probe.collect(topics.REFERENCE, Float64)
+        output = probe.publisher(topics.PLANT_OUTPUT, Float64)
+        probe.wait_until(lambda: heard, 'a first reference')
+        start, k = time.monotonic(), 0
+        before = len(heard)
+        while k < 100:
+            while (left := start + k / rate_hz - time.monotonic()) > 0.0:
+                probe.spin(left)
+            output.publish(Float64(data=0.0))
+            k += 1
+        passed = time.monotonic() - start
+        assert len(heard) - before <= passed / PERIOD_S + 5
+        assert len(heard) - before >= 0.9 * k
+
+
+def test_signal_goes_on_by_the_own_clock_once_outputs_are_no_longer_waited_for() -> None:
+    pace = ReferencePace(PERIOD_S, begins_with_output=True, now_s=0.0)
+    assert [pace.sample_to_send(k * PERIOD_S) for k in range(3)] == [0, 0, 0]
+    assert pace.waits
+    pace.wait_no_longer()
+    assert not pace.waits
+    sent = [pace.sample_to_send(k * PERIOD_S) for k in range(3, 6)]
+    assert sent == [0, 1, 2]

@@ -1,0 +1,180 @@
+"""Estimates and signals one by one, for plots: their pace, their cost, their content."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isnan, nan
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+from drivers.paced_driver import controller_and_driver
+from rclpy.node import Node
+from ros_processes import ros_world
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.core.estimate import Status
+from backlash_ros.nodes.control.watch_publisher import (
+    LOOK_S,
+    PERIOD_S,
+    WatchPublisher,
+    watched_values,
+)
+
+SIGNALS = tuple(float(i) for i, _ in enumerate(topics.SIGNAL_LABELS))
+ESTIMATES = (1.3, 3.0, -2.0, 0.2, 0.1, 0.2, 0.3, nan, 7.0)
+
+
+class FakePublisher:
+    """Notes what is published and how often anybody asks for subscribers."""
+
+    def __init__(self) -> None:
+        self.listeners = self.looks = 0
+        self.sent: list[float] = []
+
+    def get_subscription_count(self) -> int:
+        self.looks += 1
+        return self.listeners
+
+    def publish(self, message: Float64) -> None:
+        self.sent.append(message.data)
+
+
+class FakeNode:
+    """Makes such publishers, kept by topic."""
+
+    def __init__(self) -> None:
+        self.publishers: dict[str, FakePublisher] = {}
+
+    def create_publisher(
+        self, message_type: type[Any], topic: str, *_: object, **__: object
+    ) -> FakePublisher:
+        assert message_type is Float64
+        return self.publishers.setdefault(topic, FakePublisher())
+
+
+def watch_of() -> tuple[WatchPublisher, Mapping[str, FakePublisher]]:
+    node = FakeNode()
+    return WatchPublisher(cast(Node, node)), node.publishers
+
+
+def run(watch: WatchPublisher, rate_hz: float, seconds: float) -> None:
+    for k in range(round(rate_hz * seconds)):
+        watch.follow(SIGNALS, ESTIMATES, k / rate_hz)
+
+
+def test_each_quantity_has_a_topic_below_the_name_of_the_node() -> None:
+    _, publishers = watch_of()
+    assert list(publishers) == [f'~/watch/{label}' for label in topics.WATCH_LABELS]
+
+
+def test_nothing_is_published_and_seldom_anything_asked_while_nobody_listens() -> None:
+    watch, publishers = watch_of()
+    run(watch, 1000.0, 10.0)
+    assert all(publisher.sent == [] for publisher in publishers.values())
+    assert all(publisher.looks <= 10.0 / LOOK_S for publisher in publishers.values())
+
+
+def test_only_what_is_listened_to_is_published() -> None:
+    watch, publishers = watch_of()
+    publishers['~/watch/c_l'].listeners = 1
+    run(watch, 100.0, 1.0)
+    assert {topic for topic, each in publishers.items() if each.sent} == {'~/watch/c_l'}
+
+
+@pytest.mark.parametrize('rate_hz', [10.0, 50.0, 60.0, 200.0, 1000.0, 5000.0])
+def test_every_topic_keeps_to_the_lesser_of_its_bound_and_the_sampling_rate(
+    rate_hz: float,
+) -> None:
+    watch, publishers = watch_of()
+    for publisher in publishers.values():
+        publisher.listeners = 1
+    run(watch, rate_hz, 4.0)
+    for publisher in publishers.values():
+        # At the end those that follow v still wait for the sample after it.
+        assert 0.99 * 4.0 * min(rate_hz, 1.0 / PERIOD_S) - 1 <= len(publisher.sent)
+        assert len(publisher.sent) <= 4.0 * min(rate_hz, 1.0 / PERIOD_S) + 1
+
+
+@pytest.mark.parametrize('rate_hz', [10.0, 100.0, 450.0, 1000.0])
+@pytest.mark.parametrize('others', [True, False])
+def test_u_is_the_one_that_the_v_before_it_led_to(rate_hz: float, others: bool) -> None:
+    watch, publishers = watch_of()
+    for topic, publisher in publishers.items():
+        publisher.listeners = int(others or topic in ('~/watch/v', '~/watch/u_hat'))
+    v, u = publishers['~/watch/v'].sent, publishers['~/watch/u_hat'].sent
+    row = list(SIGNALS)
+    for k in range(1000):
+        # y(k) shows the u of the interval before it, over which v(k - 1) acted.
+        row[topics.SIGNAL_LABELS.index('v')], row[topics.SIGNAL_LABELS.index('u_hat')] = k, k - 1
+        before = len(u)
+        watch.follow(row, ESTIMATES, k / rate_hz)
+        assert u[before:] == v[before:len(u)]
+    assert len(u) > 900 * min(1.0, 1.0 / PERIOD_S / rate_hz)
+
+
+def test_in_a_fast_loop_no_command_is_followed_by_more_than_one_message() -> None:
+    watch, publishers = watch_of()
+    for publisher in publishers.values():
+        publisher.listeners = 1
+    run(watch, 1000.0, 1.0)
+    for k in range(1000, 2000):
+        before = sum(len(each.sent) for each in publishers.values())
+        watch.follow(SIGNALS, ESTIMATES, 1e-3 * k)
+        assert sum(len(each.sent) for each in publishers.values()) - before <= 1
+
+
+def test_who_stops_listening_is_not_served_any_more() -> None:
+    watch, publishers = watch_of()
+    publishers['~/watch/m'].listeners = 1
+    run(watch, 100.0, 1.0)
+    publishers['~/watch/m'].listeners = 0
+    watch.follow(SIGNALS, ESTIMATES, 1.0 + LOOK_S)
+    sent = len(publishers['~/watch/m'].sent)
+    watch.follow(SIGNALS, ESTIMATES, 2.0)
+    assert len(publishers['~/watch/m'].sent) == sent > 0
+
+
+def test_values_are_those_of_the_rows_with_bands_of_two_deviations() -> None:
+    values = watched_values(SIGNALS, ESTIMATES)
+    assert set(values) == set(topics.WATCH_LABELS)
+    assert (values['m'], values['c_r'], values['c_l'], values['gap']) == (1.3, 3.0, -2.0, 5.0)
+    assert (values['m_low'], values['m_high']) == pytest.approx((1.1, 1.5))
+    assert (values['c_l_low'], values['c_l_high']) == pytest.approx((-2.6, -1.4))
+    for label in ('y_m', 'y', 'u_d', 'v', 'u_hat', 'innovation', 'status', 'latency_s'):
+        assert values[label] == SIGNALS[topics.SIGNAL_LABELS.index(label)]
+
+
+def test_a_law_without_deviations_has_estimates_without_a_band() -> None:
+    values = watched_values(SIGNALS, (1.3, 3.0, -2.0, 0.2, nan, nan, nan, nan, 7.0))
+    assert values['c_r'] == 3.0
+    assert isnan(values['c_r_low'])
+    assert isnan(values['c_r_high'])
+
+
+def test_a_subscriber_hears_the_estimates_of_its_controller(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world)
+        driver.learn()
+        heard = {
+            label: driver.probe.collect(topics.watched(label), Float64)
+            for label in ('m', 'm_low', 'm_high', 'gap', 'status', 'v')
+        }
+        driver.run_until(lambda: all(heard.values()), 'a message of each topic')
+        first = driver.k
+        counted = {label: len(messages) for label, messages in heard.items()}
+        driver.run(2.0)
+        passed_s = 0.01 * (driver.k - first)
+        for label, messages in heard.items():
+            # A driver that was held up finds what has come meanwhile.
+            assert len(messages) - counted[label] <= 1.5 * passed_s / PERIOD_S, label
+        # A machine that is held up makes commands late, which the estimate takes some time to see.
+        driver.run_until(lambda: heard['status'][-1].data == Status.TRACKING, 'the status')
+        newest = {label: messages[-1].data for label, messages in heard.items()}
+        known = driver.estimate()
+        assert newest['m'] == pytest.approx(known['m'], rel=0.05)
+        assert newest['m_low'] < newest['m'] < newest['m_high']
+        assert newest['gap'] == pytest.approx(known['c_r'] - known['c_l'], rel=0.05)
+        assert newest['v'] in [message.data for message in driver.controls]
+        assert controller.stop() == 0
