@@ -157,7 +157,9 @@ class ReferenceNode(ProcessNode):
         self._publish(round(stamp_ns_of(message) * 1e-9 / self._sample_period))
 
     def _on_output(self, output: Output) -> None:
-        if self._counter.count(output.stamp_ns, output.sequence).is_sample:
+        if self._counter.count(
+            output.stamp_ns, output.sequence, output.numbered
+        ).is_sample:
             self._pace.hear(self._counter.index, arrival_ns(output.received_ns) * 1e-9)
 
     def _publish(self, sample: int) -> None:

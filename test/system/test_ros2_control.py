@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from builtin_interfaces.msg import Time
 from drivers.paced_driver import NOISE, PacedDriver
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_processes import RosWorld, ros_world
 from sensor_msgs.msg import JointState
@@ -21,7 +22,8 @@ class StandIn:
     """Speaks the topics of ros2_control in front of a PacedDriver.
 
     Every state is stamped with the time of the sample and leaves some time later. clock_ns: by how
-    much its clock is ahead.
+    much its clock is ahead. stamped: samples that share a stamp. second: another publisher in this
+    process, of zeros with the same stamps.
     """
 
     def __init__(
@@ -36,6 +38,9 @@ class StandIn:
         qos = QoSProfile(depth=10, reliability=(
             ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
         ))
+        self.stamped = 1
+        self.second: Publisher | None = None
+        self._stamp_ns = 0
         self._states = probe.node.create_publisher(JointState, topics.JOINT_STATES, qos)
         self._field, self._names = field, names
         driver.sent = self._send
@@ -55,12 +60,17 @@ class StandIn:
         self.driver.controls.append(Float64(data=v))
 
     def _send(self, k: int, y: float) -> list[float]:
-        now_ns = self.driver.probe.node.get_clock().now().nanoseconds + self._clock_ns
+        if k % self.stamped == 0 or not self._stamp_ns:
+            now_ns = self.driver.probe.node.get_clock().now().nanoseconds
+            self._stamp_ns = now_ns + self._clock_ns
         message = JointState(header=Header(stamp=Time(
-            sec=now_ns // 10**9, nanosec=now_ns % 10**9
+            sec=self._stamp_ns // 10**9, nanosec=self._stamp_ns % 10**9
         )), name=self._names)
         setattr(message, self._field, [0.1 * i for i in range(len(self._names) - 1)] + [y])
         self._states.publish(message)
+        if self.second is not None:
+            setattr(message, self._field, [0.0] * len(self._names))
+            self.second.publish(message)
         return []
 
 
@@ -131,4 +141,35 @@ def test_a_joint_that_is_not_there_is_told(tmp_path: Path) -> None:
             lambda: driver.says("no position of joint 'axel' but axle"), 'a word about the joint'
         )
         assert driver.controls == []
+        assert controller.stop() == 0
+
+
+def test_of_two_publishers_with_the_same_stamps_the_first_one_is_used(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {
+            'io.style': 'ros2_control', 'estimator.output_noise_std': NOISE,
+        })
+        stand_in = StandIn(world, 'position', ['axle'], False)
+        driver = stand_in.driver
+        stand_in.second = driver.probe.publisher(topics.JOINT_STATES, JointState)
+        stand_in.meet()
+        driver.run_until_known(0.02)
+        driver.check_sanity()
+        driver.run_until(lambda: driver.says('2 publishers of joint_states'), 'a word about them')
+        assert controller.stop() == 0
+
+
+@pytest.mark.parametrize('stamped', [2, 1_000_000])
+def test_a_driver_that_repeats_its_stamps_is_told_and_served(tmp_path: Path, stamped: int) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {
+            'io.style': 'ros2_control', 'estimator.output_noise_std': NOISE,
+        })
+        stand_in = StandIn(world, 'position', ['axle'], False)
+        stand_in.stamped = stamped
+        stand_in.meet()
+        driver = stand_in.driver
+        driver.run_until_known(0.02)
+        driver.run_until(lambda: driver.says('joint_states repeats its stamps'), 'a word about it')
+        assert not driver.says('clock')
         assert controller.stop() == 0

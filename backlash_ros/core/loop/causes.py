@@ -8,8 +8,9 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures
 
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
-# Share by which the rate of y may differ from that of the model.
-RATE_TOLERANCE = 0.1
+# Share by which the rate of y may differ from that of the model; and by which nearly all intervals
+# have to differ where they do not tell the period.
+RATE_TOLERANCE, PACE_TOLERANCE = 0.005, 0.1
 # Share of late, lost or bad samples from which on the loop is told to suffer from them, and an
 # estimate that does not fit the data is put down to them.
 TROUBLE = 0.01
@@ -75,9 +76,9 @@ def _state(f: LoopFigures, causes: list[Finding]) -> Finding:
     briefly = f.inconsistent_s < PATIENCE_S and not kinds.isdisjoint(LATENESS) \
         and not f.law.wrong_sign
     if f.status == Status.INCONSISTENT and (briefly or 'rate' in kinds):
+        why = 'at this rate' if 'rate' in kinds else 'while samples are late or lost'
         return Finding(
-            Level.WARN, 'held', f'{f.output.name} does not follow from v while samples are late or '
-            'lost: estimates held',
+            Level.WARN, 'held', f'{f.output.name} does not follow from v {why}: estimates held',
         )
     if f.given and f.status == Status.TRACKING:
         return GIVEN
@@ -221,9 +222,16 @@ def _timing(f: LoopFigures) -> list[Finding]:
     found = []
     rate = _wrong_rate(f)
     if isfinite(rate):
+        wrong = abs(f.period.median / f.sample_period - 1.0) < 0.5 * RATE_TOLERANCE
+        cure = 'is the driver held up?' if wrong else 'correct one of them'
         found.append(Finding(
-            Level.WARN, 'rate', f'{f.output.name} comes at {rate:.3g} Hz, sample_period is '
-            f'{f.sample_period:g} s ({1.0 / f.sample_period:.3g} Hz): correct one of them',
+            Level.WARN, 'rate', f'{f.output.name} comes at {rate:.4g} Hz, sample_period is '
+            f'{f.sample_period:g} s ({1.0 / f.sample_period:.4g} Hz): {cure}',
+        ))
+    if f.repeats_stamps:
+        found.append(Finding(
+            Level.WARN, 'stamps', f'{f.output.name} repeats its stamps, so the time of sending '
+            'counts: stamp each message anew',
         ))
     if abs(f.age_s) > SKEW * f.sample_period:
         age = f'{1e3 * abs(f.age_s):.3g} ms'
@@ -255,12 +263,14 @@ def _timing(f: LoopFigures) -> list[Finding]:
 def _wrong_rate(f: LoopFigures) -> float:
     """The rate of y [Hz] where it is not that of the model, else nan.
 
-    Losses and stalls lengthen some of the intervals, messages sent twice shorten some: the rate is
-    wrong only where nearly all of them are off to the same side.
+    Losses and stalls lengthen some of the intervals, messages sent twice shorten some: where the
+    period is not known, the rate is wrong only if nearly all intervals are off to the same side.
     """
+    if f.period.differs_from(f.sample_period, RATE_TOLERANCE):
+        return 1.0 / f.period.mean
     low, mean, high = f.intervals_s
-    slow = low > (1.0 + RATE_TOLERANCE) * f.sample_period
-    fast = high < f.sample_period / (1.0 + RATE_TOLERANCE)
+    slow = low > (1.0 + PACE_TOLERANCE) * f.sample_period
+    fast = high < f.sample_period / (1.0 + PACE_TOLERANCE)
     return 1.0 / mean if (slow or fast) and mean > 0.0 else nan
 
 

@@ -160,7 +160,8 @@ class ControlLoop:
     def command(self, output: Output) -> ControlStep | None:
         """The same, but what v(k) need not wait for is left to `note`, which has to follow."""
         return self._answer(
-            output, self.counter.count(output.stamp_ns, output.sequence), self.y_m
+            output, self.counter.count(output.stamp_ns, output.sequence, output.numbered),
+            self.y_m,
         )
 
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:

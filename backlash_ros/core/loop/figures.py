@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.law import LawReport
+from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD, Period
 
 
 class Level(IntEnum):
@@ -62,8 +63,9 @@ class LoopFigures:
 
     output, reference: with those who publish it. control: with those who receive it; rivals: who
     else publishes it. intervals_s: those between messages of y, low, mean and high, of which a
-    tenth is shorter and longer [s], nan while they are not known. still: newest values of y in a
-    row that are equal, and v_swing: how far v has moved meanwhile, in gaps.
+    tenth is shorter and longer [s], nan while they are not known. period: of the driver, by its
+    stamps. repeats_stamps: whether it sends some of them twice. still: newest values of y in a row
+    that are equal, and v_swing: how far v has moved meanwhile, in gaps.
     """
 
     sample_period: float
@@ -82,6 +84,8 @@ class LoopFigures:
     referred: bool = True  # whether a y_m has come
     reference_silent_s: float = 0.0
     intervals_s: tuple[float, float, float] = (nan, nan, nan)
+    period: Period = UNKNOWN_PERIOD
+    repeats_stamps: bool = False
     age_s: float = nan  # median time from the stamp of y to its arrival, nan while not known
     used: int = 0
     without_reference: int = 0

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+from collections import deque
+from itertools import islice
 from typing import NamedTuple
+
+from backlash_ros.core.loop.driver_period import DriverPeriod
 
 # What the middleware reports where it does not number messages.
 UNNUMBERED = 2**64 - 1
 # A stamp never comes before its sample, so a missing one shows as a full period of lateness.
 # Jitter of the sender up to this share of a period is not taken for a loss.
 JITTER = 0.85
-# Share of a period by which the sender's clock may run slow per sample.
-CLOCK_SLACK = 0.01
+# After so many intervals the period of the sender is learned anew, of as many as are used for that.
+# It is taken for another one than that of the samples if it is off by more than this share.
+LEARN_PERIOD_AFTER, LEARN_PERIOD_OF, OTHER_PERIOD = 20, 50, 0.003
+# Samples in a row that all came later than expected, after which the least lateness among them is
+# the new phase of the sender, which has paused: at its start, and when its period is known.
+PHASE_AT_START, PHASE_SAMPLES = 6, 20
+# Share of a period by which the sender's clock may run slow per sample. By how much the phase that
+# tells repetitions apart may lag: who was held up for some samples comes back to the old one.
+CLOCK_SLACK, LARGEST_LAG = 0.01, 0.5
 # A sender that has kept time for so many samples is held to it: what comes earlier than the next
 # sample is due, by more than a share of a period, is a repetition or from someone else. Before,
 # one that came early outweighs two that were due.
@@ -28,13 +39,18 @@ KEPT_S, KEPT_OUTPUTS = 0.1, 20
 
 
 class Output(NamedTuple):
-    """A measured y, when it was sampled, sent and received [ns], and its number."""
+    """A measured y, when it was sampled, sent and received [ns], and the number of its message.
+
+    numbered: whether each number is a sample. Else the sender also publishes messages without y,
+    and the numbers only tell it from other senders.
+    """
 
     y: float
     stamp_ns: int
     sent_ns: int
     received_ns: int
     sequence: int
+    numbered: bool = True
 
 
 class Arrival(NamedTuple):
@@ -60,8 +76,9 @@ class SampleCounter:
 
     Sequence numbers tell what the middleware lost; they cannot tell what was never published, or
     what a relay that renumbers has lost. Time stamps can: sample k is due one period after
-    sample k-1. The larger count is believed. A sender that does not keep time, like one that
-    answers each control at once, is counted by number alone as long as it is not late.
+    sample k-1, where the period is that of the sender if it is slow or fast. The larger count is
+    believed. A sender that does not keep time, like one that answers each control at once, is
+    counted by number alone as long as it is not late.
 
     index: of the newest sample, -1 before the first. due_ns: when that sample was due at the
     sender. from_zero: the first index is the count of the sender, which begins with 1, where
@@ -71,17 +88,24 @@ class SampleCounter:
 
     def __init__(self, sample_period_s: float, from_zero: bool = True) -> None:
         self.index, self.due_ns = -1, 0.0
+        self.sender = DriverPeriod(sample_period_s)
         self._from_zero = from_zero
-        self._period_ns = sample_period_s * 1e9
+        self._period_ns = sample_period_s * 1e9  # of the sender, as far as it is known
         self._sequence = 0  # of the newest sample
         self._repeated = 0  # of the newest message that followed it too early to be a sample
         self._stamp_ns = 0  # of the newest sample
+        self._early_ns = 0.0  # the earliest time at which the newest sample may have been due
+        self._lateness_ns: deque[float] = deque(maxlen=PHASE_SAMPLES)  # against due_ns
+        self._since_learned = 0  # samples since the period was learned
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
-    def count(self, stamp_ns: int, sequence: int = UNNUMBERED) -> Arrival:
-        """Take in a message and say what it is."""
-        numbered = sequence != UNNUMBERED
+    def count(
+        self, stamp_ns: int, sequence: int = UNNUMBERED, numbered: bool = True,
+    ) -> Arrival:
+        """Take in a message and say what it is; `numbered` as in Output."""
+        known = sequence != UNNUMBERED
+        numbered = numbered and known
         if self.index < 0:
             if not self._from_zero:
                 self.index = round(stamp_ns / self._period_ns)
@@ -92,41 +116,72 @@ class SampleCounter:
         period = self._period_ns
         if stamp_ns < self._stamp_ns:
             return self._stranger(stamp_ns, sequence)
-        due = self.due_ns + period
-        late = (stamp_ns - due) / period  # may be negative
+        late = (stamp_ns - self.due_ns) / period - 1.0  # may be negative
+        is_early = stamp_ns < self._early_ns + (1.0 - EARLY) * period
         keeps_time = self._on_time >= KEEPS_TIME_AFTER
         by_time = max(int(late + 1.0 - JITTER), 0)
-        by_number = 0
-        if numbered:
+        skipped = 0  # numbers between this message and the newest one of its sender
+        if known:
             passed = self._repeated if self._repeated < sequence else self._sequence
-            by_number = sequence - passed - 1
-            if by_number < 0:
+            skipped = sequence - passed - 1
+            if skipped < 0:
                 silent = stamp_ns - self._stamp_ns > SILENCE * period
                 if keeps_time and not silent:
                     return NO_SAMPLE
                 # Two senders in turn must not each look like one that restarted.
                 begin = self._stranger if keeps_time or not silent else self._restarted
                 return begin(stamp_ns, sequence, by_time)
-            if keeps_time and by_number > late + 1.0 + NUMBER_SLACK:
+            if not numbered and is_early and skipped > 0:
+                return NO_SAMPLE  # of another sender
+            if numbered and keeps_time and skipped > late + 1.0 + NUMBER_SLACK:
                 # A second sender, or a flood of which the middleware has dropped a part.
                 if late < PATIENCE:
                     return NO_SAMPLE
-                by_number = by_time
-        if keeps_time and late < -EARLY:
-            if by_number == 0:
+                skipped = by_time
+        if keeps_time and is_early:
+            if skipped == 0:
                 self._repeated = sequence
             return NO_SAMPLE
-        missing = max(by_time, by_number)
+        missing = max(by_time, skipped) if numbered else by_time
         if missing == 0 and not keeps_time:
-            self._on_time = max(self._on_time + (1 if late >= -EARLY else -OUTWEIGHED), 0)
+            self._on_time = max(self._on_time + (-OUTWEIGHED if is_early else 1), 0)
         self._sequence = self._repeated = sequence
         self._stamp_ns, self._strange = stamp_ns, 0
-        self.due_ns = min(due + period * (missing + CLOCK_SLACK), float(stamp_ns))
+        self._follow_phase(stamp_ns, missing)
+        self._learn_period(stamp_ns)
         self.index += 1 + missing
         if not missing:
             return NEXT_SAMPLE
-        unsent = missing - by_number if numbered else 0
+        unsent = max(missing - skipped, 0) if known else 0
         return Arrival(is_sample=True, missing=missing, unsent=unsent)
+
+    def _learn_period(self, stamp_ns: int) -> None:
+        self.sender.note(stamp_ns)
+        self._since_learned += 1
+        if self._since_learned < LEARN_PERIOD_AFTER:
+            return
+        self._since_learned = 0
+        nominal_s, period = self.sender.nominal_s, self.sender.newest(LEARN_PERIOD_OF)
+        is_other = period.differs_from(nominal_s, OTHER_PERIOD)
+        self._period_ns = 1e9 * (period.mean if is_other else nominal_s)
+
+    def _follow_phase(self, stamp_ns: int, missing: int) -> None:
+        """Go on to the sample with this stamp, before which so many are missing."""
+        period, latenesses = self._period_ns, self._lateness_ns
+        expected = self.due_ns + period * (1 + missing)
+        late = stamp_ns - expected
+        latenesses.append(late)
+        shift = min(late, period * CLOCK_SLACK)
+        if shift > 0.0:
+            window = PHASE_SAMPLES if self._on_time >= KEEPS_TIME_AFTER else PHASE_AT_START
+            if len(latenesses) >= window:
+                shift = max(shift, min(islice(reversed(latenesses), window)))
+        if shift != 0.0:
+            for i, each in enumerate(latenesses):
+                latenesses[i] = each - shift
+        self.due_ns = expected + shift
+        early = self._early_ns + period * (1 + missing + CLOCK_SLACK)
+        self._early_ns = max(min(early, stamp_ns), self.due_ns - LARGEST_LAG * period)
 
     def _stranger(self, stamp_ns: int, sequence: int, missing: int = 0) -> Arrival:
         self._strange += 1
@@ -141,7 +196,12 @@ class SampleCounter:
 
     def _begin(self, stamp_ns: int, sequence: int) -> None:
         self._sequence = self._repeated = sequence
-        self.due_ns, self._stamp_ns = float(stamp_ns), stamp_ns
+        self.due_ns = self._early_ns = float(stamp_ns)
+        self._stamp_ns = stamp_ns
+        self._lateness_ns.clear()
+        self.sender.restart()
+        self.sender.note(stamp_ns)
+        self._since_learned, self._period_ns = 0, 1e9 * self.sender.nominal_s
         self._on_time = self._strange = 0
 
 

@@ -14,6 +14,7 @@ from backlash_ros import topics
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.causes import LONGEST_TEXT, findings_of
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.loop.storage import was_given
@@ -86,6 +87,8 @@ class Diagnosis:
             reference_silent_s=timeout if overdue else 0.0,
             # In lockstep the outputs come as fast as the machine goes.
             intervals_s=(nan, nan, nan) if p.get_bool('lockstep') else statistics.intervals_s(),
+            period=UNKNOWN_PERIOD if p.get_bool('lockstep') else loop.counter.sender.newest(),
+            repeats_stamps=io.repeats_stamps,
             # Stamps of simulated time have nothing to do with the time of arrival.
             age_s=nan if p.get_bool('lockstep') or io.simulated_time else statistics.age_s(),
             still=statistics.still,
@@ -149,7 +152,9 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
     """Counts, estimates and what tells how well the loop runs."""
     statistics, e = loop.statistics, loop.estimate
     gap, swing = e.c_r - e.c_l, statistics.swing()
-    _, mean_s, _ = statistics.intervals_s()
+    mean_s = loop.counter.sender.newest().mean
+    if isnan(mean_s):
+        _, mean_s, _ = statistics.intervals_s()
     return {
         **counts_of(loop),
         'state': e.status.word if loop.adapting else 'held',

@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output
+from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.number_message import message_with, number_of
@@ -56,11 +56,14 @@ class DriverIo:
     """What a node says to the driver and hears from it, in the messages that io.style names.
 
     skipped: messages without the joint. seen: the joints of the newest one of them.
-    simulated_time: whether stamps are those of /clock.
+    repeats_stamps: whether the driver has sent a stamp twice; since then the time of sending
+    counts. simulated_time: whether stamps are those of /clock.
     """
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
         self.skipped, self.seen = 0, ''
+        self.repeats_stamps = False
+        self._header_ns = self._number = 0  # of the newest message with the joint
         self._node, self._p = node, p
         self.topics = STYLES[p.get_str('io.style')]
         self._joint, self._field = p.get_str('io.joint'), p.get_str('io.field')
@@ -112,12 +115,12 @@ class DriverIo:
             if row < 0:
                 self.skipped, self.seen = self.skipped + 1, ', '.join(message.name)
                 return
-            stamp = message.header.stamp
-            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+            stamp, number = message.header.stamp, info['publication_sequence_number']
+            stamp_ns = self._header_stamp_ns(stamp.sec * 10**9 + stamp.nanosec, number)
             # Drivers that leave the header empty are known by the stamp of the middleware.
             hear(Output(
-                values[row], stamp_ns or info['source_timestamp'], info['source_timestamp'],
-                info['received_timestamp'], UNNUMBERED,
+                values[row], stamp_ns or self.stamp_ns(info), info['source_timestamp'],
+                info['received_timestamp'], number, numbered=False,
             ))
 
         of_joints = self.topics.output_type is JointState
@@ -156,6 +159,15 @@ class DriverIo:
     def wait_until_received(self, timeout_s: float) -> None:
         """Wait until the driver has confirmed the newest v, or the timeout is over."""
         self.publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
+
+    def _header_stamp_ns(self, stamp_ns: int, number: int) -> int:
+        """The stamp in the header of a message with this number; 0 where it tells no time."""
+        repeated = stamp_ns == self._header_ns != 0 and number == self._number + 1
+        if repeated and not self.repeats_stamps:
+            # Two publishers with the same stamps are told apart by their numbers, mostly.
+            self.repeats_stamps = self._node.count_publishers(self.topics.output) == 1
+        self._header_ns, self._number = stamp_ns, number
+        return 0 if self.repeats_stamps else stamp_ns
 
     def _row(self, names: list[str], count: int) -> int:
         """Row of the joint, -1 where it is missing."""

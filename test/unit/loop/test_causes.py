@@ -19,6 +19,7 @@ from backlash_ros.core.loop.causes import (
     UNNAMED,
     findings_of,
 )
+from backlash_ros.core.loop.driver_period import Period
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer, TopicFigures
 
 DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
@@ -203,6 +204,23 @@ def test_an_estimate_that_does_not_fit_stays_an_error_beside_other_causes(
     changes: dict[str, Any],
 ) -> None:
     assert worst_level(replace(INCONSISTENT, **changes)) == Level.ERROR
+
+
+@pytest.mark.parametrize(('hz', 'std', 'said'), [
+    (188.8, 1e-6, 'plant_output comes at 188.8 Hz, sample_period is 0.005 s (200 Hz): correct one'),
+    (198.9, 1e-7, 'plant_output comes at 198.9 Hz'), (199.2, 1e-6, 'learned'),
+    (198.0, 2e-5, 'learned'),  # nobody knows
+])
+def test_a_rate_that_is_a_little_off_is_named_first(hz: float, std: float, said: str) -> None:
+    f = replace(WELL, period=Period(1.0 / hz, std, 1.0 / hz), late=30, lost=30)
+    assert findings_of(f)[0].text.startswith(said) or 'learned' in said
+    assert ('comes at' in findings_of(f)[0].text) == ('learned' not in said)
+
+
+def test_a_driver_that_pauses_now_and_then_is_not_asked_for_another_rate() -> None:
+    (found, *_) = findings_of(replace(WELL, period=Period(0.00506, 1e-7, 0.005)))
+    assert found.text == \
+        'plant_output comes at 197.6 Hz, sample_period is 0.005 s (200 Hz): is the driver held up?'
 
 
 @pytest.mark.parametrize('intervals_s', [

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from math import isnan
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.report_use import CONSISTENT, ReportUse, report_use
-from backlash_ros.core.loop.sample_counter import Arrival, SampleCounter
+from backlash_ros.core.loop.sample_counter import UNNUMBERED, Arrival, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
 PERIOD_S, PERIOD_NS = 0.01, 10_000_000
@@ -356,3 +357,61 @@ def test_sender_that_answers_at_once_is_counted_by_number() -> None:
     stamps = [START_NS + k * PERIOD_NS // 20 for k in range(1000)]
     arrivals = [counter.count(stamp, 1 + k) for k, stamp in enumerate(stamps)]
     assert all(arrival == Arrival(is_sample=True) for arrival in arrivals)
+
+
+def slow(share: float, jitter: float = 0.05) -> list[float]:
+    """Stamps [periods] of a sender that is slow by this share, with some jitter."""
+    rng = np.random.default_rng(3)
+    return [k * (1.0 + share) + jitter * float(rng.random()) for k in range(2000)]
+
+
+def drifting() -> list[float]:
+    """A period that grows by 10 % and shrinks again."""
+    return np.cumsum(1.05 + 0.05 * np.sin(np.arange(2000) / 200.0)).tolist()
+
+
+def pausing() -> list[float]:
+    """Every 40th period is longer by half: a sender that sleeps for a period after its work."""
+    return np.cumsum([1.5 if k % 40 == 39 else 1.0 for k in range(2000)]).tolist()
+
+
+@pytest.mark.parametrize('stamps', [
+    *(slow(share) for share in (0.0, 0.005, 0.03, 0.056, 0.09)), slow(-0.05), drifting(), pausing(),
+])
+@pytest.mark.parametrize('numbered', [True, False])
+def test_a_sender_that_is_slow_or_pauses_has_lost_nothing(
+    stamps: list[float], numbered: bool,
+) -> None:
+    counter = SampleCounter(PERIOD_S)
+    for k, stamp in enumerate(stamps):
+        arrival = counter.count(
+            START_NS + round(stamp * PERIOD_S * 1e9), k + 1 if numbered else UNNUMBERED
+        )
+        assert arrival == Arrival(is_sample=True)
+        # Commands are judged by when the sample was due: that follows the sender.
+        assert -0.7 < (counter.due_ns - START_NS) / (PERIOD_S * 1e9) - stamp < 1e-3
+
+
+@pytest.mark.parametrize('share', [0.0, 0.03, 0.056, 0.09, -0.03])
+def test_what_a_slow_sender_really_has_lost_is_counted(share: float) -> None:
+    counter, lost = SampleCounter(PERIOD_S), 0
+    for k, stamp in enumerate(slow(share)):
+        if k % 50 != 49:
+            lost += counter.count(START_NS + round(stamp * PERIOD_S * 1e9)).missing
+    assert lost == 2000 // 50 - 1  # nobody knows of the last one
+
+
+@pytest.mark.parametrize(('first', 'second'), [(1, 1), (100, 1), (1, 100), (5, 6)])
+@pytest.mark.parametrize('offset', [0.0, 0.4])
+@pytest.mark.parametrize('numbered', [True, False])
+def test_of_two_senders_one_is_used_from_the_start(
+    first: int, second: int, offset: float, numbered: bool,
+) -> None:
+    counter, used = SampleCounter(PERIOD_S), []
+    for k in range(200):
+        for sender, number, late in ((0, first, 0.0), (1, second, offset)):
+            stamp = START_NS + round((k + late) * PERIOD_S * 1e9)
+            if counter.count(stamp, number + k, numbered).is_sample:
+                used.append(sender)
+    assert len(used) <= 202
+    assert len(set(used[10:])) == 1

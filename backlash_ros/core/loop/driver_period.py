@@ -1,0 +1,88 @@
+"""The period at which a driver really samples, from the stamps of its samples."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+from math import nan, sqrt
+from statistics import mean, median
+from typing import NamedTuple
+
+FEWEST = 20  # intervals
+# What the period is fitted to: the newest stamps of this time, and at most so many.
+WINDOW_NS, STAMPS = 2_000_000_000, 1000
+OTHER_PACE = 0.25  # share by which typical intervals differ from the period where they are no such
+# Samples for which a process that is held up is late, so that their lateness is one error.
+HELD_UP = 10.0
+
+
+class Period(NamedTuple):
+    """Mean period of the driver, its standard deviation, and the median interval [s]."""
+
+    mean: float = nan
+    std: float = nan
+    median: float = nan
+
+    def differs_from(self, nominal_s: float, tolerance: float) -> bool:
+        """Whether it certainly is off by more than a share; False where it is not known."""
+        return abs(self.mean - nominal_s) > tolerance * nominal_s + 3.0 * self.std
+
+
+UNKNOWN_PERIOD = Period()
+
+
+class DriverPeriod:
+    """Learns the period of a driver from the stamps of its samples [ns]."""
+
+    def __init__(self, nominal_s: float) -> None:
+        self.nominal_s = nominal_s
+        self._stamps_ns: deque[int] = deque(maxlen=STAMPS)
+
+    def note(self, stamp_ns: int) -> None:
+        """Take in the stamp of a sample."""
+        self._stamps_ns.append(stamp_ns)
+
+    def restart(self) -> None:
+        """Forget what was before: the clock of the stamps is another one."""
+        self._stamps_ns.clear()
+
+    def newest(self, intervals: int = STAMPS) -> Period:
+        """The period over so many intervals at most: the slope of the stamps over their samples.
+
+        It is known to some 0.1 % after a second. A message that was lost, or came twice, does not
+        disturb it; unknown where most intervals are no period at all.
+        """
+        stamps = list(self._stamps_ns)[-intervals - 1:]
+        begin = len(stamps) - FEWEST - 1
+        if begin < 0:
+            return UNKNOWN_PERIOD
+        while begin > 0 and stamps[begin - 1] >= stamps[-1] - WINDOW_NS:
+            begin -= 1
+        times = [1e-9 * (stamp - stamps[begin]) for stamp in stamps[begin:]]
+        steps = [b - a for a, b in pairwise(times)]
+        ordered = sorted(steps)
+        quarter = len(ordered) // 4
+        typical = mean(ordered[quarter:-quarter])
+        if not abs(typical / self.nominal_s - 1.0) < OTHER_PACE:
+            return UNKNOWN_PERIOD
+        found = Period(self.nominal_s)
+        for _ in range(2):  # after a long gap the nominal period may miscount
+            numbers = [0]
+            for step in steps:
+                numbers.append(numbers[-1] + round(step / found.mean))
+            found = _slope(numbers, times)
+            if not found.mean > 0.0:
+                return UNKNOWN_PERIOD
+        return found._replace(median=median(ordered))
+
+
+def _slope(numbers: list[int], times: list[float]) -> Period:
+    middle, centre = mean(numbers), mean(times)
+    spread = sum((number - middle)**2 for number in numbers)
+    if not spread:
+        return UNKNOWN_PERIOD
+    slope = sum((n - middle) * (t - centre) for n, t in zip(numbers, times, strict=True)) / spread
+    rest = sum(
+        (t - centre - slope * (n - middle))**2 for n, t in zip(numbers, times, strict=True)
+    ) / len(times)
+    return Period(slope, sqrt(HELD_UP * rest / spread))
