@@ -53,7 +53,7 @@ setup(
             f'plant = {PACKAGE}.nodes.plant:main',
             f'reference = {PACKAGE}.nodes.reference:main',
             f'recorder = {PACKAGE}.nodes.recorder:main',
-            f'bringup = {PACKAGE}.tools.bringup.command:main',
+            f'bringup = {PACKAGE}.tools.bringup.__main__:main',
             f'simulate = {PACKAGE}.tools.simulate:main',
             f'report = {PACKAGE}.tools.report:main',
             f'compare = {PACKAGE}.tools.compare:main',

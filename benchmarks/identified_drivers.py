@@ -22,8 +22,7 @@ from reporting import ROOT, machine, markdown_table, text_table
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.simulation.metrics import delayed_tracking_error_rms
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 from backlash_ros.tools.runs.source import read_run
 
 EXAMPLES = ROOT / 'examples'

@@ -30,8 +30,7 @@ from hosts.linked_hosts import FIRST, Cable, Host, linked_hosts, why_not
 from reporting import ROOT, machine, markdown_table, text_table
 
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import with_source
+from backlash_ros.tools.bringup.environment import free_domain, with_source
 
 DRIVER = ROOT / 'examples' / 'motor_driver.py'
 CONFIG = 'geared_motor.yaml'

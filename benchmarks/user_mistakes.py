@@ -39,8 +39,7 @@ from reporting import CHECK_HEADER, ROOT, Check, machine, processors, text_table
 
 from backlash_ros import topics
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 
 CONFIG = ROOT / 'config' / 'geared_motor.yaml'
 BUSY_LOOP = ROOT / 'benchmarks' / 'real_time' / 'busy_loop.py'

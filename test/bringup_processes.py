@@ -15,7 +15,7 @@ from pathlib import Path
 from rosbags.highlevel import AnyReader
 from waiting import DEADLINE_S, wait_until
 
-from backlash_ros.tools.bringup import command as bringup
+from backlash_ros.tools.bringup import __main__ as bringup
 
 UNDRAWN = Path(__file__).with_name('undrawn.py')
 

@@ -31,7 +31,7 @@ from backlash_ros.core.assembly import law_fits
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
-from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import free_domain
 
 PERIOD_S, PERIOD_NS = 1e-3, 1_000_000
 LOW, HIGH = -20.0, 30.0

@@ -27,8 +27,7 @@ from rclpy.publisher import Publisher
 from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 
 prefer_loopback(os.environ)  # the nodes of the tests themselves
 

@@ -7,7 +7,7 @@ from typing import IO
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from backlash_ros.tools.bringup import command as bringup
+from backlash_ros.tools.bringup import __main__ as bringup
 
 NO_PICTURE = b'\x89PNG'
 

@@ -25,8 +25,7 @@ from reporting import ROOT
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.metrics import delayed_reference
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 from backlash_ros.tools.config.configuration import effective_parameters
 from backlash_ros.tools.runs.source import read_run
 from gears.gear_runs import (

@@ -10,9 +10,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
-from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
+from backlash_ros.tools.bringup.supervisor import ProcessPlan, ProcessSupervisor
 
 DEADLINE_S = 30.0  # for processes to start
 NODES = 'backlash_ros.nodes'

@@ -26,7 +26,7 @@ from reporting import CHECK_HEADER, ROOT, Check, text_table
 from scipy import linalg, signal
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.bringup.processes import Child, ProcessSupervisor
+from backlash_ros.tools.bringup.supervisor import Child, ProcessSupervisor
 from real_time.loop_latency import LATENCY_HEADER, measure_latency
 from real_time.node_processes import node_command, processes, wait_for_event
 

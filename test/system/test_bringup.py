@@ -91,7 +91,7 @@ def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_p
     assert session.survivors() == {}
     simulated = build_closed_loop(effective_parameters(None, settings, 5)).run(samples)
     bag = session.out / 'bag'
-    assert_same(read_bag(bag).run, simulated)
+    assert_same(read_bag(bag).record, simulated)
     counts = bag_counts(bag)
     for topic in (topics.PLANT_OUTPUT, topics.REFERENCE, topics.CONTROL, topics.SIGNALS):
         assert counts[topic] == simulated.samples
@@ -187,7 +187,6 @@ def test_a_killed_controller_is_named_and_stops_every_axis_and_its_driver(
     assert 'tilt/controller died (killed by SIGKILL)' in session.stderr
     assert str(session.out / 'tilt' / 'logs' / 'controller.log') in session.stderr
     assert 'pan/' not in session.stderr
-    assert session.stderr.count('no use for what describes the simulated plant') == 0
     for axis in TRUTH:
         assert (session.out / axis / 'report.html').is_file()
         # The plant in the place of the driver says so when it ends.
@@ -223,7 +222,6 @@ def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported
     assert 'driver died (exit code 1)' in session.stderr
     assert f'{session.out}/logs/driver.log:\n    the fuse has blown' in session.stderr
     assert session.stderr.count('died') == 1
-    assert 'plant: seed\n' in session.stderr
     assert json.loads((session.out / 'summary.json').read_text())['samples'] > 0
 
 

@@ -22,8 +22,7 @@ from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.nodes.check_driver import main
 from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 
 HERE = ROOT / 'test'
 DURATION_S = 6.0

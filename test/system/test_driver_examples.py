@@ -19,8 +19,7 @@ from ros_processes import Probe, RosWorld, ros_world
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 
 EXAMPLES = ROOT / 'examples'
 BLOCKS = re.findall(

@@ -18,8 +18,7 @@ from ros_processes import Probe
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 
 DEADLINE_S = 150.0
 LOW, HIGH, RATE, PERIOD_S = -9.0, 11.0, 200.0, 0.005

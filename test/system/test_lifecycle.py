@@ -20,7 +20,7 @@ from ros_processes import RosWorld, ros_world
 from std_srvs.srv import SetBool, Trigger
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import free_domain
 
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)

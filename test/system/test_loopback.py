@@ -17,7 +17,7 @@ from backlash_ros.middleware.loopback import (
     VARIABLE,
     prefer_loopback,
 )
-from backlash_ros.tools.bringup.domains import DOMAIN_0_PORT, PORTS_PER_DOMAIN
+from backlash_ros.tools.bringup.environment import DOMAIN_0_PORT, PORTS_PER_DOMAIN
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
 MAPS = Path('/proc/self/maps')  # Linux

@@ -97,7 +97,7 @@ def test_lockstep_run_equals_the_simulation_in_one_process_to_the_last_bit(
             assert np.array_equal(column, run.column(name), equal_nan=True), name
     estimates = [run.column(name)[-1] for name in ('m', 'c_r', 'c_l')]
     assert estimates == pytest.approx([1.3, 3.0, -3.0], rel=0.01)
-    assert repr(read_bag(bag).run.learned) == repr(run.learned)
+    assert repr(read_bag(bag).record.learned) == repr(run.learned)
     assert run.learned is not None
     assert closed['missed'] == 0
     assert_complete(recorded, run.column('y'), run.column('v'), samples)

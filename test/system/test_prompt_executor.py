@@ -21,7 +21,7 @@ from backlash_ros.nodes.runtime import prompt_executor
 from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, PromptExecutor, make_executor
 from backlash_ros.nodes.runtime.spin import spin_paced
-from backlash_ros.tools.bringup.domains import free_domain
+from backlash_ros.tools.bringup.environment import free_domain
 
 
 class Loop:

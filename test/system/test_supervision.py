@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from bringup_processes import DEADLINE_S, marked_processes, wait_until
 
-from backlash_ros.tools.bringup import process_groups, supervision
+from backlash_ros.tools.bringup import supervisor as supervising
+from backlash_ros.tools.bringup import watch as watching
 from backlash_ros.tools.bringup.environment import child_environment
-from backlash_ros.tools.bringup.processes import ProcessPlan, ProcessSupervisor
-from backlash_ros.tools.bringup.progress import ProgressDisplay
-from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan
+from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
+from backlash_ros.tools.bringup.supervisor import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.cli import StopRequests
 from backlash_ros.tools.config.configuration import effective_parameters
 
@@ -66,9 +66,8 @@ def watch(
             )] for name, program in programs.items()
         ]
         with ProcessSupervisor(stages, lambda: hurry) as supervisor:
-            run = supervision.Run(
-                RunPlan((axis,), tmp_path), supervisor, StopRequests(),
-                {'': ProgressDisplay(100, 0.01, sys.stderr)},
+            run = watching.RunWatch(
+                RunPlan((axis,), tmp_path), supervisor, StopRequests(), sys.stderr
             )
             run.execute()
         return Watched(run.failure, capsys.readouterr().err, mark)
@@ -81,7 +80,7 @@ def watch(
 def test_a_process_that_is_never_ready_is_named_with_the_end_of_its_log(
     watch: Callable[..., Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(supervision, 'READY_DEADLINE_S', 3.0)
+    monkeypatch.setattr(watching, 'READY_DEADLINE_S', 3.0)
     lines = 'import time; print("hello", *range(100, 130), sep="\\n", flush=True)'
     run = watch(slow=f'{lines}; time.sleep(600)', quick=f'{READY}; {WAIT}')
     assert run.failure.startswith('not ready within 3 s: slow\n')
@@ -109,7 +108,7 @@ def test_what_ends_by_itself_ends_all_the_deaf_and_their_children_included(
 def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(process_groups, 'ESCALATION', (
+    monkeypatch.setattr(supervising, 'ESCALATION', (
         (signal.SIGINT, 0.2), (signal.SIGTERM, 0.2), (signal.SIGKILL, DEADLINE_S),
     ))
     files, gone = [tmp_path / f'begun{i}' for i in range(3)], tmp_path / 'gone'
@@ -119,7 +118,7 @@ def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(
     stages = [
         [ProcessPlan(
             str(i), (sys.executable, '-c', program), tmp_path / f'{i}.log',
-            child_environment(tmp_path, None), foreign=True, farewell_s=DEADLINE_S * (i < 2),
+            child_environment(tmp_path, None), foreign=True, grace_s=DEADLINE_S * (i < 2),
         )] for i, program in enumerate((patient, after, deaf))
     ]
     with ProcessSupervisor(stages, lambda: False) as supervisor:

@@ -1,7 +1,172 @@
-"""python -m backlash_ros.tools.bringup"""
+"""One command for a whole run: start the nodes, watch them, stop them, report."""
 
+from __future__ import annotations
+
+import argparse
+import os
 import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
 
-from backlash_ros.tools.bringup.command import main
+from backlash_ros.options import DONE, FAILED, OptionParser
+from backlash_ros.tools import cli
+from backlash_ros.tools.cli import DEFAULT_DURATION_S, BrokenOffError, InputError, StopRequests
 
-sys.exit(main())
+if TYPE_CHECKING:
+    from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
+
+EPILOG = """
+driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
+controller has seen as many samples as the duration holds. {axis} in it is the name of the axis;
+axes whose commands are the same share one driver. --driver none waits for a driver that you start
+yourself. The controller is stopped before the driver, which so hears its last command. As a driver
+moves something real, control.min, control.max and control.rate_max have to be set, or --unlimited
+given.
+
+axes: the parameter axes, in the section /bringup of the file, lists names; each gets nodes of its
+own in the namespace of that name and a folder DIR/NAME. Values stand under /**, /**/NODE,
+/NAME/** or /NAME/NODE; a named node goes before a named axis. If one axis fails, all are stopped.
+
+exit codes: 0 done, 2 bad input, 1 anything else (a process died, nothing moves, interrupted).
+
+A first Ctrl-C (SIGTERM, SIGHUP) stops all processes in order and reports what was recorded, a
+second one kills them at once. It is the regular end of a run without end (--duration inf), which
+then returns 0. If bringup itself is killed, a guardian process stops the others.
+
+environment: the processes inherit it. Unless you set them yourself,
+  ROS_AUTOMATIC_DISCOVERY_RANGE  is LOCALHOST: nothing leaves this machine
+  ROS_DOMAIN_ID                  is one that nobody uses on this machine, so that two runs never
+                                 hear each other, or 0 with --driver none; it is printed, so that
+                                 you can listen in
+  ROS_LOG_DIR                    is DIR/logs/ros
+  OMP_NUM_THREADS and its like   are 1
+"""
+
+
+def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Options of the command line."""
+    parser = OptionParser(
+        'bringup', description=__doc__, epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    cli.add_common_options(parser)
+    parser.add_argument(
+        '--duration', type=float, metavar='SECONDS',
+        help=f'length of the run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s); '
+             'inf runs until Ctrl-C',
+    )
+    parser.add_argument(
+        '--driver', metavar='COMMAND',
+        help='start this command instead of the simulated plant; none: it is started elsewhere',
+    )
+    parser.add_argument(
+        '--unlimited', action='store_true',
+        help='let a driver run without control.min, control.max and control.rate_max',
+    )
+    parser.add_argument(
+        '--lockstep', action='store_true',
+        help='as fast as the machine allows, every sample waiting for its control, '
+             'instead of real time',
+    )
+    parser.add_argument(
+        '--record', action=argparse.BooleanOptionalAction, default=True,
+        help='record a bag and write a report from it',
+    )
+    parser.add_argument(
+        '--live', action='store_true',
+        help='show the loop on a page in the browser; its address is printed',
+    )
+    parser.add_argument(
+        '--live-port', type=int, metavar='PORT', help='the same on this port (default: a free one)',
+    )
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    code = DONE
+
+    def bringup() -> None:
+        nonlocal code
+        options = parse_options(arguments)
+        # Loading numpy and scipy takes a second, in which a Ctrl-C is to be heard already.
+        from backlash_ros.tools.bringup.plan import prepare
+        code = perform(prepare(options))
+
+    return cli.run_tool('bringup', bringup) or code
+
+
+def perform(plan: RunPlan) -> int:
+    """Run and report; returns the exit code."""
+    from backlash_ros.tools.bringup.plan import plan_processes
+    from backlash_ros.tools.bringup.supervisor import ProcessSupervisor
+    from backlash_ros.tools.bringup.watch import RunWatch, complain
+    try:
+        with ExitStack() as stack:
+            requests = stack.enter_context(StopRequests())
+            stages = plan_processes(plan, _announced_domain(plan, stack))
+            managed = [axis.process_name('controller') for axis in plan.axes if axis.is_managed]
+            if managed:
+                print(f'waiting until somebody activates {", ".join(managed)} (autostart: false)',
+                      flush=True)
+            supervisor = stack.enter_context(ProcessSupervisor(stages, requests.insist))
+            watch = RunWatch(plan, supervisor, requests)
+            watch.execute()
+    except BrokenOffError as error:
+        complain(str(error))
+        return FAILED
+    reported = [watch.has_samples(axis) and report(axis) for axis in plan.axes]
+    return DONE if all(reported) and not watch.failure else FAILED
+
+
+def _announced_domain(plan: RunPlan, stack: ExitStack) -> int | None:
+    """ROS_DOMAIN_ID to set, None to leave it alone; says where to listen or what is awaited."""
+    from backlash_ros.tools.bringup.environment import free_domain
+    discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    awaited = [axis.name for axis in plan.axes if axis.driver_is_elsewhere]
+    if awaited:
+        # Whoever started the driver did so in the domain that is set there, or in none.
+        domain = os.environ.get('ROS_DOMAIN_ID') or '0'
+        of = f' of {", ".join(awaited)}' if awaited != [''] else ''
+        print(
+            f'waiting for the driver{of} as long as it takes: start it with '
+            f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}', flush=True,
+        )
+        return None
+    if os.environ.get('ROS_DOMAIN_ID'):
+        return None
+    free = stack.enter_context(free_domain())
+    print(
+        f'to listen in: export ROS_DOMAIN_ID={free} ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}',
+        flush=True,
+    )
+    return free
+
+
+def report(axis: AxisPlan) -> bool:
+    """Write and print what came out of an axis; returns whether that worked."""
+    if not axis.record:
+        print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
+        return True
+    # Drawing libraries take a second to load: not before bad input is refused.
+    from backlash_ros.tools.bringup.watch import complain
+    from backlash_ros.tools.report import PAGE, report_bag
+    from backlash_ros.tools.runs.summary import estimate_table
+    try:
+        summary = report_bag(axis.bag, axis.out, axis.parameters)
+    except (InputError, OSError) as error:
+        complain(axis.titled(f'no report: {error}'))
+        return False
+    print(estimate_table(summary, axis.name))
+    facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
+    latency = summary['loop_latency_ms']
+    if latency is not None:
+        facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
+    print(facts)
+    print(f'report: {axis.out / PAGE}')
+    return True
+
+
+if __name__ == '__main__':
+    sys.exit(main())

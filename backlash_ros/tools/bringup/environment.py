@@ -1,17 +1,27 @@
-"""The environment of the processes that are started."""
+"""What started processes find around them: variables, and a ROS domain that nobody else uses."""
 
 from __future__ import annotations
 
 import os
+import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import backlash_ros
 from backlash_ros.middleware.loopback import prefer_loopback
+from backlash_ros.tools.cli import BrokenOffError
 
 # Set by ROS 2 wheels when they have prepared LD_LIBRARY_PATH for the Python that runs.
 WHEELS_MARK, LIBRARY_PATH = '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'LD_LIBRARY_PATH'
+
+# UDP ports of RTPS: a domain has 250; participant n takes 10 + 2 n and 11 + 2 n of them, and
+# domains up to 101 lie below the ports that Linux hands out to others.
+DOMAINS = 101
+DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250  # as the standard has them
+PARTICIPANT_OFFSETS = range(10, 74, 2)  # as many as the discovery range LOCALHOST looks for
+RESERVATION_OFFSET = 5  # port of a domain that a run holds, which no participant takes
 
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
@@ -51,9 +61,44 @@ def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
         if name not in ('BACKLASH_ROS_EVENTS', WHEELS_MARK)
     }
     if WHEELS_MARK in environment and LIBRARY_PATH in environment:
-        folders = environment[LIBRARY_PATH].split(os.pathsep)
+        folders = foreign.pop(LIBRARY_PATH).split(os.pathsep)
         kept = [folder for folder in folders if not Path(folder).is_relative_to(sys.prefix)]
-        foreign[LIBRARY_PATH] = os.pathsep.join(kept)
-        if not kept:
-            del foreign[LIBRARY_PATH]
+        if kept:
+            foreign[LIBRARY_PATH] = os.pathsep.join(kept)
     return foreign
+
+
+@contextmanager
+def free_domain() -> Iterator[int]:
+    """A ROS_DOMAIN_ID that nobody on this machine uses, reserved as long as the context lasts.
+
+    Every domain has UDP ports of its own (RTPS 2.5, 9.6.2). A domain is in use when the port of
+    a participant is taken; a port that no participant ever uses reserves it, and the kernel
+    gives that back whatever happens to this process. Raises BrokenOffError if all are in use.
+    """
+    # Starting at the process id spreads runs that start at the same moment.
+    for i in range(DOMAINS):
+        domain = 1 + (os.getpid() + i) % DOMAINS
+        ports = DOMAIN_0_PORT + PORTS_PER_DOMAIN * domain
+        with ExitStack() as reservation:
+            try:
+                reservation.enter_context(_bound(ports + RESERVATION_OFFSET))
+                for offset in PARTICIPANT_OFFSETS:
+                    _bound(ports + offset).close()
+            except OSError:
+                continue
+            yield domain
+            return
+    raise BrokenOffError(
+        f'every ROS_DOMAIN_ID from 1 to {DOMAINS} is in use on this machine: set one yourself'
+    )
+
+
+def _bound(port: int) -> socket.socket:
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        bound.bind(('', port))
+    except OSError:
+        bound.close()
+        raise
+    return bound

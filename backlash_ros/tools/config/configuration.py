@@ -47,13 +47,9 @@ class Setting:
 
 @dataclass(frozen=True)
 class Configuration:
-    """A file with what the command line changes in it: the parameters of every axis.
-
-    own_file: whether the user has named it. axes: empty for a run without axes.
-    """
+    """A file with what the command line changes in it; axes: empty for a run without axes."""
 
     file: ParameterFile
-    own_file: bool
     settings: tuple[Setting, ...]
     seed: int | None
     axes: tuple[str, ...]
@@ -78,16 +74,6 @@ class Configuration:
         values.pop(AXES, None)
         return Parameters(values)
 
-    def given(self, axis: str = '', without: str = '') -> set[str]:
-        """Names of the parameters that the user gives a value.
-
-        without: a node whose own sections of the file are left out.
-        """
-        names = {s.name for s in self.settings if s.axis in ('', axis)}
-        if self.own_file:
-            names |= set(self.file.values(axis, without))
-        return names if self.seed is None else names | {'seed'}
-
 
 def read_configuration(
     config: Path | None, settings: Sequence[str] = (), seed: int | None = None,
@@ -107,7 +93,7 @@ def read_configuration(
             raise InputError(f'--set {setting.axis}/{setting.name}: '
                              + no_such_axis(setting.axis, axes))
     file.check_axes(axes)
-    return Configuration(file, config is not None, parsed, seed, axes)
+    return Configuration(file, parsed, seed, axes)
 
 
 def effective_parameters(

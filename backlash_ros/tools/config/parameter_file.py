@@ -73,15 +73,11 @@ class ParameterFile:
                     f'/{ANY}/{section.node} for all axes or /{axes[0]}/{section.node} for one'
                 )
 
-    def values(self, axis: str, without: str = '') -> dict[str, Value]:
-        """Values for an axis by flat name, empty for a run without axes; raises InputError.
-
-        without: a node whose own sections are left out.
-        """
+    def values(self, axis: str) -> dict[str, Value]:
+        """Values for an axis by flat name, empty for a run without axes; raises InputError."""
         return self._merged([
             section for section in self.sections
-            if section.node != without
-            and (section.axis in (ANY, axis) or (section.node == BRINGUP and not section.axis))
+            if section.axis in (ANY, axis) or (section.node == BRINGUP and not section.axis)
         ])
 
     def _merged(self, sections: Sequence[Section]) -> dict[str, Value]:

@@ -19,8 +19,7 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import simulate as simulate
-from backlash_ros.tools.bringup.domains import free_domain
-from backlash_ros.tools.bringup.environment import child_environment
+from backlash_ros.tools.bringup.environment import child_environment, free_domain
 from backlash_ros.tools.records.reading import read_record
 from backlash_ros.tools.replay.command import main
 from backlash_ros.tools.runs.source import read_run

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from backlash_ros.tools.bringup.axis_progress import (
+from backlash_ros.tools.bringup.plan import AxisPlan
+from backlash_ros.tools.bringup.watch import (
     FIRST_SAMPLE_DEADLINE_S,
     LATE_DEADLINE_S,
     AxisProgress,
+    ProgressDisplay,
 )
-from backlash_ros.tools.bringup.processes import RunError
-from backlash_ros.tools.bringup.progress import ProgressDisplay
-from backlash_ros.tools.bringup.run_plan import AxisPlan
+from backlash_ros.tools.cli import BrokenOffError
 from backlash_ros.tools.config.configuration import effective_parameters
 
 
@@ -23,8 +23,8 @@ def begun(folder: Path, driver: str = '', **values: object) -> tuple[AxisProgres
     """An axis whose run of 100 samples has just begun, and what is said of it."""
     p = effective_parameters(None).replaced({'samples': 100, 'driver': driver, **values})
     said = io.StringIO()
-    display = ProgressDisplay(p.get_int('samples'), 0.01, said)
-    axis = AxisProgress(AxisPlan('', p, folder, record=True), display)
+    plan = AxisPlan('', p, folder, record=True)
+    axis = AxisProgress(plan, ProgressDisplay(plan, said))
     axis.begin()
     return axis, said
 
@@ -67,7 +67,7 @@ def test_a_plant_that_stands_still_is_an_error_that_names_the_last_sample(tmp_pa
     let_pass(axis, axis.patience - 1.0)
     axis.check_pace()
     let_pass(axis, 2.0)
-    with pytest.raises(RunError, match=r'no new sample for .* after sample 41, see '):
+    with pytest.raises(BrokenOffError, match=r'no new sample for .* after sample 41, see '):
         axis.check_pace()
 
 
@@ -91,7 +91,7 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
     axis.began -= 1.0 + LATE_DEADLINE_S - 0.5
     axis.check_pace()
     axis.began -= 1.0
-    with pytest.raises(RunError, match=r'^only 42 of 100 samples, '):
+    with pytest.raises(BrokenOffError, match=r'^only 42 of 100 samples, '):
         axis.check_pace()
 
 
@@ -113,5 +113,5 @@ def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts
         if driver == 'none':
             axis.check_pace()
         else:
-            with pytest.raises(RunError, match='does the driver publish its output'):
+            with pytest.raises(BrokenOffError, match='does the driver publish its output'):
                 axis.check_pace()

@@ -13,13 +13,12 @@ import pytest
 import yaml
 from places import ROOT
 
-from backlash_ros.tools.bringup import command as bringup
-from backlash_ros.tools.bringup import domains, environment
+from backlash_ros.tools.bringup import __main__ as bringup
+from backlash_ros.tools.bringup import environment
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
-from backlash_ros.tools.bringup.orchestrator import prepare
-from backlash_ros.tools.bringup.processes import ProcessPlan
-from backlash_ros.tools.bringup.progress import ProgressDisplay, describe
-from backlash_ros.tools.bringup.run_plan import AxisPlan, RunPlan, plan_processes
+from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
+from backlash_ros.tools.bringup.supervisor import ProcessPlan
+from backlash_ros.tools.bringup.watch import ProgressDisplay, describe
 from backlash_ros.tools.config.configuration import effective_parameters
 
 CONFIG = ROOT / 'config' / 'two_axes.yaml'
@@ -92,13 +91,13 @@ def test_folder_that_holds_a_bag_is_not_written_over(
 
 
 def test_two_runs_get_two_domains_and_none_that_somebody_uses() -> None:
-    with domains.free_domain() as first:
-        with domains.free_domain() as second:
+    with environment.free_domain() as first:
+        with environment.free_domain() as second:
             assert first != second
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
-            port = domains.DOMAIN_0_PORT + domains.PORTS_PER_DOMAIN * second + 12
+            port = environment.DOMAIN_0_PORT + environment.PORTS_PER_DOMAIN * second + 12
             participant.bind(('127.0.0.1', port))
-            with domains.free_domain() as third:
+            with environment.free_domain() as third:
                 assert third not in (first, second)
 
 
@@ -141,9 +140,9 @@ def test_plant_stops_first_but_a_driver_only_after_the_controller(tmp_path: Path
     stages = plan_processes(plan(tmp_path, 'run it', sample_period=0.05), None)
     assert names_of(stages) == [['controller'], ['driver'], ['reference'], ['recorder']]
     assert stages[1][0].command == ('run', 'it')
-    assert stages[1][0].linger_s == pytest.approx(0.1)
+    assert stages[1][0].settle_s == pytest.approx(0.1)
     slow = plan_processes(plan(tmp_path, 'run it', **{'timeout.ramp': 20.0}), None)
-    assert [stage[0].farewell_s for stage in slow] == [20.0, 0.0, 0.0, 0.0]
+    assert [stage[0].grace_s for stage in slow] == [20.0, 0.0, 0.0, 0.0]
     assert names_of(plan_processes(plan(tmp_path, 'none'), None)) == [
         ['controller'], [], ['reference'], ['recorder'],
     ]
@@ -210,30 +209,11 @@ def test_axis_that_holds_a_bag_is_not_written_over(
     assert [path.name for path in tmp_path.iterdir()] == ['tilt']
 
 
-def test_progress_names_the_axis_and_an_endless_run_has_no_total() -> None:
+def test_progress_names_the_axis_and_an_endless_run_has_no_total(tmp_path: Path) -> None:
     stream = io.StringIO()
     progress = {'sample': 149, 'm': 1.0, 'lost': 0}
-    ProgressDisplay(200, 0.01, stream, 'x').show(progress, 150)
-    ProgressDisplay(0, 0.01, stream).show(progress, 150)
+    for axis in (*plan(tmp_path, '', 'x', samples=200).axes, *plan(tmp_path, '', samples=0).axes):
+        ProgressDisplay(axis, stream).show(progress, 150)
     first, second = stream.getvalue().splitlines()
     assert first.startswith('x:    1.50 s  150/200  m 1')
     assert second.startswith('   1.50 s  150  m 1')
-
-
-def test_a_section_of_the_plant_is_no_mistake_where_there_is_a_driver(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    config = tmp_path / 'mine.yaml'
-    common = '/**: {ros__parameters: {control: {min: -1.0, max: 1.0, rate_max: 9.0}'
-    noise = 'estimator: {output_noise_std: 1.0e-4}'
-    of_plant = '/**/plant: {ros__parameters: {output_quantum: 0.1, seed: 3}}'
-    for number, (text, said) in enumerate((
-        (f'{common}, {noise}}}}}\n{of_plant}', False),
-        (f'{common}, {noise}, seed: 3}}}}', True),
-        (f'{common}}}}}\n{of_plant}', True),  # the noise of the estimator follows the quantum
-    )):
-        config.write_text(text)
-        prepare(bringup.parse_options([
-            '--config', str(config), '--driver', 'none', '--out', str(tmp_path / str(number)),
-        ]))
-        assert ('no use for' in capsys.readouterr().err) is said

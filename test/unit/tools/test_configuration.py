@@ -284,11 +284,3 @@ def test_one_of_several_axes_must_be_chosen_by_its_name(config: Path) -> None:
         effective_parameters(config, axis='z')
     with pytest.raises(InputError, match="--set z/seed: there is no axis 'z' among x, y"):
         effective_parameters(config, ['z/seed=1'], axis='x')
-
-
-def test_given_names_are_those_of_the_user_and_not_of_the_default_file(config: Path) -> None:
-    assert read_configuration(None, ['bias=1'], seed=3).given() == {'bias', 'seed'}
-    written(config, AXES + '/x/**: {ros__parameters: {amplitude: 2.0}}')
-    given = read_configuration(config, ['y/bias=1'])
-    assert given.given('x') == {'axes', 'amplitude'}
-    assert given.given('y') == {'axes', 'bias'}

@@ -1,0 +1,275 @@
+"""From options to a checked plan of a run: its axes, and the processes of each."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+
+from backlash_ros.core.assembly import build_controller, build_plant, build_reference
+from backlash_ros.core.parameters import Parameters, missing_limits
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
+from backlash_ros.options import LARGEST_PORT
+from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
+from backlash_ros.tools.bringup.supervisor import ProcessPlan
+from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
+from backlash_ros.tools.config.configuration import Configuration, read_configuration, write_config
+from backlash_ros.tools.runs.files import CONFIG, result_directory
+from backlash_ros.tools.runs.source import BAG
+
+LOGS = 'logs'
+DRIVER, ELSEWHERE = 'driver', 'none'
+LIVE = 'live'
+AXIS_MARK = '{axis}'
+ESTIMATES = 'estimates.file'
+# Each node takes one of the places that discovery on one machine has; some stay for listeners.
+MOST_AXES = 7
+
+
+@dataclass(frozen=True)
+class AxisPlan:
+    """One loop of a run; its parameters are complete and checked, its folder exists.
+
+    name: also its namespace, empty for a run without axes.
+    """
+
+    name: str
+    parameters: Parameters
+    out: Path
+    record: bool
+
+    @property
+    def samples(self) -> int:
+        """Samples of the whole run, 0 for a run without end."""
+        return self.parameters.get_int('samples')
+
+    @property
+    def sample_period(self) -> float:
+        """T [s]."""
+        return self.parameters.get_float('sample_period')
+
+    @property
+    def bag(self) -> Path:
+        """Folder of the bag."""
+        return self.out / BAG
+
+    @property
+    def logs(self) -> Path:
+        """Folder of the logs."""
+        return self.out / LOGS
+
+    @property
+    def has_driver(self) -> bool:
+        """Whether something else stands in the place of the simulated plant."""
+        return bool(self.parameters.get_str(DRIVER))
+
+    @property
+    def driver_is_elsewhere(self) -> bool:
+        """Whether somebody else starts the driver."""
+        return self.parameters.get_str(DRIVER) == ELSEWHERE
+
+    @property
+    def is_managed(self) -> bool:
+        """Whether somebody else activates the controller."""
+        return not self.parameters.get_bool('autostart')
+
+    def titled(self, text: str) -> str:
+        """The text, with the name of the axis where there are axes."""
+        return f'{self.name}: {text}' if self.name else text
+
+    def process_name(self, node: str) -> str:
+        """Name of one of its processes in messages."""
+        return f'{self.name}/{node}' if self.name else node
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """All that runs together: one loop without a name, or one for each axis.
+
+    live_port: of the page in the browser, 0 for a free one, None without a page.
+    """
+
+    axes: tuple[AxisPlan, ...]
+    out: Path
+    live_port: int | None = None
+
+    @property
+    def endless(self) -> bool:
+        """Whether only the user ends it."""
+        return any(axis.samples == 0 for axis in self.axes)
+
+
+def prepare(options: argparse.Namespace) -> RunPlan:
+    """Check all input, then make the result folders; raises ParameterError or InputError.
+
+    Raises BrokenOffError where there is no ROS 2 to run the nodes with.
+    """
+    if ros_is_missing():
+        raise BrokenOffError(ROS_MISSING)
+    configuration = read_configuration(options.config, options.settings, options.seed)
+    names = (options.axis,) if options.axis else configuration.axes or ('',)
+    if len(names) > MOST_AXES:
+        raise InputError(f'{len(names)} axes are too many for one machine: at most {MOST_AXES}')
+    parameters = {name: _parameters(configuration, name, options) for name in names}
+    if options.unlimited and not any(values.get_str(DRIVER) for values in parameters.values()):
+        raise InputError('--unlimited is about a driver: give --driver as well')
+    live_port = options.live_port if options.live_port is not None else 0 if options.live else None
+    if live_port is not None and not 0 <= live_port <= LARGEST_PORT:
+        raise InputError(f'--live-port={live_port}: must be from 0 (a free one) to {LARGEST_PORT}')
+    _check_files(parameters)
+    for name, values in parameters.items():
+        print_warnings(f'bringup: {name}' if name else 'bringup', values)
+    for name in names:
+        if options.out is not None and (options.out / name / BAG).exists():
+            raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
+    # The nodes need a path that holds wherever it is read.
+    out = result_directory(options.out).resolve()
+    plan = RunPlan(tuple(
+        AxisPlan(name, values, out / name, options.record) for name, values in parameters.items()
+    ), out, live_port)
+    try:
+        for axis in plan.axes:
+            axis.logs.mkdir(parents=True, exist_ok=True)
+            write_config(axis.parameters, axis.out / CONFIG)
+    except OSError as error:
+        raise InputError(f'{plan.out}: cannot be written: {error.strerror}') from None
+    return plan
+
+
+def _parameters(
+    configuration: Configuration, axis: str, options: argparse.Namespace,
+) -> Parameters:
+    """The parameters of an axis, checked as far as that is possible without running."""
+    try:
+        parameters = configuration.parameters(axis)
+        endless = options.duration == inf
+        parameters = parameters.replaced({
+            'lockstep': options.lockstep or parameters.get_bool('lockstep'),
+            'samples': 0 if endless else number_of_samples(parameters, options.duration),
+        })
+        if options.driver is not None:
+            parameters = parameters.replaced({DRIVER: options.driver})
+        parameters = _with_driver(axis, parameters)
+        missing = missing_limits(parameters)
+        if parameters.get_str(DRIVER) and missing and not options.unlimited:
+            raise ParameterError(
+                missing[0], parameters.get_float(missing[0]),
+                'is no limit, and a driver moves an actuator',
+                f'set {", ".join(missing)}, or give --unlimited',
+            )
+        if bag := parameters.get_str('bag'):
+            raise ParameterError('bag', bag, 'is made by bringup', 'choose its folder with --out')
+        build_controller(parameters)
+        build_reference(parameters)
+        if not parameters.get_str(DRIVER):
+            build_plant(parameters)
+    except (ParameterError, InputError) as error:
+        error.args = (f'{axis}: {error}' if axis else str(error),)
+        raise
+    return parameters
+
+
+def _with_driver(axis: str, parameters: Parameters) -> Parameters:
+    """The set with the name of the axis in the command of its driver; raises ParameterError."""
+    text = parameters.get_str(DRIVER).strip()
+    try:
+        shlex.split(text)
+    except ValueError as error:
+        raise ParameterError(DRIVER, text, 'is not a command', str(error)) from None
+    if text and parameters.get_bool('lockstep'):
+        raise ParameterError(
+            DRIVER, text, 'excludes lockstep', 'a real plant does not wait for its control'
+        )
+    if AXIS_MARK in text and not axis:
+        raise ParameterError(DRIVER, text, 'names an axis', 'list the axes in the parameter axes')
+    return parameters.replaced({DRIVER: text.replace(AXIS_MARK, axis)})
+
+
+def _check_files(parameters: Mapping[str, Parameters]) -> None:
+    """Raise ParameterError where two axes would save their estimates in one file."""
+    users: dict[str, str] = {}
+    for axis, values in parameters.items():
+        file = values.get_str(ESTIMATES)
+        if file and users.setdefault(file, axis) != axis:
+            raise ParameterError(
+                ESTIMATES, file, f'is the file of {users[file]} and of {axis}',
+                f'give each axis one of its own, like --set {axis}/{ESTIMATES}=...',
+            )
+
+
+def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]:
+    """The processes of a run by stages, which are to be stopped one after the other.
+
+    A simulated plant stops first, so that no output stays without its answer. With a driver the
+    controller goes first and the driver hears its last command. The recorder goes last and so
+    has everything that the others have said. domain: ROS_DOMAIN_ID to set, None to leave it alone.
+    """
+    stages: list[list[ProcessPlan]] = [[], [], [], []]
+    for axis in plan.axes:
+        order = ('controller', None, 'reference', 'recorder') if axis.has_driver \
+            else ('plant', 'reference', 'controller', 'recorder')
+        for stage, node in zip(stages, order, strict=True):
+            if node is not None:
+                stage.append(_node(axis, node, child_environment(axis.logs, domain)))
+    # Axes with the very same command have one driver together.
+    served: dict[tuple[str, ...], list[AxisPlan]] = {}
+    for axis in plan.axes:
+        if axis.has_driver and not axis.driver_is_elsewhere:
+            served.setdefault(tuple(shlex.split(axis.parameters.get_str(DRIVER))), []).append(axis)
+    stages[1] += [_driver(plan, command, axes, domain) for command, axes in served.items()]
+    if plan.live_port is not None:
+        logs = plan.axes[0].logs
+        shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
+        stages[-1].append(ProcessPlan(
+            LIVE, (*_module('live.command'), '--port', str(plan.live_port), *shown),
+            logs / f'{LIVE}.log', child_environment(logs, domain), plan.axes[0].name,
+            spectator=True,
+        ))
+    return stages
+
+
+def _module(name: str) -> tuple[str, ...]:
+    return sys.executable, '-m', f'backlash_ros.nodes.{name}'
+
+
+def _node(axis: AxisPlan, node: str, environment: Mapping[str, str]) -> ProcessPlan:
+    lockstep = axis.parameters.get_bool('lockstep')
+    if node == 'recorder':
+        # In YAML, whatever stands in the path.
+        bag = str(axis.bag).replace("'", "''") if axis.record else ''
+        own = {'wait_for_publishers': 'true', 'bag': f"'{bag}'"}
+    else:
+        # The loop and the recorder; in real time the reference follows plant_output as well, in
+        # lockstep it follows /clock.
+        own = {'wait_for_subscribers': '3' if node == 'plant' and not lockstep else '2'}
+    command = [*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG)]
+    for parameter, value in own.items():
+        command += ['-p', f'{parameter}:={value}']
+    if axis.name:
+        command += ['-r', f'__ns:=/{axis.name}']
+        if lockstep:
+            command += ['-r', '/clock:=clock']  # each axis has a time of its own
+    return ProcessPlan(
+        axis.process_name(node), tuple(command), axis.logs / f'{node}.log', environment, axis.name,
+        # The controller may end with a ramp, and then saves what it has learned.
+        grace_s=axis.parameters.get_float('timeout.ramp') if node == 'controller' else 0.0,
+    )
+
+
+def _driver(
+    plan: RunPlan, command: tuple[str, ...], axes: Sequence[AxisPlan], domain: int | None,
+) -> ProcessPlan:
+    name, log = axes[0].process_name(DRIVER), axes[0].logs / f'{DRIVER}.log'
+    if len(axes) > 1:
+        names = [axis.name for axis in axes]
+        name, log = f'{DRIVER} of {", ".join(names)}', plan.out / LOGS / f'{"_".join(names)}.log'
+        log.parent.mkdir(exist_ok=True)
+    # The last command of the controller acts from the next sample of the driver on.
+    settle_s = min(2.0 * max(axis.sample_period for axis in axes), 1.0)
+    environment = foreign_environment(child_environment(log.parent, domain))
+    return ProcessPlan(name, command, log, environment, foreign=True, settle_s=settle_s)

@@ -1,0 +1,290 @@
+"""Child processes: started together, listened to, stopped in order, none of them left behind.
+
+Every child leads a process group of its own, so that a Ctrl-C of the terminal reaches the
+supervisor alone, which then stops the children in order, grandchildren included. A guardian, this
+module as a program, holds the other end of a pipe: when the supervisor dies of whatever cause, the
+pipe closes and the guardian stops what is left.
+Nothing here starts a thread: forking stays safe and a signal finds one loop to wake.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import selectors
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from types import TracebackType
+
+from backlash_ros.tools.bringup.environment import with_source
+from backlash_ros.tools.cli import BrokenOffError
+
+PROCESSES = Path('/proc')
+# SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
+ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
+LINES_OF_LOG = 10  # that a message quotes
+
+Stages = Sequence[tuple[Sequence[int], float]]  # process groups, and time beyond the usual [s]
+
+
+@dataclass(frozen=True)
+class ProcessPlan:
+    """What to start.
+
+    name: in messages. axis: that its events are about. foreign: no node of this package: all that
+    it prints goes to its log. spectator: the run goes on without it. settle_s: time that passes
+    before it is stopped, in which what was stopped before still has an effect on it. grace_s: time
+    that it needs for its end beyond what any process gets.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    log: Path
+    environment: Mapping[str, str]
+    axis: str = ''
+    foreign: bool = False
+    spectator: bool = False
+    settle_s: float = 0.0
+    grace_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Event:
+    """A JSON object that a process printed as a line of its stdout."""
+
+    plan: ProcessPlan
+    content: Mapping[str, object]
+
+    @property
+    def kind(self) -> str:
+        """The word that says what happened: ready, progress, done, closed."""
+        return str(self.content['event'])
+
+
+@dataclass
+class Child:
+    """A started process; what it prints besides events goes to its log."""
+
+    plan: ProcessPlan
+    process: subprocess.Popen[bytes]
+    unfinished_line: bytes = field(default=b'', repr=False)
+
+    def take(self, chunk: bytes) -> list[Event]:
+        """Events of the lines that end in this chunk of stdout."""
+        *lines, self.unfinished_line = (self.unfinished_line + chunk).split(b'\n')
+        events = []
+        for line in lines:
+            try:
+                content = json.loads(line)
+            except ValueError:
+                content = None
+            if isinstance(content, dict) and 'event' in content:
+                events.append(Event(self.plan, content))
+            else:
+                with self.plan.log.open('ab') as log:
+                    log.write(line + b'\n')
+        return events
+
+    def end_of_log(self) -> str:
+        """The last lines of the log, indented."""
+        log = self.plan.log
+        lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
+        quoted = ''.join(f'\n    {line}' for line in lines[-LINES_OF_LOG:])
+        return f'{log}:{quoted}' if quoted else f'{log} is empty'
+
+    def describe_exit(self) -> str:
+        """How the process ended, in words."""
+        code = self.process.returncode
+        if code is not None and code < 0:
+            return f'killed by {signal.Signals(-code).name}'
+        return f'exit code {code}'
+
+
+class ProcessSupervisor:
+    """Starts processes as a context manager and has stopped all of them when it is left.
+
+    stages: in the order in which they are to be stopped, those of one stage together; all are
+    started together. hurry: asked while stopping; once it says yes, nobody is given any more time.
+    Raises BrokenOffError for a program that cannot be started.
+    """
+
+    def __init__(
+        self, stages: Sequence[Sequence[ProcessPlan]], hurry: Callable[[], bool],
+    ) -> None:
+        self._plans, self._hurry = stages, hurry
+        self._stages: list[list[Child]] = [[] for _ in stages]
+        self._selector = selectors.DefaultSelector()
+        self._guardian: subprocess.Popen[bytes] | None = None
+
+    def __enter__(self) -> ProcessSupervisor:
+        try:
+            self._guardian = subprocess.Popen(
+                (sys.executable, '-m', 'backlash_ros.tools.bringup.supervisor'), bufsize=0,
+                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),
+                start_new_session=True,
+            )
+            for children, plans in zip(self._stages, self._plans, strict=True):
+                for plan in plans:
+                    children.append(self._start(plan))
+                    self._tell_guardian(self._stages)
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+        self._selector.close()
+        streams = [child.process.stdout for child in self.children]
+        if self._guardian is not None:
+            streams.append(self._guardian.stdin)
+        for stream in streams:
+            if stream is not None:
+                stream.close()
+        if self._guardian is not None:
+            self._guardian.wait()
+
+    @property
+    def children(self) -> list[Child]:
+        """All that were started."""
+        return list(chain(*self._stages))
+
+    def events(self, timeout: float) -> list[Event]:
+        """What the processes have said; waits up to timeout [s] for a first word."""
+        found: list[Event] = []
+        for key, _ in self._selector.select(timeout):
+            chunk = os.read(key.fd, 65536)
+            if not chunk:
+                self._selector.unregister(key.fileobj)
+            found += key.data.take(chunk)
+        return found
+
+    def ended(self) -> list[Child]:
+        """Children whose process has ended, whether by itself or by a signal."""
+        return [child for child in self.children if child.process.poll() is not None]
+
+    def stop(self) -> list[Event]:
+        """Stop one stage after the other, each child with all its group; returns last words."""
+        last_words: list[Event] = []
+
+        def listen() -> None:
+            last_words.extend(self.events(0.02))
+
+        for i, children in enumerate(self._stages):
+            living = [child for child in children if child.process.poll() is None]
+            settled = time.monotonic() + max((c.plan.settle_s for c in living), default=0.0)
+            while time.monotonic() < settled and not self._hurry():
+                listen()
+            stop_groups(*_groups(children), listen, self._hurry)
+            for child in children:
+                child.process.poll()
+            self._tell_guardian(self._stages[i + 1:])
+        while self._selector.select(0.0):
+            listen()
+        return last_words
+
+    def _start(self, plan: ProcessPlan) -> Child:
+        try:
+            with plan.log.open('ab') as log:
+                process = subprocess.Popen(
+                    plan.command, stdin=subprocess.DEVNULL,
+                    stdout=log if plan.foreign else subprocess.PIPE, stderr=log,
+                    env=plan.environment, start_new_session=True,
+                )
+        except OSError as error:
+            raise BrokenOffError(
+                f'{plan.name} does not start: {plan.command[0]}: {error.strerror}'
+            ) from error
+        child = Child(plan, process)
+        if process.stdout is not None:
+            self._selector.register(process.stdout, selectors.EVENT_READ, child)
+        return child
+
+    def _tell_guardian(self, stages: Sequence[Sequence[Child]]) -> None:
+        if self._guardian is not None and self._guardian.stdin is not None:
+            line = json.dumps([_groups(children) for children in stages]) + '\n'
+            with contextlib.suppress(BrokenPipeError):
+                self._guardian.stdin.write(line.encode())
+
+
+def _groups(children: Sequence[Child]) -> tuple[list[int], float]:
+    """Process groups of a stage, and the longest time that one of them needs beyond the usual."""
+    grace_s = max((child.plan.grace_s for child in children), default=0.0)
+    return [child.process.pid for child in children], grace_s
+
+
+def stop_groups(
+    groups: Sequence[int], grace_s: float, wait: Callable[[], None], hurry: Callable[[], bool],
+) -> None:
+    """Signal process groups, ever more firmly, until none is alive or all means are used up.
+
+    grace_s: how much longer the first signal may take than usual. wait: passes a moment. hurry: yes
+    skips to SIGKILL.
+    """
+    for number, patience in ESCALATION:
+        last = number == signal.SIGKILL
+        if hurry() and not last:
+            continue
+        for group in filter(group_exists, groups):
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(group, number)
+        deadline = time.monotonic() + patience + grace_s
+        while any(map(group_exists, groups)) and time.monotonic() < deadline and (
+            last or not hurry()
+        ):
+            wait()
+        grace_s = 0.0
+
+
+def group_exists(group: int) -> bool:
+    """Whether a process of this group is left; a zombie is none, for it may never be collected."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    # The leader first: only when it has gone all others must be looked through.
+    return not PROCESSES.is_dir() or any(
+        _lives_in(process, group)
+        for process in chain([PROCESSES / str(group)], PROCESSES.glob('[0-9]*'))
+    )
+
+
+def _lives_in(process: Path, group: int) -> bool:
+    try:
+        stat = (process / 'stat').read_text(encoding='utf-8', errors='replace')
+    except OSError:
+        return False
+    # The name of the program stands in parentheses and may hold anything.
+    state, _, its_group = stat.rpartition(')')[2].split()[:3]
+    return int(its_group) == group and state not in ('Z', 'X')
+
+
+def guard(lines: Iterable[str]) -> None:
+    """Read what is running, stage by stage, until the end, then stop what stays.
+
+    Each line replaces the one before it. The end comes when the supervisor closes the pipe or the
+    kernel does it after its death.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    stages: Stages = []
+    for line in lines:
+        stages = json.loads(line)
+    for groups, grace_s in stages:
+        stop_groups(groups, grace_s, lambda: time.sleep(0.02), lambda: False)
+
+
+if __name__ == '__main__':
+    guard(sys.stdin)
