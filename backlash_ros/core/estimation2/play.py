@@ -1,0 +1,52 @@
+"""The play operator over a record: p(k) = min(max(p(k-1), v(k)), v(k) + gap).
+
+u = m (p - c_r) is the output of the backlash (2.1) with the gap c_r - c_l; p rests on v while the
+right side is engaged, and on v + gap while the left one is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.plant.backlash import play_outputs
+
+Array = NDArray[np.float64]
+Sides = NDArray[np.int8]
+
+RIGHT, LEFT, NEITHER = 1, -1, 0
+
+
+def play(v: Array, gap: float, before: float) -> Array:
+    """p after each v (N,); before: p before the first of them."""
+    return np.array(play_outputs(v.tolist(), gap, before))
+
+
+def plays(v: Array, gaps: Array, before: Array) -> Array:
+    """The same for many gaps (H,) and beginnings (H,) at once, shape (H, N).
+
+    Between two turns of v, p is the larger of v and what was held, or the smaller of v + gap and
+    it: only the turns are stepped.
+    """
+    rises = np.append(False, v[1:] > v[:-1])
+    last = np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
+    held = np.minimum(np.maximum(before, v[0]), v[0] + gaps)
+    at_turns = np.empty((len(gaps), len(last)))
+    for k, (value, rising) in enumerate(zip(v[last].tolist(), rises[last].tolist(), strict=True)):
+        at_turns[:, k] = held
+        held = np.maximum(held, value) if rising else np.minimum(held, value + gaps)
+    p = np.repeat(at_turns, np.diff(last, prepend=-1), axis=1)
+    return np.where(rises, np.maximum(p, v), np.minimum(p, v + gaps[:, None]))
+
+
+def engaged(v: Array, p: Array, gap: float) -> Sides:
+    """The side that was engaged last at each sample (N,): RIGHT, LEFT, NEITHER before the first."""
+    now = np.where(p == v, RIGHT, np.where(p == v + gap, LEFT, NEITHER)).astype(np.int8)
+    newest = np.maximum.accumulate(np.where(now != NEITHER, np.arange(len(v)), -1))
+    return np.where(newest < 0, np.int8(NEITHER), now[newest])
+
+
+def reversals(sides: Sides) -> NDArray[np.intp]:
+    """Samples (R,) at which the other side engages."""
+    seen = np.flatnonzero(sides != NEITHER)
+    return np.asarray(seen[1:][np.diff(sides[seen]) != 0])

@@ -1,0 +1,36 @@
+"""What the estimator is tuned by: every constant with its meaning and unit.
+
+Guards against rounding stand where they are used.
+"""
+
+from __future__ import annotations
+
+# --- what counts as known
+STD_SLOPE = 0.2  # standard deviation of m over m, below which an estimate is published
+STD_GAP = 0.3  # standard deviation of the gap over the gap, below which it is published
+SYSTEMATIC = 3.0  # factor by which both are smaller while residuals are correlated
+NO_GAP = 0.1  # upper end of a gap that counts as none, over the gap of the first guess
+REVERSALS = 2  # changes of the engaged side before a first estimate where G is uncertain
+UNEXPLAINED = 0.1  # motion that nothing explains, over m times the gap, that is tolerated
+LOST_MOTION = 0.02  # by which the gap of a gear differs from one motion to another, over the gap
+
+# --- when an explanation counts
+CHANCE = 1e-3  # probability below which a difference between two estimates is no chance
+ENGAGED = 15.0  # log-likelihood by which a backlash must beat a constant u
+GATE = 6.0  # standard deviations beyond which a reading is an outlier
+OUTLIERS = 5  # readings in a row beyond the gate that are no outliers
+OUTLIER_SHARE = 0.2  # of a block, up to which readings beyond the gate are outliers
+MISFIT = 3.0  # mean square of normalised residuals of a block that contradicts an estimate
+AS_GOOD = 1.5  # ratio of residuals up to which another explanation is as good
+FORETOLD = 30  # samples that an explanation must foretell after a contradiction
+COMMAND_ODDS = 20.0  # against a command other than the one that was sent
+
+# --- how much is looked at
+FIRST_FIT = 20  # samples before the first search
+GROWTH = 1.25  # of the record from one search to the next
+BLOCKS = 16  # refits while the record doubles: one for so many of its samples
+FEWEST = 8  # samples between two refits
+LIVELY = 1500  # samples that are kept though fewer hold enough reversals
+HELD_REVERSALS = 6  # reversals that the record holds, however long they take
+LONGEST = 120_000  # samples of the record, at most
+ROWS = 1500  # rows that a search averages the record to
