@@ -22,7 +22,8 @@ Array = NDArray[np.float64]
 
 GAPS, STARTS = 32, 5  # that are compared, and beginnings within each
 SMALLEST = 0.01  # gap that is compared, over the swing of v
-ZOOM: Array = np.array([0.8 + 0.025 * k for k in range(17)])  # gaps of the second look, over the best of the first
+# Gaps of the second look, over the best of the first.
+ZOOM: Array = np.array([0.8 + 0.025 * k for k in range(17)])
 SCALES = (0.03, 0.3, 1.0)  # of the error of G that are weighed
 AT_ONCE = 2_000_000  # numbers that are held at once
 # --- guards
