@@ -19,6 +19,7 @@ from backlash_ros.core.control.structure import Structure
 from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
+from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
 from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
@@ -43,7 +44,7 @@ from backlash_ros.core.scenario import (
 __all__ = [
     'ESTIMATORS', 'STRUCTURES', 'build_controller', 'build_four_blocks', 'build_limits',
     'build_model', 'build_plant', 'build_reference', 'build_state_model', 'build_structure',
-    'build_true_model', 'law_fits', 'warnings_of',
+    'build_true_model', 'first_guess', 'known_before', 'law_fits', 'warnings_of',
 ]
 
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
@@ -62,12 +63,28 @@ def build_state_model(p: Parameters) -> StateModel:
     return _state_model(tuple(model.numerator), tuple(model.denominator))
 
 
-def build_controller(p: Parameters, inherited: Estimate | None = None) -> AdaptiveController:
+def first_guess(p: Parameters) -> Estimate:
+    """The estimates that estimator.initial names."""
+    return Estimate(
+        p.get_float('estimator.initial.m'), p.get_float('estimator.initial.c_r'),
+        p.get_float('estimator.initial.c_l'), p.get_float('proportional.f'),
+    )
+
+
+def known_before(p: Parameters) -> Estimate:
+    """The estimates to begin with: those in estimates.file if they are to be loaded and there.
+
+    Raises ParameterError for a file that does not belong to these parameters.
+    """
+    return load_estimate(p) or first_guess(p)
+
+
+def build_controller(p: Parameters, estimate: Estimate | None = None) -> AdaptiveController:
     """The controller with the law and the structure that the parameters name.
 
-    inherited: what was learned before; it takes the place of estimator.initial. Raises
-    ParameterError for parameters that contradict each other and for a G(z) through which the
-    backlash cannot be learned.
+    estimate: to begin with, None for those that were known before. Raises ParameterError for
+    parameters that contradict each other and for a G(z) through which the backlash cannot be
+    learned.
     """
     check_model(build_model(p))
     _check_first_guess(p)
@@ -77,7 +94,7 @@ def build_controller(p: Parameters, inherited: Estimate | None = None) -> Adapti
         p.get_float('inverse.direction_band'), p.get_float('inverse.take_up_rate') * period
     )
     _check_structure(p)
-    estimator = ESTIMATORS[p.get_str('estimator.law')](p, inherited or _initial(p))
+    estimator = ESTIMATORS[p.get_str('estimator.law')](p, estimate or known_before(p))
     return AdaptiveController(
         estimator, build_structure(p), inverse, build_limits(p), p.get_bool('plant.adapt'),
         _serial(p),
@@ -151,13 +168,6 @@ def _bounds(p: Parameters) -> Bounds:
     return Bounds(
         p.get_pair('estimator.bounds.m'), p.get_pair('estimator.bounds.c_r'),
         p.get_pair('estimator.bounds.c_l'),
-    )
-
-
-def _initial(p: Parameters) -> Estimate:
-    return Estimate(
-        p.get_float('estimator.initial.m'), p.get_float('estimator.initial.c_r'),
-        p.get_float('estimator.initial.c_l'), p.get_float('proportional.f'),
     )
 
 

@@ -14,14 +14,14 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_controller, warnings_of
+from backlash_ros.core.assembly import build_controller, first_guess, known_before, warnings_of
 from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter, kept_outputs
-from backlash_ros.core.loop.storage import load_estimate, worth_saving
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import CONTROLLER
@@ -66,7 +66,7 @@ class ControllerNode(ManagedNode):
         if p.get_bool('lockstep') and p.get_str('io.style') != 'native':
             raise ParameterError('lockstep', True, 'needs io.style: native')
         # Whatever is wrong with the parameters ends the process before it takes part in anything.
-        build_controller(p, load_estimate(p))
+        build_controller(p)
         for warning in warnings_of(p, with_reference=False):
             self.log.warning(warning)
         self.loop: ControlLoop | None = None  # None while unconfigured
@@ -144,16 +144,16 @@ class ControllerNode(ManagedNode):
 
     def configure(self) -> None:
         p = self._live.parameters
-        inherited = load_estimate(p)
+        before = known_before(p)
         self.loop = ControlLoop(
-            p, self._io.publish, self._io.now_ns, inherited, self._counter,
+            p, self._io.publish, self._io.now_ns, before, self._counter,
             self._first_command.v_at_start(p), self._new_reports,
         )
         self._model.publish(self.loop)
-        if inherited is not None:
+        if before.learned:
             self.log.info(
-                f'going on with the estimates in {self.estimates_file}: m={inherited.m:.6g}, '
-                f'c_r={inherited.c_r:.6g}, c_l={inherited.c_l:.6g}'
+                f'going on with the estimates in {self.estimates_file}: m={before.m:.6g}, '
+                f'c_r={before.c_r:.6g}, c_l={before.c_l:.6g}'
             )
 
     def activate(self) -> None:
@@ -314,7 +314,7 @@ class ControllerNode(ManagedNode):
 
     def _check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loop cannot take up."""
-        build_controller(p)
+        build_controller(p, first_guess(p))
         changes = p[NOISE] != self._live.parameters[NOISE]
         if self.loop is not None and changes and NOISE not in self.loop.core.estimator.RETUNED:
             raise ParameterError(

@@ -108,7 +108,7 @@ _NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
     return {
         'estimator.law': 'fixed', 'estimator.initial.m': m, 'estimator.initial.c_r': c_r,
-        'estimator.initial.c_l': c_l,
+        'estimator.initial.c_l': c_l, 'estimates.load': False,
     }
 
 
@@ -126,6 +126,8 @@ def compare(scenario: Parameters, samples: int) -> list[Result]:
 
 def _parameters(contender: Contender, scenario: Parameters) -> Parameters:
     changed = scenario.replaced(contender.changes)
+    if changed['estimator.law'] != scenario['estimator.law']:
+        changed = changed.replaced({'estimates.load': False})  # they belong to another law
     if not contender.follows:
         return changed
     z = np.exp(1j * scenario.get_float('frequency') * scenario.get_float('sample_period'))

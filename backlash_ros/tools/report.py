@@ -44,6 +44,7 @@ from backlash_ros.tools.runs.files import (
 from backlash_ros.tools.runs.run import Run
 from backlash_ros.tools.runs.source import read_run
 from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
+from backlash_ros.topics import BACKLASH
 
 PAGE = 'report.html'
 TITLE = 'Adaptive backlash inverse control'
@@ -182,6 +183,7 @@ def _facts(summary: Mapping[str, Any]) -> str:
         ('lost samples', str(summary['lost_samples'])),
         ('sample period', f'{summary["sample_period"]:.6g} s'),
         ('structure', escape(summary['structure'] or NOTHING)),
+        ('began with', _beginning(summary['began_with'])),
         ('control error RMS, last second', number(summary['control_error_rms'], 4, '[unit of u]')),
         ('tracking error RMS, last half',
          number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)),
@@ -194,6 +196,11 @@ def _facts(summary: Mapping[str, Any]) -> str:
         ('samples in state tracking',
          number((summary['status_share'] or {}).get('tracking'), 3, '%', 100.0)),
     ])
+
+
+def _beginning(first: Mapping[str, Any]) -> str:
+    values = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
+    return f'{values}: {escape(first["from"])}' if first['from'] else values
 
 
 def main(args: Sequence[str] | None = None) -> int:

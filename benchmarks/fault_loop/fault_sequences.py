@@ -18,7 +18,7 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.loop.storage import was_given
+from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction

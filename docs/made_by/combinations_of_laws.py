@@ -17,7 +17,7 @@ from backlash_ros.core.assembly import (
     law_fits,
 )
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.loop.storage import was_given
+from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.parameters import Parameters
 
 SAMPLES, RESTS_FROM = 1500, 900

@@ -12,6 +12,7 @@ from backlash_ros.core.assembly import (
     build_limits,
     build_model,
     build_structure,
+    first_guess,
 )
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.last_command import last_commands
@@ -47,17 +48,17 @@ class _Sent(NamedTuple):
 class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
-    send: takes v to the driver. now_ns: the clock of the stamps. inherited: estimates that were
-    learned before. counter: goes on counting where another loop has ended. v: the newest command,
-    0 as long as nobody knows (knows_v) which one acts. reports: v and stamp [ns] of what the driver
-    has reported since the last call. told: G(z) as the parameters have it.
+    send: takes v to the driver. now_ns: the clock of the stamps. estimate: to begin with, None for
+    what was known before. counter: goes on counting where another loop has ended. v: the newest
+    command, 0 as long as nobody knows (knows_v) which one acts. reports: v and stamp [ns] of what
+    the driver has reported since the last call. told: G(z) as the parameters have it.
     silent: the driver was given up for the time being. standing_down: another controller commands
     the actuator, so nothing is sent.
     """
 
     def __init__(
         self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
-        inherited: Estimate | None, counter: SampleCounter, v: float | None = None,
+        estimate: Estimate | None, counter: SampleCounter, v: float | None = None,
         reports: Callable[[], Iterable[tuple[float, int]]] = tuple,
     ) -> None:
         self.statistics = LoopStatistics()
@@ -78,7 +79,7 @@ class ControlLoop:
         self._unnoted: tuple[Output, bool] | None = None  # the newest one, whether it is a sample
         self._sent: _Sent | None = None  # the newest command, until it is noted
         self._other_ns = 0  # when another controller was last heard to command
-        self.core = build_controller(p, inherited)
+        self.core = build_controller(p, estimate)
         self.told = build_model(p)
 
     @property
@@ -86,16 +87,20 @@ class ControlLoop:
         """What is known of the backlash."""
         return self.core.estimator.estimate
 
-    def renew(self, inherited: Estimate | None) -> None:
-        """Go on with a new core from the present v: nothing is known of the state of the plant.
+    def renew(self, estimate: Estimate) -> None:
+        """Go on from the present v with a new core that begins with these estimates.
 
-        inherited: estimates to begin with, None for those of the parameters.
+        Nothing is known of the state of the plant then.
         """
-        before, self.core = self.core, build_controller(self._p, inherited)
+        before, self.core = self.core, build_controller(self._p, estimate)
         self.core.go_on_from(before)
         self.core.compensating = self.compensating
         self.core.estimator.adapting = self.adapting
         self._begun, self._missing = False, 0
+
+    def reset(self) -> None:
+        """Begin with the estimates of estimator.initial."""
+        self.renew(first_guess(self._p))
 
     def adapt(self, adapting: bool) -> None:
         """Learn, or hold the estimates."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.loop.learned_model import LearnedModel
-from backlash_ros.core.loop.storage import was_given
 
 COLUMNS = (
     't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',

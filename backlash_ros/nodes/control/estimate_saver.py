@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.loop.storage import save_estimate
+from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.parameters import Parameters
 
 

@@ -11,8 +11,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.storage import worth_saving
 
 UNCONFIGURED = 'the controller is unconfigured: configure it first'
 
@@ -58,11 +58,11 @@ def offer_services(node: Node, served: Served) -> None:
         return response
 
     def reset(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def renew(loop: ControlLoop) -> str:
-            loop.renew(None)
+        def begin_anew(loop: ControlLoop) -> str:
+            loop.reset()
             return 'the estimates are those of estimator.initial'
 
-        when_configured(response, renew)
+        when_configured(response, begin_anew)
         return response
 
     async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -12,12 +12,12 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.loop.causes import LONGEST_TEXT, findings_of
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer
 from backlash_ros.core.loop.loop_statistics import Lately
-from backlash_ros.core.loop.storage import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.run_record import stated_deviations

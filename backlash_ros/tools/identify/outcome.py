@@ -12,13 +12,13 @@ import numpy as np
 from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import (
     Identification,
     Options,
     identifying,
 )
-from backlash_ros.core.loop.storage import save_estimate
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import Value

@@ -129,7 +129,9 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
         if law == own or not law_fits(law, parameters.get_str('structure')):
             continue
         try:
-            loop = build_closed_loop(parameters.replaced({'estimator.law': law}))
+            loop = build_closed_loop(parameters.replaced({
+                'estimator.law': law, 'estimates.load': False,
+            }))
             simulated = run_loop(loop, samples)
         except (ParameterError, InputError, BrokenOffError) as error:
             nothing = np.empty(0)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.assembly import build_structure, first_guess
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
@@ -45,6 +45,7 @@ def summarise(
         'samples': run.samples,
         'sample_period': run.sample_period,
         'lost_samples': run.lost_samples,
+        'began_with': _beginning(run, parameters),
         'final': {name: last[name] for name in (*BACKLASH, 'f')},
         'final_std': {name: last[f'std_{name}'] for name in BACKLASH},
         'truth': {name: last[f'true_{name}'] if truth else None for name in BACKLASH},
@@ -57,6 +58,19 @@ def summarise(
         'final_status': Status(int(code)).word if (code := last['status']) in set(Status) else None,
         'status_share': _status_share(run.column('status')),
         **_learned(run.learned),
+    }
+
+
+def _beginning(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
+    """The estimates of the first command, and where they are from; None where nobody knows."""
+    first = {name: float(run.column(name)[0]) for name in (*BACKLASH, 'f')}
+    if parameters is None:
+        return {**first, 'from': None}
+    guess = first_guess(parameters)
+    guessed = all(first[name] == getattr(guess, name) for name in BACKLASH)
+    loaded = parameters.get_bool('estimates.load') and not guessed
+    return {
+        **first, 'from': parameters.get_str('estimates.file') if loaded else 'estimator.initial',
     }
 
 
@@ -102,7 +116,7 @@ def _learned(learned: LearnedModel | None) -> dict[str, Any]:
 
 def reference_delay(parameters: Parameters | None) -> int:
     """Samples by which y is to follow y_m late, which the structure decides; 0 if unknown."""
-    return build_controller(parameters).structure.delay if parameters else 0
+    return build_structure(parameters).delay if parameters else 0
 
 
 def latency_ms(latency_s: NDArray[np.float64] | None) -> dict[str, float] | None:

@@ -13,7 +13,7 @@ from test_identification import PERIOD_S, motion, record
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.loop.storage import load_estimate
+from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.cli import InputError

@@ -14,11 +14,16 @@ from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.loop.storage import load_estimate, save_estimate, worth_saving
+from backlash_ros.core.estimates_file import load_estimate, save_estimate, worth_saving
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.sample_counter import SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.replay import replay
 from backlash_ros.core.simulation.run_record import stated_deviations
+from backlash_ros.tools.compare import compare
+from backlash_ros.tools.runs.summary import summarise
 
 LEARNED = Estimate(1.25, 2.5, -3.5, 0.2, 0.01, 0.02, 0.03, Status.TRACKING)
 
@@ -164,3 +169,36 @@ def test_a_first_guess_is_not_worth_saving() -> None:
     # Laws without deviations.
     assert worth_saving(Estimate(1.0, 1.0, -1.0, 0.2, status=Status.TRACKING))
     assert worth_saving(replace(LEARNED, status=Status.INCONSISTENT))
+
+
+def test_whoever_builds_a_controller_begins_with_what_was_known(tmp_path: Path) -> None:
+    p = parameters(tmp_path / 'estimates.json')
+    save_estimate(Path(p.get_str('estimates.file')), LEARNED, p)
+    assert build_controller(p).estimator.estimate.c_r == LEARNED.c_r
+    run = build_closed_loop(p).run(30)
+    assert run.column('c_l')[0] == LEARNED.c_l
+    assert replay(run, p).column('c_l')[0] == LEARNED.c_l
+    loop = ControlLoop(p, lambda v: None, lambda: 0, None, SampleCounter(0.01))
+    assert loop.estimate.m == LEARNED.m
+    loop.reset()
+    assert loop.estimate.m == p.get_float('estimator.initial.m')
+    assert summarise(run, p)['began_with'] == {
+        'm': 1.25, 'c_r': 2.5, 'c_l': -3.5, 'f': 0.2, 'from': p.get_str('estimates.file'),
+    }
+    plain = Parameters()
+    began = summarise(build_closed_loop(plain).run(30), plain)['began_with']
+    assert (began['c_r'], began['from']) == (0.5, 'estimator.initial')
+
+
+def test_other_laws_are_compared_from_the_first_guess(tmp_path: Path) -> None:
+    p = parameters(tmp_path / 'estimates.json')
+    save_estimate(Path(p.get_str('estimates.file')), LEARNED, p)
+    results = {result.contender.name: result for result in compare(p, 60)}
+    lms, own, wrong = (results[name].run for name in (
+        'lms, u_d = y_m + f v', 'moving_horizon, u_d = y_m + f v', 'wrong constants, tracking',
+    ))
+    assert lms is not None
+    assert own is not None
+    assert wrong is not None
+    assert (lms.column('c_r')[0], own.column('c_r')[0]) == (0.5, LEARNED.c_r)
+    assert wrong.column('c_r')[0] == pytest.approx(3.9)

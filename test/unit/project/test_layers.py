@@ -23,8 +23,8 @@ LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
     'parameters', 'plant', 'reference', 'estimate', 'law', 'laws', 'estimation', 'estimation2',
-    'control', 'scenario', 'assembly', 'loop', 'records', 'simulation', 'identification',
-    'driver_check',
+    'control', 'scenario', 'estimates_file', 'assembly', 'loop', 'records', 'simulation',
+    'identification', 'driver_check',
 )
 ESTIMATION = (
     'constants', 'regression', 'fit', 'observer', 'moving_horizon', 'whole_record',

@@ -22,9 +22,9 @@ from backlash_ros.tools.runs.summary import summarise
 
 OLD_HEADER = 't,y_m,y,u_d,v,u,m,c_r,c_l,f'  # of samples.csv before version 0.3
 FIELDS = [
-    'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'final', 'final_std',
-    'truth', 'settling_time_s', 'control_error_rms', 'tracking_error_rms', 'loop_latency_ms',
-    'final_status', 'status_share', 'model', 'noise_ratio', 'unexplained',
+    'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'began_with', 'final',
+    'final_std', 'truth', 'settling_time_s', 'control_error_rms', 'tracking_error_rms',
+    'loop_latency_ms', 'final_status', 'status_share', 'model', 'noise_ratio', 'unexplained',
 ]
 LEARNED = LearnedModel((0.1, 0.05), (1.0, -0.9), 1, (0.1, 0.2, 0.3, 0.4, nan), 1.1, 0.02)
 
