@@ -17,7 +17,7 @@ from math import inf, nan
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from accuracy.identification_cases import Case, random_case
+from cases.identification_cases import Case, random_case
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
 from scipy.stats import chi2
 

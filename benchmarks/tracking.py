@@ -29,7 +29,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1])]
 
 import numpy as np  # noqa: E402
-from accuracy.random_cases import random_case  # noqa: E402
+from cases.random_cases import random_case  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from scipy import signal  # noqa: E402
 

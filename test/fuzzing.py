@@ -9,27 +9,17 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
-import os
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from math import inf, isfinite
 from typing import Any
 
-# Before rclpy reads it.
-os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-
 import numpy as np
-import rclpy
-from rclpy.node import Node
+from node_in_process import catch_commands, hand_over, look_for_silence, node_with
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
-from std_msgs.msg import Float64
 
 from backlash_ros.core.assembly import law_fits
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output
-from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
 from backlash_ros.tools.bringup.environment import free_domain
 
@@ -62,27 +52,6 @@ def parameters_of(rng: np.random.Generator) -> dict[str, object]:
     }
 
 
-@contextmanager
-def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode]:
-    """A controller node in this process."""
-    arguments = ['--ros-args', '--log-level', 'fatal']
-    for name, value in values.items():
-        text = str(value).lower() if isinstance(value, bool) else str(value)
-        arguments += ['-p', f'{name}:={text.replace("inf", ".inf")}']
-    # A failure elsewhere ends all processes by a signal, which must end them.
-    prefer_loopback(os.environ)
-    rclpy.init(args=arguments, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-    try:
-        node = ControllerNode()
-        try:
-            yield node
-        finally:
-            node.finish()
-            Node.destroy_node(node)
-    finally:
-        rclpy.try_shutdown()
-
-
 class Fuzzer:
     """Plays one random driver, reference and user after the other."""
 
@@ -91,13 +60,7 @@ class Fuzzer:
         self._untyped: Any = node
         self._stamp, self._number, self._y = 10**18, 0, 0.0
         self._sent: list[float] = []
-        publish = self._untyped._io.publish
-
-        def note(v: float) -> None:
-            self._sent.append(v)
-            publish(v)
-
-        self._untyped._io.publish = note
+        catch_commands(node, self._sent.append)
 
     def play(self) -> None:
         """One sequence; raises AssertionError for a command that must not be."""
@@ -129,13 +92,13 @@ class Fuzzer:
         assert loop is not None
         if rng.random() < soundness:
             self._output(self._sound_y(), PERIOD_NS, 1)
-            self._untyped._on_reference(Float64(data=float(5.0 * np.sin(0.1 * self._number))))
+            hand_over(node, float(5.0 * np.sin(0.1 * self._number)), None)
             return
         kind = int(rng.integers(9))
         if kind == 0:
             self._output(self._number_of_any_kind(), PERIOD_NS, 1)
         elif kind == 1:
-            self._untyped._on_reference(Float64(data=self._number_of_any_kind()))
+            hand_over(node, self._number_of_any_kind(), None)
         elif kind == 2:
             # Where a command must not move further than the rate allows, the driver is honest
             # about v: whoever restarts goes on from what it says.
@@ -160,18 +123,17 @@ class Fuzzer:
                 Parameter('inverse.direction_band', value=self._size()),
             ])
         else:
-            self._silence(loop)
+            self._silence()
 
-    def _silence(self, loop: Any) -> None:
-        loop.heard_at = -1e9
-        self._untyped._look_for_silence()
+    def _silence(self) -> None:
+        look_for_silence(self._node)
         self._untyped._diagnose()
 
     def _output(self, y: float, later_ns: int, numbers: int) -> None:
         self._stamp = max(self._stamp + later_ns, 1)
         self._number = max(self._number + numbers, 0)
         number = UNNUMBERED if self._stamp % 7 == 0 else self._number
-        self._untyped._on_output(Output(
+        hand_over(self._node, None, Output(
             y, self._stamp, time.time_ns(), time.time_ns(), number
         ))
 

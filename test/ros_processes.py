@@ -10,6 +10,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from multiprocessing.context import ForkServerProcess
@@ -24,6 +25,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.task import Future
 from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.middleware.loopback import prefer_loopback
@@ -39,6 +41,8 @@ FORKING = multiprocessing.get_context('forkserver')
 FORKING.set_forkserver_preload([
     f'{PACKAGE}.{name}' for name in ('controller', 'plant', 'reference', 'recorder')
 ])
+
+AGAIN_S = 5.0  # without an answer, after which a service is asked again
 
 
 class ForkedNode:
@@ -188,6 +192,7 @@ class Probe:
         self.node = Node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
+        self._asked_at = 0.0
 
     def collect(self, topic: str, message_type: type[Any]) -> list[Any]:
         """A list that grows with every message of the topic."""
@@ -202,6 +207,23 @@ class Probe:
     def wait_until(self, condition: Callable[[], object], what: str) -> None:
         """Listen until condition holds."""
         wait_until(condition, what, lambda: self._executor.spin_once(timeout_sec=0.02))
+
+    def ask(self, call: Callable[[], Future], what: str) -> Any:
+        """The result of an asynchronous call of a service.
+
+        It is made again where no answer comes: a server that has not discovered this client when
+        it answers is not heard.
+        """
+        asked: list[Future] = []
+
+        def answered() -> bool:
+            if not asked or time.monotonic() > self._asked_at + AGAIN_S:
+                asked.append(call())
+                self._asked_at = time.monotonic()
+            return any(future.done() for future in asked)
+
+        self.wait_until(answered, what)
+        return next(future for future in asked if future.done()).result()
 
     def spin(self, seconds: float) -> None:
         """Listen for a moment."""

@@ -172,14 +172,10 @@ def _bounds(p: Parameters) -> Bounds:
 
 
 def _reconstruction(p: Parameters) -> InputReconstruction:
-    noise_std = p.get_float('estimator.output_noise_std') * LITTLE_SMOOTHING
-    try:
-        return InputReconstruction(build_model(p), noise_std, p.get_int('estimator.lag'))
-    except ArithmeticError as error:
-        raise ParameterError(
-            'estimator.output_noise_std', p.get_float('estimator.output_noise_std'), str(error),
-            'give the standard deviation of the noise on y, in the unit of y',
-        ) from None
+    return InputReconstruction(
+        build_model(p), p.get_float('estimator.output_noise_std'), p.get_int('estimator.lag'),
+        LITTLE_SMOOTHING,
+    )
 
 
 def _moving_horizon(p: Parameters, initial: Estimate) -> Law:

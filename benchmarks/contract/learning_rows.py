@@ -8,11 +8,11 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from accuracy.coasting_load import CoastingLoad
-from accuracy.cramer_rao import cramer_rao
-from accuracy.random_cases import Case, bound_of, random_case, uncertain_case
+from cases.coasting_load import CoastingLoad
+from cases.cramer_rao import cramer_rao
+from cases.geared_motor import motor, random_backlash
+from cases.random_cases import Case, bound_of, random_case, uncertain_case
 from numpy.typing import NDArray
-from ordinary_motions import motor, random_backlash
 
 from backlash_ros.core import Parameters, Status, build_closed_loop, build_plant
 from contract.figures import Figure, figure, rms, share, upper

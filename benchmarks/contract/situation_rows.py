@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from accuracy.identification_cases import random_case
-from accuracy.motor_crossings import crossing_error
-from accuracy.simulated_processes import HeldUpProcesses
+from cases.geared_motor import flat, motor
+from cases.held_up import HeldUpProcesses
+from cases.identification_cases import random_case
 from faults import Result, play
 from gears.gear_map import gear_of
 from gears.gear_runs import (
@@ -28,7 +28,6 @@ from gears.gear_runs import (
     uncompensated,
 )
 from numpy.typing import NDArray
-from ordinary_motions import flat, motor
 
 from backlash_ros.core import Estimate, Parameters, Status, build_controller, fit_record
 from backlash_ros.tools.identify.command import main as identify
@@ -62,13 +61,9 @@ def run_late(job: tuple[float, str, int]) -> HeldUp:
     load, use, seed = job
     p = Parameters({**motor(), 'estimator.use_applied_control': use})
     heard = HeldUpProcesses(p, load, seed, reports=use != 'false').run(HELD_UP_S)
-    errors = [crossing_error(e.c_r, e.c_l, e.std_c_r, e.std_c_l) for _, e in heard]
-    settled = max((time_s for (time_s, _), error in zip(heard, errors, strict=True)
-                   if not error.relative <= 0.01), default=0.0)
-    wrong = [e.status is Status.TRACKING and error.deviations > 5.0 and error.relative > 0.01
-             for (_, e), error in zip(heard, errors, strict=True)]
-    return HeldUp(f'load {load:g}, reports {use}', errors[-1].relative, settled,
-                  float(np.mean(wrong)))
+    settled = max((one.time_s for one in heard if not one.error <= 0.01), default=0.0)
+    return HeldUp(f'load {load:g}, reports {use}', heard[-1].error, settled,
+                  float(np.mean([one.wrong for one in heard])))
 
 
 def late_figures(runs: Sequence[HeldUp]) -> dict[str, Figure]:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from ordinary_motions import motor
+from cases.geared_motor import motor
 from real_time.loop_latency import measure_latency
 from real_time.step_times import Sampled, filter_timer
 
@@ -45,13 +45,6 @@ def times_figures(found: Sequence[Times]) -> dict[str, Figure]:
     }
 
 
-def _yardstick() -> Callable[[], float]:
-    timer = filter_timer()
-    if timer is None:
-        raise RuntimeError('filterpy is not installed: pip install filterpy')
-    return timer
-
-
 def step_jobs(scale: float) -> list[tuple[str, int]]:
     """The default law in both structures."""
     return repeated(scale, ('proportional', 'tracking'), 6)
@@ -62,7 +55,7 @@ def run_step(job: tuple[str, int]) -> Times:
     structure, seed = job
     sampled = Sampled(Parameters({'structure': structure, 'output_noise_std': 1e-3,
                                   'seed': seed + 1}))
-    timer = _yardstick()
+    timer = filter_timer()
     rows = []
     for _ in range(ACQUISITION + STEADY):
         step = sampled.step()
@@ -114,7 +107,7 @@ def run_simulate(job: tuple[str, int]) -> Times:
     """Processor time of a sample in one process."""
     name, seed = job
     loop = build_closed_loop(Parameters({**SIMULATIONS[name](), 'seed': seed + 1}))
-    timer = _yardstick()
+    timer = filter_timer()
     unit = float(np.median([timer() for _ in range(2000)]))
     begun = time.process_time()
     loop.run(SIMULATED)

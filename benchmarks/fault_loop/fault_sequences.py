@@ -8,7 +8,7 @@ from enum import Enum, auto
 from math import isfinite
 
 import numpy as np
-from accuracy.random_cases import NEAR_ONE
+from cases.random_cases import NEAR_ONE
 
 from backlash_ros.core.assembly import (
     build_model,

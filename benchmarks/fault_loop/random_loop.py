@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from accuracy.random_cases import random_plant
+from cases.random_cases import random_plant
 
 from backlash_ros.core.assembly import build_controller, build_model, build_plant, law_fits
 from backlash_ros.core.parameters import Parameters

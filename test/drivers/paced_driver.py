@@ -17,6 +17,10 @@ from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 
 NOISE = 1e-3
+# Long enough that other processes do not make every command late. A sample of the loop is that of
+# the paper's example, only later.
+PERIOD_S = 0.03
+OF_THE_LOOP = {'sample_period': PERIOD_S, 'estimator.output_noise_std': NOISE}
 TRUTH = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
 # Beyond every swing of the paper's example: a loop that goes there is unstable.
 LARGEST_V, LARGEST_Y = 100.0, 100.0
@@ -37,8 +41,10 @@ class PacedDriver:
     controls the driver gets. referred: whether y_m is published.
     """
 
-    def __init__(self, probe: Probe, period_s: float = 0.01, reports_applied: bool = False) -> None:
-        p = Parameters({'output_noise_std': NOISE, 'sample_period': period_s})
+    def __init__(self, probe: Probe, reports_applied: bool = False) -> None:
+        p = Parameters({
+            'output_noise_std': NOISE, 'sample_period': PERIOD_S, 'frequency': 0.06 / PERIOD_S,
+        })
         self.probe = probe
         self.plant, self._signal = build_plant(p), build_reference(p)
         self.rng = np.random.default_rng(7)
@@ -48,7 +54,7 @@ class PacedDriver:
         self.k = 0
         self.v = 0.0
         self.y: list[float] = []
-        self._period_s, self._start = period_s, time.monotonic()
+        self._start = time.monotonic()
         self.controls = probe.collect(topics.CONTROL, Float64)
         self.estimates = probe.collect(topics.ESTIMATES, Float64MultiArray)
         self.signals = probe.collect(topics.SIGNALS, Float64MultiArray)
@@ -75,9 +81,9 @@ class PacedDriver:
         )
         self.rest()
 
-    def run(self, seconds: float) -> None:
-        """Let the plant go on for so long."""
-        for _ in range(round(seconds / self._period_s)):
+    def run(self, samples: int) -> None:
+        """Let the plant go on for so many samples."""
+        for _ in range(samples):
             self._tick()
 
     def run_until(self, condition: Callable[[], object], what: str) -> None:
@@ -87,7 +93,7 @@ class PacedDriver:
     def learn(self) -> None:
         """Go on until the backlash is known for some time."""
         self.run_until_known(0.02)
-        self.run(0.2)
+        self.run(20)
         self.run_until_known(0.02)
 
     def run_until_known(self, error: float) -> None:
@@ -96,7 +102,7 @@ class PacedDriver:
 
     def rest(self) -> None:
         """Let the plant stand still while nobody is served."""
-        self._start = time.monotonic() - self.k * self._period_s
+        self._start = time.monotonic() - self.k * PERIOD_S
 
     def status(self) -> DiagnosticStatus | None:
         """The newest diagnostics of the controller."""
@@ -138,7 +144,7 @@ class PacedDriver:
         assert max(map(abs, self.y)) < LARGEST_Y
 
     def _tick(self) -> None:
-        while (left := self._start + (self.k + 1) * self._period_s - time.monotonic()) > 0.0:
+        while (left := self._start + (self.k + 1) * PERIOD_S - time.monotonic()) > 0.0:
             self.probe.spin(left)
         self.probe.spin(0.0)
         for message in self.controls[self._taken:]:
@@ -146,7 +152,7 @@ class PacedDriver:
                 self.v = message.data
         self._taken = len(self.controls)
         # The plant does not wait for a test that was held up, which then has nothing to send.
-        passed = (time.monotonic() - self._start) / self._period_s
+        passed = (time.monotonic() - self._start) / PERIOD_S
         while self.k < int(passed):
             self._advance()
         if passed - self.k > LATEST:
@@ -156,7 +162,7 @@ class PacedDriver:
         for value in self.sent(self.k, y):
             self.output.publish(Float64(data=value))
         if self.referred:
-            self.reference.publish(Float64(data=self._signal((self.k + 1) * self._period_s)))
+            self.reference.publish(Float64(data=self._signal((self.k + 1) * PERIOD_S)))
 
     def _advance(self) -> None:
         if self.applied is not None:
@@ -169,9 +175,7 @@ def controller_and_driver(
     world: RosWorld, reports_applied: bool = False, **parameters: object,
 ) -> tuple[NodeProcess, PacedDriver]:
     """A controller that knows the noise, and a driver that it hears."""
-    controller = world.start(
-        'controller', {'estimator.output_noise_std': NOISE, **parameters}
-    )
+    controller = world.start('controller', {**OF_THE_LOOP, **parameters})
     driver = PacedDriver(world.probe(), reports_applied=reports_applied)
     driver.meet(controller)
     return controller, driver

@@ -137,6 +137,7 @@ def test_a_worker_imports_neither_ros_nor_the_program_that_started_it(
 
 
 def test_the_loop_goes_before_it(executor: WorkerExecutor) -> None:
+    executor.open()
     assert executor.pid is not None
     own = os.getpriority(os.PRIO_PROCESS, 0)
     assert os.getpriority(os.PRIO_PROCESS, executor.pid) == min(own + NICENESS, 19)
@@ -237,9 +238,10 @@ def test_interrupts_are_for_the_loop_alone(executor: WorkerExecutor) -> None:
 
 def test_nothing_is_left_of_a_closed_executor(tmp_path: Path) -> None:
     executor = WorkerExecutor()
+    assert executor.pid is None  # nobody needs a worker yet
+    begin(executor.open(), tmp_path / 'begun')
     pid = executor.pid
     assert pid is not None
-    begin(executor.open(), tmp_path / 'begun')
     executor.close()
     assert not is_there(pid)
     assert not executor.alive

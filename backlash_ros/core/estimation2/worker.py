@@ -37,10 +37,10 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 10.0
 
 
 class WorkerExecutor:
-    """Computes jobs in a worker process.
+    """Computes jobs in a worker process, which begins with the first channel.
 
-    preload: modules that the worker imports at its start, not with its first job. Start it before
-    rclpy is imported. restarts: how many workers have died so far.
+    preload: modules that the worker imports at its start, not with its first job. restarts: how
+    many workers have died so far.
     """
 
     def __init__(self, preload: Sequence[str] = ()) -> None:
@@ -57,7 +57,7 @@ class WorkerExecutor:
         self._closed = Event()
         self._starting: Thread | None = None
         self._started: SimpleQueue[subprocess.Popen[bytes]] = SimpleQueue()
-        self._process: subprocess.Popen[bytes] | None = _start(self._preload)
+        self._process: subprocess.Popen[bytes] | None = None
 
     @property
     def alive(self) -> bool:
@@ -71,6 +71,8 @@ class WorkerExecutor:
 
     def open(self, quantities: int = 0, capacity: int = 0) -> Channel:
         """A new channel with a record of the newest `capacity` samples; 0 quantities: no record."""
+        if self._opened == 0:
+            self._process = _start(self._preload)
         channel = _WorkerChannel(self, self._opened, quantities, capacity)
         self._opened += 1
         self._channels[channel.number] = channel

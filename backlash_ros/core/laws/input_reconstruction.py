@@ -10,7 +10,6 @@ Reference: B. D. O. Anderson, J. B. Moore, Optimal Filtering, Prentice-Hall 1979
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf, nan, sqrt
 
 import numpy as np
@@ -28,29 +27,22 @@ Array = NDArray[np.float64]
 # much noise the smoother assumes at least: this share of the weakest response, which counts as no
 # weaker than so much of the typical one.
 NOISE_FLOOR, WEAKEST = 1e-3, 1e-4
-# After a lost sample the covariances take this many lags to become stationary again.
+# After a lost sample the covariance takes this many lags to become stationary again.
 LAGS_TO_STEADY = 4
-TOO_NOISY = 'is so large that y says nothing of u'
-
-
-@dataclass
-class _Covariance:
-    """p: of the predicted [x; u]. rows: of u(k-i), i = 0 .. lag, with it. var: of u(k-i)."""
-
-    p: Array
-    rows: Array
-    var: Array
 
 
 class InputReconstruction:
     """Fixed-lag smoother: u_hat(k - lag) from y(..k).
 
     model: G(z). noise_std: standard deviation of the noise on y. lag: samples, no less than the
-    delay of G. std: standard deviation of u_hat while no sample is lost. Raises ParameterError, and
-    ArithmeticError where rounding is all that is left because of so much noise.
+    delay of G. smoothed: share of the noise that is smoothed away. std: standard deviation of u_hat
+    while no sample is lost. Raises ParameterError, also where so much noise leaves nothing but
+    rounding.
     """
 
-    def __init__(self, model: TransferFunction, noise_std: float, lag: int) -> None:
+    def __init__(
+        self, model: TransferFunction, noise_std: float, lag: int, smoothed: float = 1.0,
+    ) -> None:
         check_model(model)
         if lag < model.delay:
             raise ParameterError(
@@ -63,41 +55,46 @@ class InputReconstruction:
         n = self._n = state.order
         self._scale, weakest = _typical_and_weakest(model)
         self._c = state.c
-        self._transition = np.eye(n + 1)
-        self._transition[:n, :n], self._transition[:n, n] = state.a, state.b / self._scale
-        noise = max(noise_std / self._scale, NOISE_FLOOR * weakest)
+        noise = max(smoothed * noise_std / self._scale, NOISE_FLOOR * weakest)
         self._noise = noise * noise  # inf where ** would raise
-        try:
-            self._steady = self._stationary()
-        except (linalg.LinAlgError, ValueError):
-            raise ArithmeticError(TOO_NOISY) from None
-        self._step = np.zeros((n + 1 + lag, n + 1 + lag))  # from k-1 to k before y(k)
-        self._step[:n + 1, :n + 1] = self._transition
+        # z = [x(k), u(k), u(k-1) .. u(k-lag)], from k-1 to k before y(k).
+        self._step = np.zeros((n + 1 + lag, n + 1 + lag))
+        self._step[:n, :n], self._step[:n, n] = state.a, state.b / self._scale
+        self._step[n, n] = 1.0
         self._step[n + 1:, n:-1] = np.eye(lag)
-        self._gain = self._gains(self._steady)
-        # While no sample is lost, prediction and correction are one map.
-        self._closed = self._step - np.outer(self._gain, self._c * self._step[0])
-        self._seen = self._c * self._step[0]
-        self._after_steady = self._covariance = self._measured(self._steady)
-        variance = float(self._after_steady.var[-1])
+        try:
+            steady = self._stationary()
+        except (linalg.LinAlgError, ValueError):
+            variance = nan
+        else:
+            self._gain = self._gain_of(steady)
+            self._after_steady = self._covariance = self._measured(steady)
+            variance = float(self._after_steady[-1, -1])
         if not 0.0 < variance < inf:  # rounding has taken over
-            raise ArithmeticError(TOO_NOISY)
+            raise ParameterError(
+                'estimator.output_noise_std', noise_std, 'is so large that y says nothing of u',
+                'give the standard deviation of the noise on y, in the unit of y',
+            )
+        # While no sample is lost, prediction and correction are one map.
+        self._seen = self._c * self._step[0]
+        self._closed = self._step - np.outer(self._gain, self._seen)
         self.std = sqrt(variance)
-        self._z: Array = np.zeros(n + 1 + lag)  # x(k), u(k), u(k-1) .. u(k-lag) given y(..k)
+        self._z: Array = np.zeros(n + 1 + lag)  # given y(..k)
         self._steady_after = self._since_loss = LAGS_TO_STEADY * lag
 
-    def _stationary(self) -> _Covariance:
-        """Covariances before a measurement when no sample was ever lost."""
-        size, lag = self._n + 1, self.lag
+    def _stationary(self) -> Array:
+        """Covariance of z before a measurement when no sample was ever lost."""
+        size = self._n + 1
         output, process = np.zeros((size, 1)), np.zeros((size, size))
         output[0, 0], process[-1, -1] = self._c, 1.0
         p = linalg.solve_discrete_are(
-            self._transition.T, output, process, np.array([[self._noise]])
+            self._step[:size, :size].T, output, process, np.array([[self._noise]])
         )
-        covariance = _Covariance(p, np.tile(p[-1], (lag + 1, 1)), np.full(lag + 1, p[-1, -1]))
-        for _ in range(lag):
+        as_if_resting = np.minimum(np.arange(size + self.lag), size - 1)
+        covariance: Array = p[np.ix_(as_if_resting, as_if_resting)]
+        for _ in range(self.lag):
             covariance = self._propagated(self._measured(covariance))
-            covariance.p = p
+            covariance[:size, :size] = p
         return covariance
 
     @property
@@ -115,7 +112,7 @@ class InputReconstruction:
         if self.samples <= 2 * self.lag:
             return False
         steady = self._covariance is self._after_steady
-        return steady or bool(self._covariance.var[-1] <= 4.0 * self.std**2)
+        return steady or bool(self._covariance[-1, -1] <= 4.0 * self.std**2)
 
     @property
     def x_hat(self) -> Array:
@@ -132,43 +129,27 @@ class InputReconstruction:
             self._z = self._closed @ self._z + self._gain * scaled
             self._covariance = self._after_steady
             return float(self._z[-1])
-        covariance, z = self._propagated(self._covariance), self._step @ self._z
+        covariance, self._z = self._propagated(self._covariance), self._step @ self._z
         if y is None:
             self.innovation = nan
-            self._covariance = covariance
         else:
-            e = y / self._scale - self._c * float(z[0])
-            z += self._gains(covariance) * e
+            e = y / self._scale - self._c * float(self._z[0])
             self.innovation = e * self._scale
-            self._covariance = self._measured(covariance)
-        self._z = z
-        return float(z[-1])
+            self._z += self._gain_of(covariance) * e
+            covariance = self._measured(covariance)
+        self._covariance = covariance
+        return float(self._z[-1])
 
-    def _gains(self, covariance: _Covariance) -> Array:
-        """Gain of [x; u] and of u(k-1) .. u(k-lag), shape (n + 1 + lag,)."""
-        c = self._c
-        variance = c * c * covariance.p[0, 0] + self._noise
-        column = np.concatenate([covariance.p[:, 0], covariance.rows[1:, 0]])
-        return np.asarray(column * (c / variance))
+    def _gain_of(self, p: Array) -> Array:
+        return np.asarray(p[:, 0] * (self._c / (self._c**2 * p[0, 0] + self._noise)))
 
-    def _measured(self, covariance: _Covariance) -> _Covariance:
-        c = self._c
-        variance = c * c * covariance.p[0, 0] + self._noise
-        row, column = c * covariance.p[0], c * covariance.rows[:, 0]
-        return _Covariance(
-            covariance.p - np.outer(row, row) / variance,
-            covariance.rows - np.outer(column, row) / variance,
-            covariance.var - column**2 / variance,
-        )
+    def _measured(self, p: Array) -> Array:
+        return p - np.outer(self._gain_of(p), self._c * p[0])
 
-    def _propagated(self, covariance: _Covariance) -> _Covariance:
-        p = self._transition @ covariance.p @ self._transition.T
-        p[-1, -1] += 1.0
-        p = 0.5 * (p + p.T)
-        rows, var = np.empty_like(covariance.rows), np.empty_like(covariance.var)
-        rows[1:], rows[0] = covariance.rows[:-1] @ self._transition.T, p[-1]
-        var[1:], var[0] = covariance.var[:-1], p[-1, -1]
-        return _Covariance(p, rows, var)
+    def _propagated(self, p: Array) -> Array:
+        p = self._step @ p @ self._step.T
+        p[self._n, self._n] += 1.0
+        return np.asarray(0.5 * (p + p.T))
 
 
 def _typical_and_weakest(model: TransferFunction) -> tuple[float, float]:

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.law import Law
+from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.agreement import Agreement
-from backlash_ros.core.laws.history import History
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 
 # A side is engaged when the reconstructed u moves on in one direction over this many samples to
@@ -24,7 +23,7 @@ class LaggedLaw(Law):
 
     def __init__(self, reconstruction: InputReconstruction) -> None:
         self._reconstruction = reconstruction
-        self._history = History(reconstruction.lag)
+        self._applied: deque[Interval] = deque(maxlen=reconstruction.lag)
         self._threshold = MOTION_THRESHOLD * reconstruction.std
         self._past: deque[float] = deque([0.0, 0.0], maxlen=STROKE + 1)
         self._agreement = Agreement()
@@ -44,11 +43,17 @@ class LaggedLaw(Law):
         """y(k) minus its prediction; nan where y(k) was lost."""
         return self._reconstruction.innovation
 
-    def _follow(self, y: float | None) -> float:
-        """Take in y(k), None if it was lost, and return the u that the reconstruction reached."""
+    def _follow(self, y: float | None, interval: Interval) -> tuple[float, Interval | None]:
+        """Take in y(k), None if it was lost, and what was applied before it.
+
+        Returns the u that the reconstruction has reached, and what was applied with it; None while
+        nothing is to be learned from that.
+        """
         u = self._reconstruction.update(y)
         self._past.append(u)
-        return u
+        self._applied.append(interval)  # the newest carried u(k-1), the oldest u(k-lag)
+        learns = self.adapting and self._reconstruction.ready
+        return u, self._applied[0] if learns else None
 
     def _rising(self, u: float) -> bool | None:
         """Whether u moves on the right line (True) or the left one; None where it may rest.

@@ -48,9 +48,8 @@ class NormalisedLms(LaggedLaw):
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""
-        u = self._follow(y)
-        past = self._history.push(interval)
-        if past is None or not (self._reconstruction.ready and self.adapting):
+        u, past = self._follow(y, interval)
+        if past is None:
             return
         rising = self._rising(u)
         if rising is None:

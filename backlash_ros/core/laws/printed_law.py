@@ -61,9 +61,8 @@ class PrintedLaw(LaggedLaw):
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and apply (3.11) to the sample that the reconstruction has reached."""
-        u = self._follow(y)
-        past = self._history.push(interval)
-        if past is None or not (self._reconstruction.ready and self.adapting):
+        u, past = self._follow(y, interval)
+        if past is None:
             return
         old = self.estimate
         # w is c_r in the upward region, c_l in the downward one, and kept in the gap.

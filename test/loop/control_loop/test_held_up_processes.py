@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from accuracy.simulated_processes import HeldUpProcesses
+from cases.held_up import HeldUpProcesses
 from simulated_motor import C_L, C_R
 
 from backlash_ros.core.estimate import Status

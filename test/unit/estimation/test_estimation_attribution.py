@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from accuracy.uncertain_cases import motor_jobs
+from cases.geared_motor import motor, random_backlash
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.fit.pace import Pace, drained
@@ -16,6 +16,7 @@ from backlash_ros.core.estimation.observer.observer import Observer
 from backlash_ros.core.estimation.observer.record_attribution import attributed
 from backlash_ros.core.estimation.regression.error_model import build_error_model
 from backlash_ros.core.estimation.regression.play import Start
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -30,10 +31,9 @@ def worst_error(structure: str, told: bool, delay: int = 0) -> tuple[float, int]
 
     told: whether the controller is told that the command before may have acted instead.
     """
-    [job] = motor_jobs(
-        {'late': {'truth.delay_samples': delay}}, [1], SECONDS, structure=structure
-    )
-    loop = build_closed_loop(job.parameters)
+    loop = build_closed_loop(Parameters({
+        **motor(), **random_backlash(1), 'structure': structure, 'truth.delay_samples': delay,
+    }))
     controller, plant = loop.controller, loop.plant
     estimator = controller.estimator
     assert isinstance(estimator, MovingHorizon)
@@ -41,7 +41,7 @@ def worst_error(structure: str, told: bool, delay: int = 0) -> tuple[float, int]
     rng = np.random.default_rng(4)
     before, worst = 0.0, 0.0
     instead: tuple[float, ...] = ()
-    for k in range(job.samples):
+    for k in range(round(SECONDS / loop.sample_period) + 1):
         t = k * loop.sample_period
         v = controller.step(plant.measure(), loop.reference(t), alternatives=instead).v
         controller.refine()
@@ -51,7 +51,7 @@ def worst_error(structure: str, told: bool, delay: int = 0) -> tuple[float, int]
         estimate = estimator.estimate
         error = max(abs(estimate.c_r / truth.c_r - 1.0), abs(estimate.c_l / truth.c_l - 1.0))
         worst = max(worst, error) if t >= 4.0 else 0.0
-    return worst, estimator.reattributed
+    return worst, estimator.report.reattributed
 
 
 @pytest.mark.parametrize(('structure', 'delay'), [
@@ -67,20 +67,20 @@ def test_late_commands_cost_little_where_they_may_be_told(structure: str, delay:
 
 def tracking_while_late(seed: int) -> float:
     """Share of the first 3 s with status TRACKING, where one command in ten is late, and told."""
-    [job] = motor_jobs({'late': {}}, [seed], 3.0)
-    loop = build_closed_loop(job.parameters)
+    loop = build_closed_loop(Parameters({**motor(), **random_backlash(seed), 'seed': seed}))
+    samples = round(3.0 / loop.sample_period) + 1
     controller, plant = loop.controller, loop.plant
     rng = np.random.default_rng(seed)
     before, tracking = 0.0, 0
     instead: tuple[float, ...] = ()
-    for k in range(job.samples):
+    for k in range(samples):
         y_m = loop.reference(k * loop.sample_period)
         v = controller.step(plant.measure(), y_m, alternatives=instead).v
         controller.refine()
         plant.step(before if rng.random() < 0.1 else v)
         instead, before = (before,), v
         tracking += controller.estimator.estimate.status is Status.TRACKING
-    return tracking / job.samples
+    return tracking / samples
 
 
 def test_late_commands_explain_samples_that_contradict() -> None:
@@ -88,8 +88,7 @@ def test_late_commands_explain_samples_that_contradict() -> None:
 
 
 def test_a_refit_takes_in_no_sample_that_was_not_compared_with_the_fit() -> None:
-    [job] = motor_jobs({'right': {}}, [1], 3.0)
-    loop = build_closed_loop(job.parameters)
+    loop = build_closed_loop(Parameters({**motor(), **random_backlash(1)}))
     loop.run(400)
     estimator = loop.controller.estimator
     assert isinstance(estimator, MovingHorizon)

@@ -6,8 +6,8 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from accuracy import identification_cases
-from accuracy.identification_cases import random_case
+from cases import identification_cases
+from cases.identification_cases import random_case
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray

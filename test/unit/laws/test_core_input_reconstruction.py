@@ -186,7 +186,7 @@ def test_it_is_ready_only_after_its_start_is_forgotten() -> None:
 
 
 def test_noise_that_leaves_nothing_of_u_is_refused() -> None:
-    with pytest.raises(ArithmeticError, match='so large that y says nothing of u'):
+    with pytest.raises(ParameterError, match='so large that y says nothing of u'):
         InputReconstruction(PAPER, 1e200, LAG)
 
 

@@ -70,31 +70,10 @@ def test_printed_c_reduces_to_the_solution_of_e_equal_0(
     assert printed_c(u, y_m, f, m) == float(reduced)
 
 
-@given(u=SMALL, y_m=SMALL, m=eighths(1, 80), w=SMALL, f=eighths(1, 80))
-def test_each_quotient_makes_the_control_error_zero(
-    u: float, y_m: float, m: float, w: float, f: float,
-) -> None:
-    for new_f, new_m, new_w in (
-        (printed_f(u, y_m, m, w), m, w), (f, printed_m(u, y_m, f, w), w),
-        (f, m, printed_c(u, y_m, f, m)),
-    ):
-        if isfinite(new_f) and isfinite(new_m) and isfinite(new_w):
-            terms = (u * new_m, u * new_f, new_m * y_m, new_m * new_f * new_w)
-            e = terms[0] - terms[1] - terms[2] - terms[3]
-            assert e == pytest.approx(0.0, abs=1e-12 * (1.0 + max(map(abs, terms))))
-
-
 @given(y_m=SMALL, m=eighths(1, 80), w=SMALL)
-def test_f_of_zero_divides_by_zero(y_m: float, m: float, w: float) -> None:
+def test_zero_denominators_give_no_number(y_m: float, m: float, w: float) -> None:
     assert isnan(printed_m(1.0, y_m, 0.0, w))
     assert isnan(printed_c(1.0, y_m, 0.0, m))
-
-
-def test_u_of_zero_gives_a_slope_of_zero() -> None:
-    assert printed_m(0.0, 2.0, 0.22, 0.5) == 0.0
-
-
-def test_zero_denominator_of_f_is_not_a_number() -> None:
     assert isnan(printed_f(-1.0, 2.0, 2.0, 0.5))
 
 
@@ -178,10 +157,3 @@ def test_in_the_gap_the_side_of_before_stays() -> None:
     estimator = law(bounds=narrow, f_bounds=(0.2, 0.3))
     for y_m in (3.0, 3.5, 3.8):
         assert feed(estimator, 5.0, y_m).c_l == START.c_l
-
-
-def test_equal_crossings_do_not_confuse_the_side() -> None:
-    narrow = Bounds((0.69, 0.7), (0.0, 50.0), (-50.0, 0.0))
-    estimator = law(Estimate(0.696, 0.0, 0.0, 0.22), narrow, (0.2, 0.3))
-    assert feed(estimator, -5.0, 3.0).c_r == 0.0
-    assert estimator.estimate.c_l < 0.0

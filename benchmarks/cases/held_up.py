@@ -19,12 +19,11 @@ from unittest.mock import patch
 sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 
 import simulated_motor
+from simulated_motor import C_L, C_R
 
-from backlash_ros.core.assembly import build_reference
-from backlash_ros.core.estimate import Estimate
+from backlash_ros.core import Estimate, Parameters, Status, build_reference
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
-from backlash_ros.core.parameters import Parameters
 
 # How long a process that wants to run waits: share of its turns at load 1, and longest wait [s] of
 # a uniform distribution. Otherwise it waits for SHORT_WAIT_S on average.
@@ -40,6 +39,20 @@ class Heard(NamedTuple):
 
     time_s: float
     estimate: Estimate
+
+    @property
+    def error(self) -> float:
+        """Of c_r or c_l, relative to the true one, the larger."""
+        e = self.estimate
+        return max(abs(e.c_r / C_R - 1.0), abs(e.c_l / C_L - 1.0))
+
+    @property
+    def wrong(self) -> bool:
+        """Whether it is *tracking*, off by 1 % of the gap and by five published deviations."""
+        e = self.estimate
+        off_r, off_l = abs(e.c_r - C_R), abs(e.c_l - C_L)
+        beyond = not (off_r <= 5.0 * e.std_c_r and off_l <= 5.0 * e.std_c_l)
+        return e.status is Status.TRACKING and beyond and max(off_r, off_l) > 0.01 * (C_R - C_L)
 
 
 class HeldUpProcesses:

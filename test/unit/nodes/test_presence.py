@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 
@@ -44,19 +42,3 @@ def test_a_topic_may_have_a_long_name() -> None:
     with closing(Presence(DOMAIN, LONG, 'a' * 32)), \
             closing(Presence(DOMAIN, LONG, 'b' * 32)) as other:
         assert other.others() == {'a' * 32}
-
-
-def test_a_killed_process_is_gone_at_once(here: Presence) -> None:
-    code = (
-        'import sys\nfrom backlash_ros.nodes.diagnostics.presence import Presence\n'
-        f'presence = Presence({DOMAIN}, "/control", "b")\nprint(flush=True)\nsys.stdin.read()'
-    )
-    with subprocess.Popen(
-        [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-    ) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        assert here.others() == {'b'}
-        process.kill()
-        process.wait()
-    assert here.others() == frozenset()

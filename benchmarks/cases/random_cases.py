@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from accuracy.cramer_rao import cramer_rao
 from backlash_ros.core.assembly import build_true_model
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from cases.cramer_rao import cramer_rao
 
 Array = NDArray[np.float64]
 

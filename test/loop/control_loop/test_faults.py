@@ -1,0 +1,259 @@
+"""What a driver, a sensor or a network may do to the loop, and what is left of the estimates."""
+
+from __future__ import annotations
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+from simulated_loop import Fault, SimulatedLoop
+
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.loop.sample_counter import Output
+
+ABSURD = (nan, inf, -inf, 1e300, -1e300)
+RATE_MAX = 400.0
+STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
+
+
+def test_absurd_numbers_are_dropped_counted_and_change_nothing() -> None:
+    world = SimulatedLoop(reports=True, **{'estimator.use_applied_control': 'true'})
+    world.learn()
+    for i, bad in enumerate(ABSURD, start=1):
+        world.loop.take_reference(bad)
+        world.driver.applied.append((bad, world.driver.time_ns))
+        world.fault = lambda k, output, bad=bad: [output._replace(y=bad)]  # type: ignore[misc]
+        world.run(1)
+        world.fault = lambda k, output: [output]
+        world.run(5)
+        assert world.loop.statistics.dropped == 3 * i
+        assert world.loop.statistics.bad_outputs == world.loop.statistics.bad_references == i
+    world.run(100)
+    assert world.error() < 0.02
+    world.check_sanity()
+
+
+def test_denormal_numbers_are_numbers_like_others() -> None:
+    world = SimulatedLoop()
+    world.fault = lambda k, output: [output._replace(y=5e-324) if k < 20 else output]
+    world.learn()
+    assert world.loop.statistics.dropped == 0
+
+
+@pytest.mark.parametrize('action', ['hold', 'zero', 'ramp'])
+def test_a_silent_driver_brings_the_configured_command_and_a_return_without_a_jump(
+    action: str,
+) -> None:
+    world = SimulatedLoop(**{
+        'on_timeout': action, 'timeout.plant_output': 0.2, 'control.rate_max': RATE_MAX,
+    })
+    world.learn()
+    while abs(world.sent[-1]) < 5.0:
+        world.run(1)
+    world.fault = lambda k, output: []
+    world.run(19)
+    assert not world.loop.silent
+    answered = len(world.sent)
+    world.run(30)
+    assert world.loop.silent
+    assert (world.sent[-1] == 0.0) == (action != 'hold')
+    assert len(world.sent) - answered == 0 if action == 'hold' else len(world.sent) > answered
+    ended = len(world.sent)
+    world.fault = lambda k, output: [output]
+    world.run(150)
+    assert len(world.sent) == ended + 150
+    assert world.loop.statistics.interruptions == 1
+    assert world.error() < 0.05
+    assert np.abs(np.diff(world.sent)).max() <= STEP
+    world.check_sanity()
+
+
+def test_a_missing_reference_is_held() -> None:
+    world = SimulatedLoop()
+    world.learn()
+    world.referred = False
+    y_m = world.loop.y_m
+    world.run(100)
+    assert world.loop.y_m == y_m
+    assert world.loop.statistics.without_reference == 0
+    world.check_sanity()
+
+
+@pytest.mark.parametrize('share', [0.01, 0.1, 0.3])
+@pytest.mark.parametrize('published', [True, False])
+def test_lost_outputs_leave_the_estimates_within_5_percent(share: float, published: bool) -> None:
+    world = SimulatedLoop()
+
+    def lose(k: int, output: Output) -> list[Output]:
+        if world.rng.random() > share:
+            return [output]
+        world.driver.number -= not published  # then the numbers have no gap
+        return []
+
+    world.fault = lose
+    world.run(400)
+    statistics = world.loop.statistics
+    assert world.error() < 0.05
+    assert statistics.lost == pytest.approx(share * 400.0, rel=0.35, abs=3.0)
+    assert statistics.unsent == (0 if published else statistics.lost)
+    world.check_sanity()
+
+
+def lost_in_bursts(k: int, output: Output) -> list[Output]:
+    return [] if k % 150 >= 100 else [output]
+
+
+def doubled(k: int, output: Output) -> list[Output]:
+    return [output, output]
+
+
+class Swapped:
+    """Every tenth output comes after the one that follows it."""
+
+    def __init__(self) -> None:
+        self._kept: list[Output] = []
+
+    def __call__(self, k: int, output: Output) -> list[Output]:
+        if k % 10 == 9:
+            self._kept = [output]
+            return []
+        kept, self._kept = self._kept, []
+        return [output, *kept]
+
+
+@pytest.mark.parametrize(('fault', 'extra'), [(lost_in_bursts, 0), (doubled, 400), (Swapped(), 40)])
+def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent(
+    fault: Fault, extra: int,
+) -> None:
+    world = SimulatedLoop()
+    world.learn()
+    world.fault = fault
+    world.run(400)
+    assert world.error() < 0.05
+    assert world.loop.statistics.extra == extra
+    world.check_sanity()
+
+
+@pytest.mark.parametrize(('share', 'use'), [
+    (0.01, 'auto'), (0.1, 'true'), (0.3, 'auto'), (0.3, 'true'),
+])
+def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_percent(
+    share: float, use: str,
+) -> None:
+    world = SimulatedLoop(reports=True, **{'estimator.use_applied_control': use})
+    world.deaf = lambda: bool(world.rng.random() < share)
+    world.run(400)
+    assert world.error() < 0.05
+    world.check_sanity()
+
+
+def test_lost_controls_that_nobody_reports_are_said_to_be_inconsistent() -> None:
+    world = SimulatedLoop()
+    world.learn()
+    world.deaf = lambda: bool(world.rng.random() < 0.3)
+    world.run(300)
+    assert Status.INCONSISTENT in {row.status for row in world.rows[-300:]}
+    world.check_sanity()
+
+
+def test_reports_that_stop_are_given_up_and_the_loop_goes_on_learning() -> None:
+    world = SimulatedLoop(reports=True)
+    world.run(50)
+    assert world.loop.commands.uses_reports
+    world.driver.reports = False
+    world.run(50)
+    assert not world.loop.commands.uses_reports
+    missed = world.loop.commands.unreported
+    world.run(300)
+    assert world.error() < 0.02
+    assert world.loop.commands.unreported == missed
+
+
+@pytest.mark.parametrize('broken', ['sign', 'constant'])
+def test_a_broken_sensor_contradicts_and_the_last_good_estimates_are_held(broken: str) -> None:
+    world = SimulatedLoop()
+    world.learn()
+    world.sensor.fault, world.sensor.value = broken, world.sensor.last
+    world.run(200)
+    assert world.rows[-1].status == Status.INCONSISTENT
+    held = [(row.m, row.c_r, row.c_l) for row in world.rows[-50:]]
+    assert len(set(held)) == 1
+    assert world.error() < 0.05
+    world.check_sanity()
+
+
+def test_a_flood_brings_an_answer_a_sample_and_leaves_nothing_behind() -> None:
+    world = SimulatedLoop()
+    world.learn()
+
+    def flood(k: int, output: Output) -> list[Output]:
+        first = 20 * output.sequence
+        return [
+            output._replace(stamp_ns=output.stamp_ns + 1000 * i, sequence=first + i)
+            for i in range(20)
+        ]
+
+    world.fault = flood
+    before = len(world.sent)
+    world.run(50)
+    assert len(world.sent) - before <= 55
+    assert world.loop.statistics.extra >= 19 * 45
+    world.fault = lambda k, output: [output]
+    world.driver.number *= 20
+    world.run(200)
+    assert world.error() < 0.05
+    world.check_sanity()
+
+
+def test_a_second_driver_is_not_listened_to() -> None:
+    world = SimulatedLoop()
+    world.learn()
+
+    def with_stranger(k: int, output: Output) -> list[Output]:
+        later = output.stamp_ns + 4_000_000
+        return [output, output._replace(y=3.0 - output.y, stamp_ns=later, sequence=k)]
+
+    world.fault = with_stranger
+    world.run(200)
+    assert world.loop.statistics.extra == 200
+    assert world.error() < 0.02
+    world.check_sanity()
+
+
+@pytest.mark.parametrize('clean_up', [False, True])
+@pytest.mark.parametrize('structure', ['proportional', 'tracking'])
+def test_a_loop_that_ended_goes_on_from_its_last_command_and_counts_on(
+    structure: str, clean_up: bool,
+) -> None:
+    world = SimulatedLoop(structure=structure, **{
+        'control.rate_max': RATE_MAX, 'on_stop': 'ramp',
+    })
+    world.learn()
+    index, rows = world.loop.counter.index, len(world.rows)
+    world.controller.cycle(clean_up)
+    assert world.sent[-1] == 0.0
+    world.run(100)
+    assert world.loop.counter.index == index + 100
+    if not clean_up:
+        assert all(abs(row.m / 1.3 - 1.0) < 0.05 for row in world.rows[rows:])
+    assert np.abs(np.diff(world.sent)).max() <= STEP
+
+
+STANDING = 5.13  # v at which the driver is found
+
+
+@pytest.mark.parametrize(('reports', 'initial'), [(True, None), (True, -3.0), (False, STANDING)])
+def test_the_first_command_goes_on_from_what_is_known_of_v(
+    reports: bool, initial: float | None,
+) -> None:
+    world = SimulatedLoop(reports, initial, **{'control.rate_max': RATE_MAX})
+    world.driver.actuator.v = STANDING
+    world.run(100)
+    assert np.abs(np.diff([STANDING, *world.sent])).max() <= STEP
+
+
+def test_where_nobody_knows_v_the_first_command_goes_on_from_0() -> None:
+    world = SimulatedLoop(**{'control.rate_max': RATE_MAX})
+    world.driver.actuator.v = STANDING
+    world.run(10)
+    assert abs(world.sent[0]) <= STEP
