@@ -45,7 +45,7 @@ from tqdm import tqdm
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters.table import Value
-from backlash_ros.tools.config.configuration import parse_setting
+from backlash_ros.tools.config import parse_setting
 
 DOCUMENT = ROOT / 'docs' / 'physics.md'
 IMAGES = ROOT / 'docs' / 'images'

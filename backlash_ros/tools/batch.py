@@ -1,4 +1,4 @@
-"""Many simulated runs: seeds and sweeps as jobs, in parallel processes, and what they come to."""
+"""Many simulated runs: seeds and sweeps as jobs, in parallel processes, and their statistics."""
 
 from __future__ import annotations
 
@@ -32,7 +32,13 @@ from backlash_ros.topics import BACKLASH
 PATIENCE_S = 5.0  # after an interruption, until the process ends whatever it waits for
 # The matrices are tiny: threads of the linear algebra would only disturb the other processes.
 ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
-UNKNOWN = (nan, nan, nan)
+GROUPS = {'': 'final', 'std_': 'final_std', 'true_': 'truth', 'settling_': 'settling_time_s'}
+MERITS = ('control_error_rms', 'tracking_error_rms', 'lost_samples')
+PROBLEM = 'problem'  # why a run broke off
+COLUMNS = (*(f'{prefix}{name}' for prefix in GROUPS for name in BACKLASH), *MERITS, PROBLEM)
+
+# What a run came to, under COLUMNS: nothing where a number is unknown or never reached.
+Outcome = Mapping[str, float | str | None]
 
 
 @dataclass(frozen=True)
@@ -52,34 +58,17 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Last estimates of (m, c_r, c_l), what they should be, and what else a run came to.
-
-    std: nan where the law has none. settling [s]: inf for never. problem: why a run broke off,
-    all its numbers are nan then.
-    """
-
-    final: tuple[float, ...] = UNKNOWN
-    std: tuple[float, ...] = UNKNOWN
-    truth: tuple[float, ...] = UNKNOWN
-    settling: tuple[float, ...] = UNKNOWN
-    control_error_rms: float | None = None
-    tracking_error_rms: float | None = None
-    lost_samples: int = 0
-    problem: str = ''
-
-
-@dataclass(frozen=True)
 class ParameterStatistics:
     """Statistics of one estimated parameter over runs.
 
-    settling times [s]: inf for never. within: share of runs within 1 % at the end.
-    nees: mean of (error / std)^2, nan without standard deviations; honest ones put it into
-    nees_interval with 95 %.
+    rmse_percent: of the truth, nan where that is 0. settling times [s]: inf for never. within:
+    share of runs within 1 % at the end. nees: mean of (error / std)^2, nan without standard
+    deviations; honest ones put it into nees_interval with 95 %.
     """
 
     bias: float
     rmse: float
+    rmse_percent: float
     settling_median: float
     settling_max: float
     within: float
@@ -145,17 +134,13 @@ def run_job(job: Job) -> Outcome:
     try:
         run = run_loop(build_closed_loop(parameters), job.samples)
     except BrokenOffError as error:
-        return Outcome(problem=str(error))
+        return {**dict.fromkeys(COLUMNS), PROBLEM: str(error)}
     summary = summarise(run, parameters)
-    settling = summary['settling_time_s']
-    final, std, truth = (
-        tuple(summary[key][name] for name in BACKLASH) for key in ('final', 'final_std', 'truth')
-    )
-    return Outcome(
-        final, std, truth,
-        tuple(inf if settling[name] is None else settling[name] for name in BACKLASH),
-        summary['control_error_rms'], summary['tracking_error_rms'], summary['lost_samples'],
-    )
+    return {
+        **{f'{prefix}{name}': summary[group][name]
+           for prefix, group in GROUPS.items() for name in BACKLASH},
+        **{name: summary[name] for name in MERITS}, PROBLEM: '',
+    }
 
 
 def run_jobs(jobs: Sequence[Job], workers: int | None = None, label: str = '') -> list[Outcome]:
@@ -168,8 +153,8 @@ def run_jobs(jobs: Sequence[Job], workers: int | None = None, label: str = '') -
         workers = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
             os.cpu_count() or 1)
     workers = min(workers, len(jobs))
-    # disable=None: no bar where stderr is not a terminal.
     tqdm.monitor_interval = 0  # a thread would take the signals that are held back below
+    # disable=None: no bar where stderr is not a terminal.
     with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
         outcomes: dict[int, Outcome] = {}
         if workers <= 1:
@@ -243,26 +228,28 @@ def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
 
     Raises InputError where all of them did.
     """
-    whole = [outcome for outcome in outcomes if not outcome.problem]
+    whole = [outcome for outcome in outcomes if not outcome[PROBLEM]]
     if not whole:
-        raise InputError(f'every run broke off, the first one with: {outcomes[0].problem}')
-    return {name: _statistics(whole, i) for i, name in enumerate(BACKLASH)}
+        raise InputError(f'every run broke off, the first one with: {outcomes[0][PROBLEM]}')
+    return {name: _statistics(whole, name) for name in BACKLASH}
 
 
-def _statistics(outcomes: Sequence[Outcome], i: int) -> ParameterStatistics:
-    final, std, truth, settling = np.array([
-        [outcome.final[i], outcome.std[i], outcome.truth[i], outcome.settling[i]]
-        for outcome in outcomes
-    ]).T
+def _statistics(outcomes: Sequence[Outcome], name: str) -> ParameterStatistics:
+    final, std, truth, settling = (
+        np.array([one[f'{prefix}{name}'] for one in outcomes], dtype=float) for prefix in GROUPS
+    )
     error = final - truth
-    # The median of a number and "never" is never, not the nan of inf - inf.
-    median = float(np.sort(settling)[len(settling) // 2])
+    settling = np.sort(np.where(np.isnan(settling), inf, settling))
     known = bool(np.all(np.isfinite(std) & (std > 0.0)))
     n = len(outcomes)
     # Quantiles of chi squared with n degrees of freedom: n times the mean has that distribution.
     low, high = chdtri(n, [0.975, 0.025]) / n
+    relative = error / np.where(truth == 0.0, nan, truth)
     return ParameterStatistics(
-        float(error.mean()), float(np.sqrt(np.mean(error**2))), median, float(settling.max()),
+        float(error.mean()), float(np.sqrt(np.mean(error**2))),
+        100.0 * float(np.sqrt(np.mean(relative**2))),
+        # The median of a number and "never" is never, not the nan of inf - inf.
+        float(settling[n // 2]), float(settling[-1]),
         float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),
         float(np.mean((error / std) ** 2)) if known else nan, (float(low), float(high)),
     )

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
@@ -29,36 +28,8 @@ def run_on_cluster(jobs: Sequence[Job], address: str, label: str = '') -> list[O
     Raises InputError where there is no such cluster, or one with other libraries; BrokenOffError
     where it ends before the runs do, or a run has ended several workers.
     """
-    with _client(address) as client:
-        from distributed import KilledWorker, as_completed
-        _check_workers(client, address)
-        try:
-            # Not pure: runs of the same parameters are runs all the same.
-            futures = client.map(run_job, jobs, pure=False)
-            # disable=None: no bar where stderr is not a terminal.
-            with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
-                outcomes = {}
-                for future, outcome in as_completed(
-                    futures, loop=client.loop, with_results=True
-                ):
-                    outcomes[future.key] = outcome
-                    bar.update()
-            return [outcomes[future.key] for future in futures]
-        except KilledWorker:
-            raise BrokenOffError(
-                f'--cluster {address}: a run has ended several workers: is there enough memory?'
-            ) from None
-        except CancelledError:
-            raise BrokenOffError(
-                f'--cluster {address}: the scheduler has ended: start it and simulate again'
-            ) from None
-
-
-@contextmanager
-def _client(address: str) -> Iterator[Client]:
-    """A connection to the scheduler, closed with the context; its jobs are given up then."""
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker, as_completed
     except ImportError:
         raise InputError(
             "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
@@ -73,23 +44,36 @@ def _client(address: str) -> Iterator[Client]:
             f'--cluster {address}: no scheduler answers ({reason}): start one with '
             '`dask scheduler --host HOST`, and workers with `dask worker tcp://HOST:8786`'
         ) from None
-    with client:
-        yield client
+    # disable=None: no bar where stderr is not a terminal.
+    with client, tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
+        _check_workers(client, address)
+        try:
+            # Not pure: runs of the same parameters are runs all the same.
+            futures = client.map(run_job, jobs, pure=False)
+            outcomes = {}
+            for future, outcome in as_completed(futures, loop=client.loop, with_results=True):
+                outcomes[future.key] = outcome
+                bar.update()
+            return [outcomes[future.key] for future in futures]
+        except (KilledWorker, CancelledError) as error:
+            why = 'a run has ended several workers: is there enough memory?' \
+                if isinstance(error, KilledWorker) else \
+                'the scheduler has ended: start it and simulate again'
+            raise BrokenOffError(f'--cluster {address}: {why}') from None
 
 
 def _check_workers(client: Client, address: str) -> None:
     """Raise InputError unless there are workers, with the libraries of this process."""
     from distributed import TimeoutError as NoWorkerError
+    here = libraries()
     try:
         client.wait_for_workers(1, timeout=ANSWER_S)
+        there: dict[str, Any] = client.run(libraries)
     except NoWorkerError:
         raise InputError(
             f'--cluster {address}: no worker within {ANSWER_S:g} s: start some with '
             f'`dask worker {address}`'
         ) from None
-    here = libraries()
-    try:
-        there: dict[str, Any] = client.run(libraries)
     except ImportError as error:
         raise InputError(
             f'--cluster {address}: a worker says {error}: install the same backlash_ros there'

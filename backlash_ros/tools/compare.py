@@ -5,19 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
-from time import perf_counter
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import ClosedLoop, build_closed_loop
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import (
     control_error_rms,
     delayed_reference,
@@ -25,51 +22,46 @@ from backlash_ros.core.simulation.metrics import (
     gap_crossings_per_reversal,
     total_variation,
 )
-from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.analysis import ErrorCurves, control_error, moving_rms
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.run import run_loop
-
-Array = NDArray[np.float64]
 
 DOCUMENT, FIGURE = Path('comparison.md'), Path('images/comparison.png')
 WINDOW_S = 0.5  # over which the error of a curve is averaged
 HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
-    'crossings per reversal', 'time per step',
+    'crossings per reversal',
 )
 
 
 @dataclass(frozen=True)
 class Contender:
-    """A loop of the comparison: its name and what sets it apart."""
+    """A loop of the comparison: its name and what sets it apart.
+
+    follows: whether y is meant to follow y_m; otherwise y_m sets u_d.
+    """
 
     name: str
     changes: Mapping[str, object]
-    follows: bool  # whether y is meant to follow y_m; otherwise y_m sets u_d
+    follows: bool
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a contender; a figure of merit that does not apply is None.
+    """What became of a contender.
 
-    control_error [unit of u], tracking_error relative, penalty: tracking error that the backlash
-    costs, step_us: median time of a step [us]. note: why the run broke off, if it did.
+    merits: what stands below HEADER behind the name, None where it does not apply: control error
+    [unit of u], relative tracking error, the part of it that the backlash costs, way of v [unit of
+    v], crossings of the gap per reversal. curves: of its errors. note: why the run broke off.
     """
 
     contender: Contender
-    run: RunRecord | None
-    delay: int = 0
-    control_error: float | None = None
-    tracking_error: float | None = None
-    penalty: float | None = None
-    variation: float | None = None
-    crossings: float | None = None
-    step_us: float | None = None
+    merits: tuple[float | None, ...] = ()
+    curves: ErrorCurves | None = None
     note: str = ''
 
 
@@ -142,62 +134,34 @@ def _measure(contender: Contender, parameters: Parameters, samples: int) -> Resu
     delay = loop.controller.structure.delay
     try:
         run = run_loop(loop, samples)
-        step_us = 1e6 * median(_step_times(loop))
     except BrokenOffError as broken:
-        return Result(contender, None, delay, note=str(broken))
+        return Result(contender, note=str(broken))
     since = 0.2 * run.samples * run.sample_period
-    result = Result(
-        contender, run, delay, control_error_rms(run),
-        variation=total_variation(run.column('v')[run.column('t') >= since]),
-        crossings=gap_crossings_per_reversal(run, since), step_us=step_us,
-    )
-    if not contender.follows:
-        return result
-    gapless = run_loop(build_closed_loop(parameters.replaced({
-        **_NO_GAP, **_fixed(parameters.get_float('backlash.m'), 0.0, 0.0), 'fixed.doubt': 0.0,
-    })), samples)
-    error, best = (delayed_tracking_error_rms(each, delay, since) for each in (run, gapless))
-    penalty = None if error is None or best is None else error - best
-    return replace(result, tracking_error=error, penalty=penalty)
-
-
-def _step_times(loop: ClosedLoop) -> list[float]:
-    """Times of some further steps of the controller [s]."""
-    times = []
-    for _ in range(100):
-        y, y_m = loop.plant.measure(), loop.reference(loop.plant.sample * loop.sample_period)
-        begin = perf_counter()
-        step = loop.controller.step(y, y_m)
-        times.append(perf_counter() - begin)
-        loop.controller.refine()
-        loop.plant.step(step.v)
-    return times
+    window = max(round(WINDOW_S / run.sample_period), 1)
+    error = penalty = tracking = None
+    if contender.follows:
+        tracking = moving_rms(run.column('y') - delayed_reference(run, delay), window)
+        gapless = run_loop(build_closed_loop(parameters.replaced({
+            **_NO_GAP, **_fixed(parameters.get_float('backlash.m'), 0.0, 0.0), 'fixed.doubt': 0.0,
+        })), samples)
+        error, best = (delayed_tracking_error_rms(each, delay, since) for each in (run, gapless))
+        penalty = None if error is None or best is None else error - best
+    # The curve of the loop without backlash comes to lie on that of the one that has learned it.
+    width = 3.4 if contender.follows and 'moving_horizon' in contender.name else 1.7
+    return Result(contender, (
+        control_error_rms(run), error, penalty,
+        total_variation(run.column('v')[run.column('t') >= since]),
+        gap_crossings_per_reversal(run, since),
+    ), ErrorCurves(
+        contender.name, run.column('t'), moving_rms(control_error(run), window), tracking, width,
+    ))
 
 
 def row(result: Result) -> tuple[str, ...]:
     """The line of the table for a result."""
     if result.note:
         return (result.contender.name, 'broke off', *[NOTHING] * (len(HEADER) - 2))
-    return (
-        result.contender.name, number(result.control_error, 3), number(result.tracking_error, 3),
-        number(result.penalty, 3), number(result.variation, 3), number(result.crossings, 3),
-        number(result.step_us, 2, 'us'),
-    )
-
-
-def error_curves(result: Result) -> ErrorCurves | None:
-    """Moving RMS of the errors of a loop over WINDOW_S; None where it broke off."""
-    run = result.run
-    if run is None:
-        return None
-    samples = max(round(WINDOW_S / run.sample_period), 1)
-    tracking = None
-    if result.contender.follows:
-        tracking = moving_rms(run.column('y') - delayed_reference(run, result.delay), samples)
-    control = moving_rms(control_error(run), samples)
-    # The curve of the loop without backlash comes to lie on that of the one that has learned it.
-    width = 3.4 if tracking is not None and 'moving_horizon' in result.contender.name else 1.7
-    return ErrorCurves(result.contender.name, run.column('t'), control, tracking, width)
+    return (result.contender.name, *(number(merit, 3) for merit in result.merits))
 
 
 def comparison_document(
@@ -228,7 +192,6 @@ def comparison_document(
         'without backlash is subtracted.',
         '- Total variation of v: sum of |v(k) - v(k-1)| without the first fifth. Crossings: how '
         'often v turns back by more than half of the gap, for each reversal of y_m.',
-        '- Time: median of one step of the controller on the machine that wrote this.',
         '- No compensation and wrong constants (the crossings 30 % too large) know the slope, '
         'and have an observer that allows for a disturbance of u.',
         '',
@@ -261,7 +224,7 @@ def _compare(args: Sequence[str] | None) -> None:
     print(cli.format_table(HEADER, [row(result) for result in results]))
     out = result_directory(options.out)
     (out / FIGURE).parent.mkdir(parents=True, exist_ok=True)
-    curves = [found for found in map(error_curves, results) if found is not None]
+    curves = [result.curves for result in results if result.curves is not None]
     write_atomically(out / FIGURE, png(draw_comparison(curves, WINDOW_S)))
     document = comparison_document(scenario, results, FIGURE.as_posix())
     write_atomically(out / DOCUMENT, document)

@@ -25,7 +25,7 @@ from backlash_ros.tools.cli import (
     run_tool,
     span_of,
 )
-from backlash_ros.tools.config.configuration import write_config
+from backlash_ros.tools.config import write_config
 from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.runs.analysis import (
     compare_laws,

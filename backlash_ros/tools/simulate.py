@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from math import inf, isfinite, nan
+from math import isfinite, nan
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,10 @@ from backlash_ros.core.parameters.table import Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
-from backlash_ros.tools.batch import Job, Outcome, statistics
-from backlash_ros.tools.cli import DEFAULT_DURATION_S, InputError, format_table
+from backlash_ros.tools.batch import COLUMNS, PROBLEM, Job, Outcome, statistics
+from backlash_ros.tools.cli import DEFAULT_DURATION_S, NOTHING, InputError, format_table
 from backlash_ros.tools.cluster import run_on_cluster
-from backlash_ros.tools.config.configuration import effective_parameters, write_config
+from backlash_ros.tools.config import effective_parameters, write_config
 from backlash_ros.tools.runs.files import CONFIG, result_directory, write_table
 from backlash_ros.tools.runs.run import run_loop
 from backlash_ros.tools.runs.summary import estimate_table
@@ -113,12 +113,14 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     directory = result_directory(options.out)
     write_config(parameters, directory / CONFIG)
     csv = directory / (SWEEP if swept else SEEDS)
-    write_outcomes(csv, swept, jobs, outcomes)
+    named = (*swept, 'seed')
+    write_table(csv, (*named, *COLUMNS), [
+        [*(_plain(job.values[name]) for name in named), *(outcome[name] for name in COLUMNS)]
+        for job, outcome in zip(jobs, outcomes, strict=True)
+    ])
     # The jobs of one change stand together.
     size = len(outcomes) // len(changes)
-    groups = [
-        (change, outcomes[i * size:(i + 1) * size]) for i, change in enumerate(changes)
-    ]
+    groups = [(change, outcomes[i * size:(i + 1) * size]) for i, change in enumerate(changes)]
     if swept:
         print(_sweep_table(swept, groups))
         from backlash_ros.tools.figures import draw_sweep, png
@@ -132,26 +134,8 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     print(f'runs: {csv}')
 
 
-def write_outcomes(
-    path: Path, swept: Sequence[str], jobs: Sequence[Job], outcomes: Sequence[Outcome],
-) -> None:
-    """Write a row per run, with nothing where a number is unknown or never reached."""
-    header = [
-        *swept, 'seed',
-        *(f'{prefix}{name}' for prefix in ('', 'std_', 'true_', 'settling_') for name in BACKLASH),
-        'control_error_rms', 'tracking_error_rms', 'lost_samples', 'problem',
-    ]
-    rows: list[list[object]] = []
-    for job, outcome in zip(jobs, outcomes, strict=True):
-        values = [job.values[name] for name in (*swept, 'seed')]
-        rows.append([
-            *(list(value) if isinstance(value, tuple) else value for value in values),
-            *outcome.final, *outcome.std, *outcome.truth,
-            *(time if isfinite(time) else None for time in outcome.settling),
-            outcome.control_error_rms, outcome.tracking_error_rms, outcome.lost_samples,
-            outcome.problem,
-        ])
-    write_table(path, header, rows)
+def _plain(value: Value) -> object:
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _seeds_table(outcomes: Sequence[Outcome]) -> str:
@@ -176,14 +160,13 @@ def _sweep_table(swept: Sequence[str], groups: Sequence[Group]) -> str:
     rows = []
     for change, outcomes in groups:
         row = [batch.value_text(change[name]) for name in swept]
-        if all(outcome.problem for outcome in outcomes):
-            rows.append([*row, *['-'] * 3, 'broke off', '-'])
+        if all(outcome[PROBLEM] for outcome in outcomes):
+            rows.append([*row, *[NOTHING] * 3, 'broke off', NOTHING])
             continue
-        of = statistics(outcomes)
+        of = statistics(outcomes).values()
         rows.append([
-            *row, *(f'{of[name].rmse:.3g}' for name in BACKLASH),
-            _seconds(max(s.settling_median for s in of.values())),
-            f'{100.0 * min(s.within for s in of.values()):.4g} %',
+            *row, *(f'{s.rmse:.3g}' for s in of), _seconds(max(s.settling_median for s in of)),
+            f'{100.0 * min(s.within for s in of):.4g} %',
         ])
     return format_table(header, rows)
 
@@ -195,19 +178,15 @@ def _lines(swept: Sequence[str], groups: Sequence[Group]) -> dict[str, NDArray[n
     """
     lines: dict[str, list[list[float]]] = {}
     for change, outcomes in groups:
-        name = ', '.join(batch.value_text(change[other]) for other in swept[1:])
-        line = lines.setdefault(name, [])
-        whole = [outcome for outcome in outcomes if not outcome.problem]
-        if not whole:
+        line = lines.setdefault(', '.join(batch.value_text(change[name]) for name in swept[1:]), [])
+        if all(outcome[PROBLEM] for outcome in outcomes):
             line.append([nan] * 4)
             continue
-        final, truth = (np.array([getattr(one, key) for one in whole]) for key in
-                        ('final', 'truth'))
-        # Nothing is a percentage of zero, and the logarithm has no zero.
-        relative = final / np.where(truth == 0.0, nan, truth) - 1.0
-        rmse = np.maximum(100.0 * np.sqrt(np.mean(relative**2, axis=0)), 1e-10)
-        slowest = max(s.settling_median for s in statistics(whole).values())
-        line.append([*rmse.tolist(), nan if slowest == inf else slowest])
+        of = statistics(outcomes).values()
+        slowest = max(s.settling_median for s in of)
+        # The logarithm has no zero.
+        percents = [max(s.rmse_percent, 1e-10) if isfinite(s.rmse_percent) else nan for s in of]
+        line.append([*percents, slowest if isfinite(slowest) else nan])
     return {name: np.array(line).T for name, line in lines.items()}
 
 
@@ -215,13 +194,13 @@ def _shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> list[str]:
     """Lines that name the runs that broke off or did not end within 1 %."""
     lines = []
     pairs = list(zip(jobs, outcomes, strict=True))
-    broken = [job for job, outcome in pairs if outcome.problem]
+    broken = [job for job, outcome in pairs if outcome[PROBLEM]]
     if broken:
-        first = next(outcome.problem for outcome in outcomes if outcome.problem)
+        first = next(outcome[PROBLEM] for outcome in outcomes if outcome[PROBLEM])
         lines.append(f'broke off: {_seeds(broken)}, the first one with: {first}')
     missed = [
         job for job, outcome in pairs
-        if not outcome.problem and not all(isfinite(time) for time in outcome.settling)
+        if not outcome[PROBLEM] and any(outcome[f'settling_{name}'] is None for name in BACKLASH)
     ]
     if missed:
         lines.append(f'not within 1 % at the end: {_seeds(missed)}')

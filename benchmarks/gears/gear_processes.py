@@ -26,7 +26,7 @@ from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.metrics import delayed_reference
 from backlash_ros.tools.bringup.environment import child_environment, free_domain
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.source import read_run
 from gears.gear_runs import (
     AT_FIRST,

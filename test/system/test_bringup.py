@@ -23,7 +23,7 @@ from ros_processes import ros_world
 from backlash_ros import topics
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.bag import read_bag
 
 TWO_AXES = ROOT / 'config' / 'two_axes.yaml'

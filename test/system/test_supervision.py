@@ -19,7 +19,7 @@ from backlash_ros.tools.bringup.environment import child_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
 from backlash_ros.tools.bringup.supervisor import ProcessPlan, ProcessSupervisor
 from backlash_ros.tools.cli import StopRequests
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 
 READY = (
     'import signal; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]);'

@@ -18,7 +18,7 @@ from backlash_ros.options import LARGEST_PORT
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.supervisor import ProcessPlan
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
-from backlash_ros.tools.config.configuration import Configuration, read_configuration, write_config
+from backlash_ros.tools.config import Configuration, read_configuration, write_config
 from backlash_ros.tools.runs.files import CONFIG, result_directory
 from backlash_ros.tools.runs.source import BAG
 

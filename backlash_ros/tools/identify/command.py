@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from backlash_ros.core.parameters.table import Value
 from backlash_ros.options import FAILED, OptionParser, positive
 from backlash_ros.tools.cli import (
-    InputError,
     Span,
     add_out_option,
     add_span_options,
@@ -160,15 +159,9 @@ def given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
     """What the user's file holds for the axis; nothing without a file."""
     if config is None:
         return {}
-    from backlash_ros.tools.config.configuration import find_config
-    from backlash_ros.tools.config.parameter_file import no_such_axis, read_parameter_file
+    from backlash_ros.tools.config import check_axis, find_config, read_parameter_file
     file = read_parameter_file(find_config(config))
-    axes = file.axes
-    file.check_axes(axes)
-    if axes and not axis:
-        raise InputError(
-            f'{file.path}: holds the axes {", ".join(axes)}: choose one, like --axis {axes[0]}'
-        )
-    if axes and axis not in axes:
-        raise InputError(no_such_axis(axis, axes))
+    file.check_axes(file.axes)
+    if file.axes:
+        check_axis(file, axis, file.axes)
     return file.values(axis)

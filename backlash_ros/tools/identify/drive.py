@@ -30,7 +30,7 @@ from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import BAD_INPUT
 from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
-from backlash_ros.tools.config.configuration import write_config
+from backlash_ros.tools.config import write_config
 from backlash_ros.tools.identify.outcome import options_of
 from backlash_ros.tools.records.messages import from_messages
 

@@ -25,8 +25,7 @@ from backlash_ros.core.parameters.table import (
     Parameter,
     Value,
 )
-from backlash_ros.tools.config.configuration import yaml_value
-from backlash_ros.tools.config.parameter_file import ANY, EVERY_NODE
+from backlash_ros.tools.config import ANY, EVERY_NODE, yaml_value
 
 LEAST_DEVIATION = 1e-6  # relative: a deviation of 0 would say that a constant was given
 WIDER = 3.0  # bounds of the estimates, in times of what was found

@@ -119,7 +119,7 @@ def _reports(
 
 
 def _with_settings(parameters: Parameters, settings: Sequence[str]) -> Parameters:
-    from backlash_ros.tools.config.configuration import parse_setting
+    from backlash_ros.tools.config import parse_setting
     changes: dict[str, Value] = {}
     for text in settings:
         setting = parse_setting(text)

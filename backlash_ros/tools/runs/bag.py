@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf
@@ -166,53 +166,28 @@ def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
     return content
 
 
-def read_numbers(
-    path: Path, names: Iterable[str],
-) -> tuple[dict[str, tuple[Stamps, Array]], str]:
-    """Stamps [ns] and values of each Float64 topic whose name ends like one of these.
-
-    Returns them by recorded name, and what is wrong with the bag, '' for nothing. Raises
-    InputError.
-    """
-    ends = tuple(last_part(name) for name in names)
-    content = read_topics(path, lambda topic: (
-        topic.message_type == NUMBER and last_part(topic.name) in ends
-    ))
-    return {
-        name: (
-            np.array([stamp for stamp, _ in messages], dtype=np.int64),
-            np.array([float(message.data) for _, message in messages]),
-        ) for name, messages in sorted(content.messages.items())
-    }, content.damage
-
-
 def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
     """What applied_control reported between each output of a run and the one before it.
 
     y (N,): outputs of the run, by whose values they are found among the messages. Empty where the
     bag holds no applied_control, or the outputs are not all there. Raises InputError.
     """
-    numbers, _ = read_numbers(path, (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL))
-    chosen = []
+    content = read_topics(path, lambda topic: topic.message_type == NUMBER)
+    chosen: list[list[tuple[int, Any]]] = []
     for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL):
-        name, _ = choose_namespace(
-            sorted(name for name in numbers if f'/{name}'.endswith(f'/{topic}')), axis
-        )
-        if not name:
-            return []
-        chosen.append(numbers[name])
-    (output_ns, outputs), (report_ns, values) = chosen
-    stamps, place = [], 0
-    heard = outputs.tolist()
+        names = sorted(name for name in content.messages if f'/{name}'.endswith(f'/{topic}'))
+        chosen.append(content.messages.get(choose_namespace(names, axis)[0], []))
+    outputs, reports = chosen
+    stamps: list[int] = []
+    remaining = iter(outputs)
     for value in y.tolist():
-        while place < len(heard) and heard[place] != value:
-            place += 1
-        if place == len(heard):
+        found = next((stamp for stamp, message in remaining if message.data == value), None)
+        if found is None:
             return []
-        stamps.append(output_ns[place])
-        place += 1
-    until = np.searchsorted(report_ns, stamps, side='right')
-    return [[], *(values[a:b].tolist() for a, b in pairwise(until.tolist()))]
+        stamps.append(found)
+    until = np.searchsorted([stamp for stamp, _ in reports], stamps, side='right').tolist()
+    values = [float(message.data) for _, message in reports]
+    return [[], *(values[a:b] for a, b in pairwise(until))] if values else []
 
 
 def choose_namespace(names: Sequence[str], axis: str) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from cases.held_up import HeldUpProcesses
 from simulated_motor import C_L, C_R
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 
 CONFIG = Path('geared_motor.yaml')
 SECONDS, LEARNED_S = 4.0, 3.0

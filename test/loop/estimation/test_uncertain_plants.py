@@ -17,7 +17,7 @@ from backlash_ros.core.estimation.moving_horizon import acquisition
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.tools.config.configuration import load_config
+from backlash_ros.tools.config import load_config
 
 PERIOD = 0.005
 SHIPPED = ROOT / 'config'

@@ -16,7 +16,7 @@ from backlash_ros.core.loop.sample_counter import SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
 from backlash_ros.nodes.runtime.driver_io import Output
-from backlash_ros.tools.config.configuration import write_config
+from backlash_ros.tools.config import write_config
 from backlash_ros.tools.replay.command import main
 from backlash_ros.tools.runs.bag import read_reports
 from backlash_ros.tools.runs.source import read_run

@@ -17,8 +17,7 @@ from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.cli import InputError
-from backlash_ros.tools.config.configuration import effective_parameters
-from backlash_ros.tools.config.parameter_file import read_parameter_file
+from backlash_ros.tools.config import effective_parameters, read_parameter_file
 from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.records.messages import from_messages
 from backlash_ros.tools.records.reading import read_record

@@ -19,7 +19,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.plant.true_plant import Alteration, altered_plant, delayed
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 
 PERIOD = 0.005
 NOTHING = {

@@ -21,7 +21,7 @@ from backlash_ros.nodes.driver_check.options import parse_options
 from backlash_ros.tools import batch
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.bringup import __main__ as bringup
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.identify import command as identify
 from backlash_ros.tools.replay import command as replay
 

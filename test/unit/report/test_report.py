@@ -20,7 +20,7 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import InputError, Span
-from backlash_ros.tools.config.configuration import write_config
+from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs import analysis
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import write_run, write_summary
@@ -203,18 +203,6 @@ def test_bag_in_the_results_goes_first(run: RunRecord, tmp_path: Path) -> None:
         source = read_run(path)
         assert source.latency_s is not None
         assert source.parameters == PARAMETERS
-
-
-def test_samples_take_the_truth_from_the_summary_beside_them(
-    run: RunRecord, tmp_path: Path,
-) -> None:
-    folder = saved(run, tmp_path / 'results')
-    source = read_run(folder / 'samples.csv')
-    assert source.record.has_truth
-    np.testing.assert_array_equal(source.record.column('true_c_l'), run.column('true_c_l'))
-    # Of a truth that wears, the summary knows only the end.
-    write_config(PARAMETERS.replaced({'backlash.rate': [0.1, 0, 0]}), folder / 'parameters.yaml')
-    assert not read_run(folder / 'samples.csv').record.has_truth
 
 
 def broken_bag(path: Path, run: RunRecord) -> None:

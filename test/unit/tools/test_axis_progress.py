@@ -16,7 +16,7 @@ from backlash_ros.tools.bringup.watch import (
     ProgressDisplay,
 )
 from backlash_ros.tools.cli import BrokenOffError
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 
 
 def begun(folder: Path, driver: str = '', **values: object) -> tuple[AxisProgress, io.StringIO]:

@@ -19,7 +19,7 @@ from backlash_ros.tools.bringup.environment import child_environment, foreign_en
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
 from backlash_ros.tools.bringup.supervisor import ProcessPlan
 from backlash_ros.tools.bringup.watch import ProgressDisplay, describe
-from backlash_ros.tools.config.configuration import effective_parameters
+from backlash_ros.tools.config import effective_parameters
 
 CONFIG = ROOT / 'config' / 'two_axes.yaml'
 DRIVER = 'drive --axis {axis}'

@@ -12,14 +12,13 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.tools.cli import InputError
-from backlash_ros.tools.config.configuration import (
+from backlash_ros.tools.config import (
     Setting,
     effective_parameters,
     find_config,
     load_config,
     parse_setting,
     read_configuration,
-    shipped_configs,
     write_config,
 )
 
@@ -37,7 +36,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() -> None:
-    example = load_config(shipped_configs() / 'paper_example.yaml')
+    example = load_config(find_config(None))
     # The paper supposes G(z) exact, which the plant of a user never is.
     exact = Parameters().replaced({'plant.uncertainty': 0.0})
     assert example == {name: exact[name] for name in example}

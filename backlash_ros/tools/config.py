@@ -1,0 +1,350 @@
+"""Parameters from ROS 2 parameter files and the command line, and back into such a file.
+
+A section /AXIS/NODE holds values of one node of one axis; ** stands for all axes or all nodes, and
+/NODE for the node without a namespace. A named node goes before a named axis.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from backlash_ros import shipped
+from backlash_ros.atomic_file import write_atomically
+from backlash_ros.core.parameters import Parameters, check_names, check_value
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import (
+    BRINGUP,
+    BY_NAME,
+    CONTROLLER,
+    NODES,
+    PARAMETERS,
+    Parameter,
+    Value,
+)
+from backlash_ros.tools.cli import InputError
+
+ANY = '**'
+EVERY_NODE = f'/{ANY}'
+AXES = 'axes'
+
+
+@dataclass(frozen=True)
+class Section:
+    """Checked values under one name of a file.
+
+    axis: ANY for a wildcard, empty for the node without a namespace. node: ANY for all nodes.
+    """
+
+    name: str
+    axis: str
+    node: str
+    values: Mapping[str, Value]
+
+    @property
+    def rank(self) -> tuple[bool, bool]:
+        """The larger one wins: the name of a node goes before the namespace of an axis."""
+        return self.node != ANY, self.axis not in (ANY, '')
+
+    def is_for(self, *axes: str) -> bool:
+        """Whether it belongs to one of the axes, or to the whole run."""
+        return self.axis in (ANY, *axes) or (self.node == BRINGUP and not self.axis)
+
+
+@dataclass(frozen=True)
+class ParameterFile:
+    """A file that was read, its names and values checked."""
+
+    path: Path
+    sections: tuple[Section, ...]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes that the file lists; raises InputError for two different lists."""
+        listing = [section for section in self.sections if AXES in section.values]
+        value = self._merged(listing).get(AXES, ())
+        assert isinstance(value, tuple)
+        return tuple(map(str, value))
+
+    def check_axes(self, axes: Sequence[str]) -> None:
+        """Raise InputError for a section that belongs to none of the axes of the run."""
+        for section in self.sections:
+            if section.is_for(*axes) or not (section.axis or axes):
+                continue
+            rule = f': {no_such_axis(section.axis, axes)}' if section.axis else (
+                f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
+                f'/{axes[0]}/{section.node} for one'
+            )
+            raise InputError(f'{self.path}: section {section.name!r}{rule}')
+
+    def values(self, axis: str) -> dict[str, Value]:
+        """Values for an axis by flat name, empty for a run without axes; raises InputError."""
+        return self._merged([section for section in self.sections if section.is_for(axis)])
+
+    def _merged(self, sections: Sequence[Section]) -> dict[str, Value]:
+        merged: dict[str, Value] = {}
+        ranks: dict[str, tuple[bool, bool]] = {}
+        for section in sorted(sections, key=lambda section: section.rank, reverse=True):
+            for name, value in section.values.items():
+                if ranks.setdefault(name, section.rank) != section.rank:
+                    continue
+                if merged.setdefault(name, value) != value:
+                    raise InputError(
+                        f'{self.path}: {name} has two values, {merged[name]!r} and {value!r}'
+                    )
+        return merged
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One --set: axis is empty for all axes."""
+
+    axis: str
+    name: str
+    value: Value
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A file with what the command line changes in it; axes: empty for a run without axes."""
+
+    file: ParameterFile
+    settings: tuple[Setting, ...]
+    seed: int | None
+    axes: tuple[str, ...]
+
+    def parameters(self, axis: str = '') -> Parameters:
+        """Return the complete set: defaults, then the file, then --set, then --seed.
+
+        axis: one of the axes, empty only if there are none; raises InputError.
+        """
+        check_axis(self.file, axis, self.axes)
+        values: dict[str, object] = dict(self.file.values(axis))
+        for meant in ('', axis):
+            values.update({s.name: s.value for s in self.settings if s.axis == meant})
+        if self.seed is not None:
+            values['seed'] = self.seed
+        values.pop(AXES, None)
+        return Parameters(values)
+
+
+def check_axis(file: ParameterFile, axis: str, axes: Sequence[str]) -> None:
+    """Raise InputError unless the axis is one of the axes, or there are none."""
+    if axes and not axis:
+        raise InputError(
+            f'{file.path}: holds the axes {", ".join(axes)} and only one can be used here: '
+            f'choose it, like --axis {axes[0]}'
+        )
+    if axis and axis not in axes:
+        raise InputError(no_such_axis(axis, axes))
+
+
+def no_such_axis(axis: str, axes: Sequence[str]) -> str:
+    """What is wrong with the name of an axis, and the nearest one that exists."""
+    if not axes:
+        return f'there is no axis {axis!r}: list it in the parameter {AXES} under /{BRINGUP}'
+    near = difflib.get_close_matches(axis, axes, n=1, cutoff=0.0)[0]
+    return f'there is no axis {axis!r} among {", ".join(axes)}: did you mean {near}?'
+
+
+def read_configuration(
+    config: Path | None, settings: Sequence[str] = (), seed: int | None = None,
+) -> Configuration:
+    """Read and check everything; raises InputError and ParameterError.
+
+    config: a path, or the name of a shipped file; None for the paper's example.
+    """
+    file = read_parameter_file(find_config(config))
+    parsed = tuple(parse_setting(setting) for setting in settings)
+    axes = file.axes
+    for setting in parsed:
+        if setting.name == AXES:
+            axes = Parameters({AXES: setting.value}).get_strs(AXES)
+    for setting in parsed:
+        if setting.axis and setting.axis not in axes:
+            raise InputError(f'--set {setting.axis}/{setting.name}: '
+                             + no_such_axis(setting.axis, axes))
+    file.check_axes(axes)
+    return Configuration(file, parsed, seed, axes)
+
+
+def effective_parameters(
+    config: Path | None, settings: Sequence[str] = (), seed: int | None = None, axis: str = '',
+) -> Parameters:
+    """Return the complete set for one axis, as `Configuration.parameters` does."""
+    return read_configuration(config, settings, seed).parameters(axis)
+
+
+def load_config(path: Path) -> dict[str, Value]:
+    """Return the values that a file without axes holds, by flat name.
+
+    Raises InputError and ParameterError.
+    """
+    file = read_parameter_file(path)
+    file.check_axes(())
+    return file.values('')
+
+
+def find_config(config: Path | None) -> Path:
+    """Path of a configuration file: as given, or else among the shipped ones by name."""
+    if config is not None:
+        return shipped.find_config(config)
+    examples = [folder / shipped.DEFAULT_CONFIG for folder in shipped.config_folders()]
+    return next(filter(Path.is_file, examples), examples[0])
+
+
+def parse_setting(text: str) -> Setting:
+    """Return the checked content of `KEY=VALUE` or `AXIS/KEY=VALUE`, the value as in YAML."""
+    key, equals, given = text.partition('=')
+    axis, slash, name = key.strip().rpartition('/')
+    if not equals or (slash and not axis):
+        raise InputError(f'--set {text!r} must be KEY=VALUE or AXIS/KEY=VALUE')
+    check_names([name])
+    if axis and name == AXES:
+        raise ParameterError(name, given, 'is for the whole run', f'write --set {AXES}=...')
+    value: object = given
+    if not isinstance(BY_NAME[name].default, str):  # a word is taken as it is
+        try:
+            value = yaml.safe_load(given)
+        except yaml.YAMLError:
+            raise ParameterError(name, given, 'is not a value in YAML') from None
+    return Setting(axis, name, check_value(BY_NAME[name], value))
+
+
+def read_parameter_file(path: Path) -> ParameterFile:
+    """Read and check a file.
+
+    Raises InputError for a file that cannot be read, ParameterError for a name or value that
+    breaks a rule; both name the file.
+    """
+    sections = []
+    for name, content in _read_yaml(path).items():
+        try:
+            sections.append(_read_section(str(name), content))
+        except (ParameterError, InputError) as error:
+            error.args = (f'{path}: {error}',)
+            raise
+    return ParameterFile(path, tuple(sections))
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """SafeLoader that refuses a key given twice, of which YAML would keep the last one."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for i, key in enumerate(keys):
+            if key in keys[:i]:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f'{key!r} is given twice', node.value[i][0].start_mark
+                )
+        return super().construct_mapping(node, deep=deep)
+
+
+def _read_yaml(path: Path) -> dict[object, object]:
+    try:
+        document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
+    except OSError as error:
+        raise InputError(f'{path}: cannot be read: {error.strerror}') from None
+    except UnicodeDecodeError:
+        raise InputError(f'{path}: is not a text file in UTF-8') from None
+    except yaml.MarkedYAMLError as error:
+        line = f' line {error.problem_mark.line + 1}:' if error.problem_mark else ''
+        raise InputError(f'{path}:{line} {error.problem}') from None
+    except yaml.YAMLError as error:
+        raise InputError(f'{path}: is not YAML: {" ".join(str(error).split())}') from None
+    if not isinstance(document, dict) or not document:
+        raise InputError(f'{path}: must hold "/**: {{ros__parameters: {{...}}}}"')
+    return document
+
+
+def _read_section(name: str, content: object) -> Section:
+    axis, node = _address(name)
+    if not isinstance(content, dict) or set(content) != {'ros__parameters'}:
+        raise InputError('each section must hold ros__parameters and nothing else')
+    if not isinstance(content['ros__parameters'], dict):
+        raise InputError('ros__parameters must hold "name: value" lines')
+    values = dict(_flatten(content['ros__parameters']))
+    check_names(values)
+    checked = {key: check_value(BY_NAME[key], value) for key, value in values.items()}
+    for key, value in checked.items():
+        users = BY_NAME[key].used_by
+        if node not in (ANY, *users):
+            raise ParameterError(
+                key, value, f'is not a parameter of {node}',
+                f'put it under {EVERY_NODE} or /{users[0]}',
+            )
+        if key == AXES and axis not in (ANY, ''):
+            raise ParameterError(key, value, 'is for the whole run', f'put it under /{BRINGUP}')
+    return Section(name, axis, node, checked)
+
+
+def _address(name: str) -> tuple[str, str]:
+    """Axis and node of the name of a section."""
+    parts = name.removeprefix('/').split('/')
+    if name == EVERY_NODE:
+        return ANY, ANY
+    axis, node = ('', parts[0]) if len(parts) == 1 else (parts[0], parts[-1])
+    if len(parts) <= 2 and (node in NODES or (node == ANY and axis not in ('', ANY))):
+        return axis, node
+    known = [EVERY_NODE, *(f'/{node}' for node in NODES)]
+    similar = [f'/{axis}/{node}' for node in (*NODES, ANY)] if axis else known
+    near = difflib.get_close_matches(name, similar, n=1)
+    cure = f': did you mean {near[0]}?' if near else \
+        f', /AXIS/{ANY}, /AXIS/{CONTROLLER} ...' if axis else ''
+    raise InputError(f'section {name!r} is none of {", ".join(known)}{cure}')
+
+
+def _flatten(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+    for key, value in tree.items():
+        name = f'{prefix}{key}'
+        if isinstance(value, dict):
+            yield from _flatten(value, f'{name}.')
+        else:
+            yield name, value
+
+
+class _Dumper(yaml.SafeDumper):
+    """SafeDumper that writes each list on one line."""
+
+
+def _on_one_line(dumper: yaml.SafeDumper, values: Sequence[Any]) -> yaml.Node:
+    return dumper.represent_sequence('tag:yaml.org,2002:seq', values, flow_style=True)
+
+
+for _sequence in (list, tuple):
+    _Dumper.add_representer(_sequence, _on_one_line)
+
+
+def write_config(parameters: Parameters, path: Path) -> None:
+    """Write the complete set as a ROS 2 parameter file that every node accepts.
+
+    What is of bringup alone stands in a section of its own, and only if it is given. Empty lists,
+    which ROS 2 does not have, are left out.
+    """
+    common = [p for p in PARAMETERS if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
+    own = [p for p in PARAMETERS if p not in common and parameters[p.name] != p.default]
+    document = {EVERY_NODE: {'ros__parameters': _tree(parameters, common)}}
+    if own:
+        document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
+    write_atomically(path, yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000))
+
+
+def yaml_value(value: Value) -> str:
+    """A value as one line of YAML that every reader takes for the same type."""
+    return yaml.dump(value, Dumper=_Dumper, width=10000).removesuffix('...\n').strip()
+
+
+def _tree(parameters: Parameters, written: Sequence[Parameter]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for parameter in written:
+        *groups, leaf = parameter.name.split('.')
+        branch = tree
+        for group in groups:
+            branch = branch.setdefault(group, {})
+        branch[leaf] = parameters[parameter.name]
+    return tree

@@ -1,1 +1,0 @@
-"""Parameter files, and the settings of the command line upon them."""
