@@ -111,15 +111,6 @@ def test_an_unknown_actuator_is_found(tmp_path: Path) -> None:
     assert sum(found['numerator']) / sum(found['denominator']) == pytest.approx(1.0, rel=0.01)
 
 
-def test_a_precise_result_ends_the_motion_early(tmp_path: Path) -> None:
-    with bench(tmp_path) as made:
-        code, text = made.finish(made.start('--duration', '60', '--precision', '50%'))
-    assert code == 0, text
-    with (tmp_path / 'out' / 'record.csv').open() as record:
-        assert sum(1 for _ in record) * PERIOD_S < 55.0
-    assert ' s  gap 0.' in text
-
-
 def test_a_signal_brings_v_to_rest(tmp_path: Path) -> None:
     with bench(tmp_path) as made:
         process = made.start('--duration', '60')
@@ -132,41 +123,3 @@ def test_a_signal_brings_v_to_rest(tmp_path: Path) -> None:
     assert 'Traceback' not in text
     assert_limits_kept(sent)
     assert sent[-1] == 0.0
-
-
-def test_a_y_that_leaves_its_range_ends_the_motion(tmp_path: Path) -> None:
-    with bench(tmp_path) as made:
-        _, text = made.finish(made.start('--duration', '60', '--output-range', '-0.3', '0.3'))
-        sent = made.sent()
-    assert 'left --output-range' in text
-    assert sent[-1] == 0.0
-
-
-def test_a_driver_that_falls_silent_ends_the_motion(tmp_path: Path) -> None:
-    with bench(tmp_path) as made:
-        process = made.start('--duration', '60', '--order', '1', '--integrator', 'no')
-        made.probe.wait_until(lambda: len(made.control) > 300, 'some motion')
-        assert made.driver is not None
-        made.driver.kill()
-        _, text = made.finish(process)
-    assert 'nothing was heard on /plant_output for' in text
-    assert 'drive ended' in text
-    assert (tmp_path / 'out' / 'record.csv').exists()
-
-
-def test_without_a_driver_nothing_is_moved(tmp_path: Path) -> None:
-    with bench(tmp_path, with_driver=False) as made:
-        code, text = made.finish(made.start('--wait', '2'))
-        assert not made.control
-    assert code == 1
-    assert 'nothing was heard on /plant_output' in text
-    assert 'Traceback' not in text
-
-
-def test_a_missing_limit_is_refused(tmp_path: Path) -> None:
-    with bench(tmp_path, with_driver=False) as made:
-        limits = LIMITS.replace('rate_max: ', 'delay_samples: 1, initial: ', 1)
-        (tmp_path / 'limits.yaml').write_text(limits)
-        code, text = made.finish(made.start('--wait', '2'))
-    assert code == 2
-    assert 'control.rate_max' in text

@@ -1,0 +1,29 @@
+"""What check_driver refuses before it begins."""
+
+from __future__ import annotations
+
+import pytest
+
+from backlash_ros.nodes.check_driver import main
+
+
+@pytest.mark.parametrize(('options', 'word'), [
+    (['--amplitude', '3'], 'give --drive'),
+    (['--duration', '-1'], 'must be finite and > 0'),
+])
+def test_bad_options_are_one_line_and_code_2(
+    capsys: pytest.CaptureFixture[str], options: list[str], word: str
+) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(options)
+    told = capsys.readouterr().err
+    assert left.value.code == 2
+    assert word in told
+    assert len(told.splitlines()) == 1
+
+
+def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(['--help'])
+    assert left.value.code == 0
+    assert 'Exit codes' in capsys.readouterr().out
