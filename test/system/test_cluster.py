@@ -87,7 +87,15 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
         yield Cluster(tmp_path, stack)
 
 
-def test_killed_worker_loses_no_run_and_no_bit(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_killed_worker_loses_no_run_and_no_bit_and_another_numpy_is_refused(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    wait_until(cluster.is_whole, 'the workers')  # simulate does so for 10 s only
+    with monkeypatch.context() as other:
+        other.setattr(tools_cluster, 'NUMERICS', ('numpy',))
+        assert main([*RUNS, '--cluster', cluster.address]) == 2
+    assert 'install the same versions' in capsys.readouterr().err
     remote, local = tmp_path / 'remote', tmp_path / 'local'
     simulation = subprocess.Popen(
         [sys.executable, '-m', 'backlash_ros.tools.simulate', *RUNS, '--out', str(remote),
@@ -105,42 +113,3 @@ def test_killed_worker_loses_no_run_and_no_bit(cluster: Cluster, tmp_path: Path)
         simulation.wait()
     assert simulation.returncode == 0, said
     assert (remote / SEEDS).read_bytes() == (local / SEEDS).read_bytes()
-
-
-def test_worker_with_other_libraries_is_refused(
-    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
-    wait_until(cluster.is_whole, 'the workers')  # simulate does so for 10 s only
-    monkeypatch.setattr(tools_cluster, 'NUMERICS', ('numpy',))
-    assert main([*RUNS, '--cluster', cluster.address]) == 2
-    assert 'install the same versions' in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(('address', 'cure'), [
-    (f'tcp://{HERE}:1', 'dask scheduler'), ('nonsense://x', 'dask scheduler'),
-])
-def test_missing_scheduler_is_told_in_one_line(
-    address: str, cure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
-    pytest.importorskip('distributed')
-    monkeypatch.setattr(tools_cluster, 'ANSWER_S', 0.3)
-    assert main([*RUNS, '--cluster', address]) == 2
-    said = capsys.readouterr().err
-    assert said.count('\n') == 1
-    assert f'--cluster {address}: ' in said
-    assert cure in said
-
-
-def test_missing_dask_is_told_with_the_cure(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setitem(sys.modules, 'distributed', None)
-    assert main([*RUNS, '--cluster', 'tcp://x:1']) == 2
-    said = capsys.readouterr().err
-    assert said.count('\n') == 1
-    assert "pip install 'backlash_ros[cluster]'" in said
-
-
-def test_one_run_needs_no_cluster(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['--cluster', 'tcp://x:1']) == 2
-    assert '--seeds' in capsys.readouterr().err

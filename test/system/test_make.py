@@ -43,44 +43,26 @@ def one_line_of_ours(done: subprocess.CompletedProcess[str]) -> str:
     return lines[0]
 
 
-def test_make_names_a_missing_python(bare_clone: Path) -> None:
-    line = one_line_of_ours(make('demo', 'PYTHON=python3.99', cwd=bare_clone))
-    assert "no 'python3.99' here" in line
-    assert 'make ... PYTHON=' in line
-
-
-def test_make_names_a_python_that_is_too_old(bare_clone: Path) -> None:
+def test_make_names_what_is_missing_and_its_cure_in_one_line(bare_clone: Path) -> None:
     old = bare_clone / 'python-old'
     old.write_text('#!/bin/sh\nexit 1\n')
     old.chmod(0o755)
-    line = one_line_of_ours(make('demo', f'PYTHON={old}', cwd=bare_clone))
-    assert 'is older than Python 3.10' in line
-
-
-def test_make_names_a_sourced_ros_that_is_not_jazzy(bare_clone: Path) -> None:
-    done = make('demo', f'PYTHON={BASE_PYTHON}', cwd=bare_clone, ROS_DISTRO='humble')
-    line = one_line_of_ours(done)
-    assert 'ROS_DISTRO=humble' in line
-    assert 'jazzy' in line
-
-
-def test_make_names_a_jazzy_without_rclpy(bare_clone: Path) -> None:
-    done = make('demo', f'PYTHON={BASE_PYTHON}', cwd=bare_clone, ROS_DISTRO='jazzy')
-    assert 'cannot import rclpy' in one_line_of_ours(done)
-
-
-def test_make_names_an_unreachable_package_index(bare_clone: Path) -> None:
+    base = f'PYTHON={BASE_PYTHON}'
     # Nothing listens on port 9 (discard) of this machine: the connection is refused at once.
-    done = make(
-        'demo', f'PYTHON={BASE_PYTHON}', cwd=bare_clone, PIP_INDEX_URL='http://127.0.0.1:9/',
-        PIP_CONFIG_FILE=os.devnull, PIP_RETRIES='1', PIP_FIND_LINKS='',
-    )
-    assert 'connect to the network' in one_line_of_ours(done)
+    offline = {'PIP_INDEX_URL': 'http://127.0.0.1:9/', 'PIP_CONFIG_FILE': os.devnull,
+               'PIP_RETRIES': '1', 'PIP_FIND_LINKS': ''}
+    for python, environment, words in (
+        ('PYTHON=python3.99', {}, ["no 'python3.99' here", 'make ... PYTHON=']),
+        (f'PYTHON={old}', {}, ['is older than Python 3.10']),
+        (base, {'ROS_DISTRO': 'humble'}, ['ROS_DISTRO=humble', 'jazzy']),
+        (base, {'ROS_DISTRO': 'jazzy'}, ['cannot import rclpy']),
+        (base, offline, ['connect to the network']),
+    ):
+        line = one_line_of_ours(make('demo', python, cwd=bare_clone, **environment))
+        for word in words:
+            assert word in line
     assert not (bare_clone / '.venv' / 'backlash_ros.json').exists()
-
-
-def test_make_test_runs_the_linters_and_passes_arguments_on(bare_clone: Path) -> None:
-    done = make('--dry-run', 'test', 'ARGS=-x test/system/test_make.py', cwd=bare_clone)
+    done = make('--dry-run', 'test', 'ARGS=-x test/unit', cwd=bare_clone)
     modules = [line.split('-m ', 1)[1] for line in done.stdout.splitlines() if ' -m ' in line]
     assert [module.split()[0] for module in modules] == ['ruff', 'mypy', 'pytest']
-    assert modules[-1].endswith(' -x test/system/test_make.py')
+    assert modules[-1].endswith(' -x test/unit')

@@ -94,7 +94,7 @@ def switched(driver: PacedDriver, key: str, value: str) -> Callable[[], bool]:
     return lambda: driver.text(key) == value
 
 
-def test_a_controller_is_shown_and_obeys_the_keys(tmp_path: Path) -> None:
+def test_controllers_are_shown_and_the_selected_one_obeys_the_keys(tmp_path: Path) -> None:
     saved = tmp_path / 'estimates.json'
     with ros_world(tmp_path) as world, screen_of(world) as screen:
         controller, driver = controller_and_driver(world, **{'estimates.file': str(saved)})
@@ -123,6 +123,18 @@ def test_a_controller_is_shown_and_obeys_the_keys(tmp_path: Path) -> None:
         driver.run_until(
             lambda: isnan(driver.estimates[-1].data[4]) and driver.error() > 0.1, 'the reset'
         )
+        pan = world.start('controller', None, '--ros-args', '-r', '__ns:=/pan')
+        driver.run_until(
+            lambda: all(name in screen.frame() for name in ('> /controller', ' /pan/controller')),
+            'both',
+        )
+        screen.press('\t')
+        driver.run_until(lambda: '> /pan/controller' in screen.frame(), 'the other one')
+        driver.run_until(lambda: 'no diagnostics yet' not in screen.frame(), 'its diagnostics')
+        # Nothing is asked of a controller before its services are found.
+        driver.run_until(
+            lambda: screen.press('c') or 'the gap is' in pan.stderr, 'its answer'
+        )
         screen.press('q')
         assert screen.wait() == 0
         assert screen.restored
@@ -148,26 +160,6 @@ def test_ctrl_c_ends_it_while_it_waits_and_leaves_the_terminal_as_it_was(tmp_pat
         assert 'Traceback' not in screen.output
 
 
-def test_of_several_controllers_the_selected_one_obeys(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world, screen_of(world) as screen:
-        _, driver = controller_and_driver(world)
-        pan = world.start('controller', None, '--ros-args', '-r', '__ns:=/pan')
-        driver.run_until(
-            lambda: all(name in screen.frame() for name in ('> /controller', ' /pan/controller')),
-            'both',
-        )
-        screen.press('\t')
-        driver.run_until(lambda: '> /pan/controller' in screen.frame(), 'the other one')
-        driver.run_until(lambda: 'no diagnostics yet' not in screen.frame(), 'its diagnostics')
-        # Nothing is asked of a controller before its services are found.
-        driver.run_until(
-            lambda: screen.press('c') or '/pan/controller: the gap is' in screen.frame(),
-            'its answer',
-        )
-        assert 'the gap is' in pan.stderr
-        assert driver.text('compensating') == 'True'
-
-
 def test_without_a_terminal_it_prints_plain_lines_until_a_signal(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
         monitor = world.start(MODULE)
@@ -182,32 +174,3 @@ def test_without_a_terminal_it_prints_plain_lines_until_a_signal(tmp_path: Path)
         assert '\x1b' not in monitor.stdout
         assert monitor.stop() == 0
         assert monitor.stderr == ''
-
-
-def test_a_pipe_that_is_closed_ends_it_quietly(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        monitor = subprocess.Popen(
-            COMMAND, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=world.environment
-        )
-        assert monitor.stdout is not None
-        assert monitor.stderr is not None
-        try:
-            assert monitor.stdout.readline().startswith(b'waiting for a controller')
-            monitor.stdout.close()
-            assert monitor.wait(DEADLINE_S) == 0
-            assert monitor.stderr.read() == b''
-        finally:
-            if monitor.poll() is None:
-                monitor.kill()
-                monitor.wait()
-            monitor.stderr.close()
-
-
-def test_an_unknown_option_is_one_line(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        done = subprocess.run(
-            [*COMMAND, '--nonsense'], capture_output=True, text=True, env=world.environment
-        )
-    assert done.returncode == 2
-    assert done.stderr.startswith('monitor: unrecognized arguments: --nonsense')
-    assert len(done.stderr.splitlines()) == 1

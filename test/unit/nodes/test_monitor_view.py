@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from backlash_ros.nodes.monitor.command import main
 from backlash_ros.nodes.monitor.state import ControllerState
 from backlash_ros.nodes.monitor.view import BLOCKS, axis_end, bar, plain_line, screen
 
@@ -128,3 +129,12 @@ def test_a_plain_line_says_the_same_in_short() -> None:
         '/controller: tracking; m 1.3 ± 0.2, c_r 3 ± 0.4, c_l -3; '
         'excitation 4.25, latency 0.912 ms, lost 5'
     )
+
+
+def test_an_unknown_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(['--nonsense'])
+    assert left.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith('monitor: unrecognized arguments: --nonsense')
+    assert len(said.splitlines()) == 1
