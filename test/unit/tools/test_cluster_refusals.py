@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from backlash_ros.tools.simulate import cluster as tools_cluster
-from backlash_ros.tools.simulate.command import main
+from backlash_ros.tools import cluster as tools_cluster
+from backlash_ros.tools.simulate import main
 
 HERE = '127.0.0.1'
 RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
