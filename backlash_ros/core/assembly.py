@@ -140,6 +140,11 @@ def _check_first_guess(p: Parameters) -> None:
                 f'estimator.initial.{name}', value, f'must lie within [{low:g}, {high:g}]',
                 f'change it or estimator.bounds.{name}',
             )
+    c_r, c_l = p.get_float('estimator.initial.c_r'), p.get_float('estimator.initial.c_l')
+    if c_l > c_r:
+        raise ParameterError(
+            'estimator.initial.c_l', c_l, f'must be <= estimator.initial.c_r={c_r!r}'
+        )
     low, high = p.get_pair('proportional.bounds')
     if low >= high:
         raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')
@@ -171,6 +176,16 @@ def _bounds(p: Parameters) -> Bounds:
     )
 
 
+def _bounds_around_zero(p: Parameters) -> Bounds:
+    """The bounds for laws that take c_l < 0 < c_r for granted, unless they are told otherwise."""
+    bounds = _bounds(p)
+    (low_r, high_r), (low_l, high_l) = bounds.c_r, bounds.c_l
+    return replace(
+        bounds, c_r=(max(low_r, 0.0) if high_r > 0.0 else low_r, high_r),
+        c_l=(low_l, min(high_l, 0.0) if low_l < 0.0 else high_l),
+    )
+
+
 def _reconstruction(p: Parameters) -> InputReconstruction:
     return InputReconstruction(
         build_model(p), p.get_float('estimator.output_noise_std'), p.get_int('estimator.lag'),
@@ -195,13 +210,15 @@ def _moving_horizon(p: Parameters, initial: Estimate) -> Law:
 
 def _lms(p: Parameters, initial: Estimate) -> Law:
     return NormalisedLms(
-        initial, _bounds(p), p.get_pair('proportional.bounds'), _reconstruction(p),
+        initial, _bounds_around_zero(p), p.get_pair('proportional.bounds'), _reconstruction(p),
         p.get_float('lms.step'), p.get_float('lms.step_f'),
     )
 
 
 def _printed(p: Parameters, initial: Estimate) -> Law:
-    return PrintedLaw(initial, _bounds(p), p.get_pair('proportional.bounds'), _reconstruction(p))
+    return PrintedLaw(
+        initial, _bounds_around_zero(p), p.get_pair('proportional.bounds'), _reconstruction(p)
+    )
 
 
 def _fixed(p: Parameters, initial: Estimate) -> Law:
@@ -219,7 +236,7 @@ def law_fits(law: str, structure: str) -> bool:
 def _gradient(p: Parameters, initial: Estimate) -> Law:
     blocks = build_four_blocks(p)
     return GradientEstimator(
-        initial, _bounds(p), blocks, p.get_float('gradient.step'),
+        initial, _bounds_around_zero(p), blocks, p.get_float('gradient.step'),
         p.get_float('estimator.output_noise_std'),
     )
 

@@ -53,11 +53,14 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Projection intervals (low, high) of the estimates; 0 < m, c_l <= 0 <= c_r."""
+    """Projection intervals (low, high) of the estimates; 0 < m, c_l <= c_r.
+
+    A constant offset moves both crossings, which may then lie on the same side of 0.
+    """
 
     m: tuple[float, float] = (0.01, 100.0)
-    c_r: tuple[float, float] = (0.0, 100.0)
-    c_l: tuple[float, float] = (-100.0, 0.0)
+    c_r: tuple[float, float] = (-100.0, 100.0)
+    c_l: tuple[float, float] = (-100.0, 100.0)
 
     def __post_init__(self) -> None:
         for name, (low, high) in (('m', self.m), ('c_r', self.c_r), ('c_l', self.c_l)):
@@ -67,15 +70,19 @@ class Bounds:
                 )
         if not self.m[0] > 0.0:
             raise ParameterError('estimator.bounds.m', list(self.m), 'must have low > 0')
-        if self.c_r[0] < 0.0:
-            raise ParameterError('estimator.bounds.c_r', list(self.c_r), 'must have low >= 0')
-        if self.c_l[1] > 0.0:
-            raise ParameterError('estimator.bounds.c_l', list(self.c_l), 'must have high <= 0')
+        if not self.c_l[0] < self.c_r[1]:
+            raise ParameterError(
+                'estimator.bounds.c_l', list(self.c_l),
+                f'must have low < {self.c_r[1]:g}, the largest c_r',
+            )
 
     def project(self, m: float, c_r: float, c_l: float) -> tuple[float, float, float]:
-        """Nearest (m, c_r, c_l) inside the bounds."""
-        return (
-            min(max(m, self.m[0]), self.m[1]),
-            min(max(c_r, self.c_r[0]), self.c_r[1]),
-            min(max(c_l, self.c_l[0]), self.c_l[1]),
-        )
+        """(m, c_r, c_l) inside the bounds, and c_l at c_r where it would lie to the right of it."""
+        m = min(max(m, self.m[0]), self.m[1])
+        c_r = min(max(c_r, self.c_r[0]), self.c_r[1])
+        c_l = min(max(c_l, self.c_l[0]), self.c_l[1])
+        if c_l > c_r:
+            middle = 0.5 * (c_l + c_r)
+            c_r = min(max(middle, self.c_r[0], self.c_l[0]), self.c_r[1])
+            c_l = min(c_r, self.c_l[1])
+        return m, c_r, c_l

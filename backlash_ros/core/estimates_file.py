@@ -19,7 +19,6 @@ WITHOUT_DEVIATIONS = ('lms', 'printed', 'gradient')
 KEY = (
     LAW,
     'sample_period', 'plant.numerator', 'plant.denominator', 'control.delay_samples',
-    'estimator.bounds.m', 'estimator.bounds.c_r', 'estimator.bounds.c_l',
 )
 NEEDED, DEVIATIONS = ('m', 'c_r', 'c_l', 'f'), ('std_m', 'std_c_r', 'std_c_l')
 
@@ -118,6 +117,11 @@ def _checked(name: str, estimate: Estimate, p: Parameters) -> Estimate:
                 f'has {part}={getattr(estimate, part)!r} outside of estimator.bounds.{part}',
                 'delete it',
             )
+    if estimate.c_l > estimate.c_r:
+        raise ParameterError(
+            'estimates.file', name, f'has c_l={estimate.c_l!r} above c_r={estimate.c_r!r}',
+            'delete it',
+        )
     if not all(getattr(estimate, part) >= 0.0 for part in DEVIATIONS):
         return replace(estimate, std_m=nan, std_c_r=nan, std_c_l=nan)
     return estimate

@@ -51,7 +51,7 @@ def identified_parameters(
         name: value for name, value in given.items()
         if not name.startswith(SIMULATED) and not name.startswith(OF_ONE_RUN)
     }
-    scale = WIDER * max(found.gap, found.c_r, -found.c_l)
+    scale = float(f'{max(WIDER * max(found.gap, found.c_r, -found.c_l), 1e-9):.3g}')
     values.update({
         'sample_period': found.sample_period,
         'plant.numerator': found.numerator,
@@ -59,11 +59,10 @@ def identified_parameters(
         'plant.uncertainty': found.uncertainty,
         'control.delay_samples': found.delay,
         'estimator.initial.m': found.m,
-        'estimator.initial.c_r': float(f'{max(found.c_r, 0.0):.6g}'),
-        'estimator.initial.c_l': float(f'{min(found.c_l, 0.0):.6g}'),
+        'estimator.initial.c_r': float(f'{found.c_r:.6g}'),
+        'estimator.initial.c_l': float(f'{found.c_l:.6g}'),
         'estimator.bounds.m': (float(f'{found.m / WIDER:.3g}'), float(f'{found.m * WIDER:.3g}')),
-        'estimator.bounds.c_r': (0.0, float(f'{max(scale, 1e-9):.3g}')),
-        'estimator.bounds.c_l': (float(f'{-max(scale, 1e-9):.3g}'), 0.0),
+        'estimator.bounds.c_r': (-scale, scale), 'estimator.bounds.c_l': (-scale, scale),
         'estimator.output_noise_std': float(f'{max(found.noise_std, 1e-12):.3g}'),
         # The simulated plant is the one that was found, so that the file can be tried out.
         'backlash.m': found.m,

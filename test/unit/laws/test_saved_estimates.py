@@ -64,7 +64,6 @@ def test_nothing_is_loaded_unless_asked_or_before_it_was_saved(tmp_path: Path) -
         ('sample_period', 0.02),
         ('plant.numerator', [1e-5, 4e-5, 2e-5]),
         ('control.delay_samples', 1),
-        ('estimator.bounds.c_r', [0.0, 50.0]),
         ('estimator.law', 'lms'),
     ],
 )
@@ -140,8 +139,8 @@ def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, content: str) 
 
 @pytest.mark.parametrize(
     ('part', 'value', 'reason'),
-    [('m', 1000.0, 'outside of estimator.bounds.m'), ('c_r', -1.0, 'outside'),
-     ('c_l', None, 'no finite c_l')],
+    [('m', 1000.0, 'outside of estimator.bounds.m'), ('c_r', -1000.0, 'outside'),
+     ('c_r', -4.0, 'c_l=-3.5 above c_r=-4.0'), ('c_l', None, 'no finite c_l')],
 )
 def test_values_that_cannot_be_are_refused(
     tmp_path: Path, part: str, value: float | None, reason: str,

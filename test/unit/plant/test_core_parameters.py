@@ -253,6 +253,7 @@ def test_message_names_parameter_value_rule_and_unit() -> None:
         ({'estimator.bounds.m': [2.0, 1.0]}, 'estimator.bounds.m'),
         ({'estimator.bounds.c_r': [2.0, 2.0]}, 'estimator.bounds.c_r'),
         ({'estimator.bounds.c_l': [-1.0, -2.0]}, 'estimator.bounds.c_l'),
+        ({'estimator.initial.c_l': 1.0}, 'estimator.initial.c_l'),
         ({'proportional.bounds': [0.5, -0.5]}, 'proportional.bounds'),
         ({'estimator.initial.m': 3.0, 'estimator.bounds.m': [0.1, 2.0]}, 'estimator.initial.m'),
         ({'estimator.initial.c_r': 6.0, 'estimator.bounds.c_r': [0.0, 5.0]},
