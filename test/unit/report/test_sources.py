@@ -1,0 +1,71 @@
+"""Whatever holds a run is read: bags of any storage and compression, lone files of them."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_bags import PARAMETERS, write_bag
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools.config import write_config
+from backlash_ros.tools.records.reading import read_record
+from backlash_ros.tools.replay import command as replay
+from backlash_ros.tools.runs.source import read_run
+
+
+@pytest.fixture(scope='module')
+def run() -> RunRecord:
+    return build_closed_loop(PARAMETERS).run(60)
+
+
+@pytest.mark.parametrize('storage', StoragePlugin)
+def test_a_lone_file_of_a_bag_is_a_bag(
+    tmp_path: Path, run: RunRecord, storage: StoragePlugin,
+) -> None:
+    bag = write_bag(tmp_path / 'bag', run, storage)
+    (file,) = (file for file in bag.iterdir() if file.suffix in ('.mcap', '.db3'))
+    lone = Path(shutil.copy(file, tmp_path / f'sent{file.suffix}'))
+    write_config(PARAMETERS, tmp_path / 'parameters.yaml')
+    found = read_run(lone)
+    assert found.notes == ()
+    assert found.parameters == PARAMETERS
+    np.testing.assert_array_equal(found.record.column('y'), run.column('y'))
+    np.testing.assert_array_equal(read_record(lone).y, run.column('y'))
+    assert replay.main([str(lone), '--sweep', 'estimator.law=lms,fixed',
+                        '--out', str(tmp_path / 'out')]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        'bag', 'out', 'parameters.yaml', lone.name,
+    ]
+
+
+def test_a_bag_of_which_only_the_metadata_are_gone_is_whole(tmp_path: Path, run: RunRecord) -> None:
+    bag = write_bag(tmp_path / 'bag', run)
+    (bag / 'metadata.yaml').unlink()
+    assert read_run(bag).record.samples == run.samples
+
+
+def test_metadata_of_a_later_rosbag2_are_no_obstacle(tmp_path: Path, run: RunRecord) -> None:
+    bag = write_bag(tmp_path / 'bag', run)
+    metadata = bag / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('version: 9', 'version: 99'))
+    assert read_run(bag).record.samples == run.samples
+
+
+def test_compressed_chunks_are_read(
+    tmp_path: Path, run: RunRecord, monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    opened = Writer.open
+
+    def open_compressed(writer: Writer) -> None:
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        opened(writer)
+
+    monkeypatch.setattr(Writer, 'open', open_compressed)
+    bag = write_bag(tmp_path / 'bag', run)
+    assert b'zstd' in next(bag.glob('*.mcap')).read_bytes()
+    np.testing.assert_array_equal(read_run(bag).record.column('v'), run.column('v'))
