@@ -309,7 +309,10 @@ def _flatten(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[
 
 
 class _Dumper(yaml.SafeDumper):
-    """SafeDumper that writes each list on one line."""
+    """SafeDumper that writes each list on one line, and in full: rcl knows no aliases."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
 
 
 def _on_one_line(dumper: yaml.SafeDumper, values: Sequence[Any]) -> yaml.Node:

@@ -283,3 +283,11 @@ def test_one_of_several_axes_must_be_chosen_by_its_name(config: Path) -> None:
         effective_parameters(config, axis='z')
     with pytest.raises(InputError, match="--set z/seed: there is no axis 'z' among x, y"):
         effective_parameters(config, ['z/seed=1'], axis='x')
+
+
+def test_equal_lists_are_written_in_full_as_rcl_wants_them(tmp_path: Path) -> None:
+    write_config(Parameters(), tmp_path / 'parameters.yaml')
+    text = (tmp_path / 'parameters.yaml').read_text()
+    assert text.count('[0.0, 0.0, 0.0]') > 1
+    assert '&' not in text
+    assert ' *' not in text
