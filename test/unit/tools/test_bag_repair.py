@@ -27,6 +27,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from backlash_ros.bags.reading import BagError, BagReader
 from backlash_ros.bags.repair import damage, repair, repair_command
 from backlash_ros.bags.writer import STORAGE, Bag
+from backlash_ros.nodes import recorder
 
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 CDR = b'\x00\x01\x00\x00'
@@ -378,3 +379,20 @@ def test_second_repair_keeps_both_originals(
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         'mcap_bag', 'mcap_bag.damaged', 'mcap_bag.damaged.1',
     ]
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (['--repair', '/nowhere/bag'], '/nowhere/bag: does not exist'),
+    (['--repair', str(ROOT)], 'holds no .mcap and no .db3 file'),
+    (['--repair'], '--repair needs the folder of a bag'),
+])
+def test_repair_of_what_is_no_bag_is_bad_input(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: list[str],
+    words: str,
+) -> None:
+    monkeypatch.setattr(signal, 'signal', lambda number, handler: None)  # that of the tests stays
+    assert recorder.main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ''
+    assert words in said.err
+    assert said.err.count('\n') == 1
