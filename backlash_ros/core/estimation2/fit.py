@@ -22,11 +22,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
-from scipy.signal import lfilter
 
 from backlash_ros.core.estimation2.plant_family import PlantFamily
 from backlash_ros.core.estimation2.play import LEFT, NEITHER, Sides, engaged, play, reversals
 from backlash_ros.core.estimation2.reading import independence, step_of, told
+from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
@@ -453,7 +453,7 @@ def filtered(b: list[float], a: list[float], u: Array, x: Array) -> tuple[Array,
     state = np.zeros(len(a) - 1)
     length = min(len(state), len(x))
     state[:length] = x[:length]
-    return lfilter(b, a, u, zi=state)  # type: ignore[no-any-return]
+    return lfilter(b, a, u, zi=state)
 
 
 def state_columns(a: list[float], count: int) -> Array:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation2.explanations import Record
@@ -24,6 +23,7 @@ from backlash_ros.core.estimation2.settings import GATE, OUTLIERS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
+from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 

@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core.estimation2.fit import state_columns
 from backlash_ros.core.estimation2.plant_family import PlantFamily
 from backlash_ros.core.estimation2.play import plays
 from backlash_ros.core.estimation2.settings import ROWS
+from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 
 from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.actuator import Actuator
+from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]

@@ -22,7 +22,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core.identification.output_error import (
     Fit,
@@ -33,6 +32,7 @@ from backlash_ros.core.identification.output_error import (
     squares_of,
 )
 from backlash_ros.core.identification.starting_models import steiglitz_mcbride
+from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 

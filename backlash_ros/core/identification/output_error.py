@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.signal import lfilter
 
 from backlash_ros.core.identification.play_record import PlayOutput, PlayRecord
+from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,6 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
-from scipy.signal import lfilter
 
 from backlash_ros.core.identification.output_error import (
     SINGULAR,
@@ -20,6 +19,7 @@ from backlash_ros.core.identification.output_error import (
     full_denominator,
     solve_linear,
 )
+from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import GAPS, NO_GAP, STARTS, ZOOM
 from backlash_ros.core.estimation.fit.pace import Pace
@@ -22,6 +21,7 @@ from backlash_ros.core.estimation.regression.error_model import ErrorFilter, Err
 from backlash_ros.core.estimation.regression.play import plays
 from backlash_ros.core.estimation.regression.posterior import NOISE_WEIGHT, RATIOS
 from backlash_ros.core.estimation.regression.regressors import held
+from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]

@@ -27,7 +27,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import GATE, ODDS
 from backlash_ros.core.estimation.fit.pace import Pace
@@ -38,6 +37,7 @@ from backlash_ros.core.estimation.observer.observer import RATIOS, gain_of
 from backlash_ros.core.estimation.regression.play import play
 from backlash_ros.core.estimation.regression.residuals import bulk_std
 from backlash_ros.core.estimation.regression.resolution import resolution_of
+from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]

@@ -25,10 +25,10 @@ from math import floor, log
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.constants import LEAK
 from backlash_ros.core.estimation.regression.pole_places import PolePlaces
+from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.model_check import ON_CIRCLE
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -192,7 +192,7 @@ class ErrorFilter:
             (b, model.denominator, np.zeros((signals, max(len(b), model.order + 1) - 1)))
             for b in numerators
         ]
-        self._once = np.zeros((signals, error.taps))
+        self._once: Array = np.zeros((signals, error.taps))
         self._past: Array = np.zeros((signals, max(error.taps - 1, 0)))
 
     def responses(self, moves: Array) -> Array:

@@ -26,10 +26,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.regression.error_model import ErrorFilter, ErrorModel
 from backlash_ros.core.estimation.regression.play import Labels
+from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
