@@ -21,6 +21,8 @@ from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
+from backlash_ros.core.estimation2.estimator import fitted
+from backlash_ros.core.estimation2.executor import Executor, InlineExecutor
 from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator
@@ -42,11 +44,13 @@ from backlash_ros.core.scenario import (
 )
 
 __all__ = [
-    'ESTIMATORS', 'STRUCTURES', 'build_controller', 'build_four_blocks', 'build_limits',
-    'build_model', 'build_plant', 'build_reference', 'build_state_model', 'build_structure',
-    'build_true_model', 'first_guess', 'known_before', 'law_fits', 'warnings_of',
+    'ESTIMATORS', 'STRUCTURES', 'WORKER_MODULES', 'build_controller', 'build_four_blocks',
+    'build_limits', 'build_model', 'build_plant', 'build_reference', 'build_state_model',
+    'build_structure', 'build_true_model', 'first_guess', 'known_before', 'law_fits', 'warnings_of',
 ]
 
+# What a process imports that makes fits.
+WORKER_MODULES = (fitted.__module__,)
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
 # Laws that belong to one structure, and why.
@@ -79,12 +83,14 @@ def known_before(p: Parameters) -> Estimate:
     return load_estimate(p) or first_guess(p)
 
 
-def build_controller(p: Parameters, estimate: Estimate | None = None) -> AdaptiveController:
+def build_controller(
+    p: Parameters, estimate: Estimate | None = None, executor: Executor | None = None,
+) -> AdaptiveController:
     """The controller with the law and the structure that the parameters name.
 
-    estimate: to begin with, None for those that were known before. Raises ParameterError for
-    parameters that contradict each other and for a G(z) through which the backlash cannot be
-    learned.
+    estimate: to begin with, None for those that were known before. executor: where fits are made,
+    None for here. Raises ParameterError for parameters that contradict each other and for a G(z)
+    through which the backlash cannot be learned.
     """
     check_model(build_model(p))
     _check_first_guess(p)
@@ -94,7 +100,9 @@ def build_controller(p: Parameters, estimate: Estimate | None = None) -> Adaptiv
         p.get_float('inverse.direction_band'), p.get_float('inverse.take_up_rate') * period
     )
     _check_structure(p)
-    estimator = ESTIMATORS[p.get_str('estimator.law')](p, estimate or known_before(p))
+    estimator = ESTIMATORS[p.get_str('estimator.law')](
+        p, estimate or known_before(p), executor or InlineExecutor()
+    )
     return AdaptiveController(
         estimator, build_structure(p), inverse, build_limits(p), p.get_bool('plant.adapt'),
         _serial(p),
@@ -193,7 +201,7 @@ def _reconstruction(p: Parameters) -> InputReconstruction:
     )
 
 
-def _moving_horizon(p: Parameters, initial: Estimate) -> Law:
+def _moving_horizon(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     observer = None
     if p.get_str('structure') != 'proportional':
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
@@ -208,20 +216,20 @@ def _moving_horizon(p: Parameters, initial: Estimate) -> Law:
     )
 
 
-def _lms(p: Parameters, initial: Estimate) -> Law:
+def _lms(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     return NormalisedLms(
         initial, _bounds_around_zero(p), p.get_pair('proportional.bounds'), _reconstruction(p),
         p.get_float('lms.step'), p.get_float('lms.step_f'),
     )
 
 
-def _printed(p: Parameters, initial: Estimate) -> Law:
+def _printed(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     return PrintedLaw(
         initial, _bounds_around_zero(p), p.get_pair('proportional.bounds'), _reconstruction(p)
     )
 
 
-def _fixed(p: Parameters, initial: Estimate) -> Law:
+def _fixed(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     return FixedBacklash(
         initial, build_state_model(p), p.get_float('estimator.output_noise_std'),
         p.get_float('fixed.doubt'),
@@ -233,7 +241,7 @@ def law_fits(law: str, structure: str) -> bool:
     return ONLY_IN.get(law, structure) == structure
 
 
-def _gradient(p: Parameters, initial: Estimate) -> Law:
+def _gradient(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     blocks = build_four_blocks(p)
     return GradientEstimator(
         initial, _bounds_around_zero(p), blocks, p.get_float('gradient.step'),
@@ -276,7 +284,7 @@ def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -
     return StateModel(TransferFunction(numerator, denominator))
 
 
-ESTIMATORS: dict[str, Callable[[Parameters, Estimate], Law]] = {
+ESTIMATORS: dict[str, Callable[[Parameters, Estimate, Executor], Law]] = {
     'moving_horizon': _moving_horizon, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
     'gradient': _gradient,
 }

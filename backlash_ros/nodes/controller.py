@@ -14,10 +14,18 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.core.assembly import build_controller, first_guess, known_before, warnings_of
+from backlash_ros.core.assembly import (
+    WORKER_MODULES,
+    build_controller,
+    first_guess,
+    known_before,
+    warnings_of,
+)
 from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimates_file import worth_saving
+from backlash_ros.core.estimation2.executor import Executor, InlineExecutor
+from backlash_ros.core.estimation2.worker import WorkerExecutor
 from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import Finding, Level
@@ -71,6 +79,10 @@ class ControllerNode(ManagedNode):
             self.log.warning(warning)
         self.loop: ControlLoop | None = None  # None while unconfigured
         self._lockstep = p.get_bool('lockstep')
+        # A fit that shared the process of the loop would hold up its commands.
+        self._executor: Executor = (
+            InlineExecutor() if self._lockstep else WorkerExecutor(WORKER_MODULES)
+        )
         self._behind = 0  # outputs in a row that were answered after the next one had come
         self._io = DriverIo(self, p)
         # Whoever waits for the others begins with them; who does not may have been restarted.
@@ -147,7 +159,7 @@ class ControllerNode(ManagedNode):
         before = known_before(p)
         self.loop = ControlLoop(
             p, self._io.publish, self._io.now_ns, before, self._counter,
-            self._first_command.v_at_start(p), self._new_reports,
+            self._first_command.v_at_start(p), self._new_reports, self._executor,
         )
         self._model.publish(self.loop)
         if before.learned:
@@ -205,6 +217,8 @@ class ControllerNode(ManagedNode):
     def cleanup(self) -> None:
         if self.loop is not None and self.loop.knows_v:
             self._first_command.before = self.loop.v
+        if self.loop is not None:
+            self.loop.close()
         self.loop = None
         self._diagnose()
 
@@ -212,6 +226,7 @@ class ControllerNode(ManagedNode):
         super().finish()
         self._rivals.close()
         self._saver.close()
+        self._executor.close()
         if self.loop is not None:
             self.log.info(', '.join(
                 f'{key}: {count}' for key, count in counts_of(self.loop).items()

@@ -135,6 +135,10 @@ class AdaptiveController:
         """The command at which the motor rests at a v that was reported."""
         return v if self._serial is None else self._serial.command_of(v)
 
+    def close(self) -> None:
+        """Give back what the estimator holds elsewhere."""
+        self.estimator.close()
+
     def start_from(self, v: float) -> None:
         """Say which command acts now, so that the first one goes on from there."""
         if v != self.motion.v:

@@ -31,7 +31,7 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     """
     causes = [
         *_unfit_peers(f), *_bad_numbers(f), *_second_senders(f), *_silence(f), *_timing(f),
-        *_reference(f), *_actuator(f),
+        *_reference(f), *_actuator(f), *_worker(f),
     ]
     state = _state(f, causes)
     found = causes
@@ -302,6 +302,16 @@ def _actuator(f: LoopFigures) -> list[Finding]:
             'without applied_control just before them',
         ))
     return found
+
+
+def _worker(f: LoopFigures) -> list[Finding]:
+    if not f.dead_workers:
+        return []
+    died = 'died lately' if f.dead_workers == 1 else f'died {f.dead_workers} times lately'
+    return [Finding(
+        Level.WARN, 'worker', f'the process that makes the fits {died}; v is not affected: '
+        'check the memory',
+    )]
 
 
 def _percent(count: int, of: int) -> str:

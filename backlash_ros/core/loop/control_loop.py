@@ -18,6 +18,7 @@ from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.limits import Motion, at_rest, plausible
 from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimation2.executor import Executor, InlineExecutor
 from backlash_ros.core.law import Interval
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
@@ -51,15 +52,16 @@ class ControlLoop:
     send: takes v to the driver. now_ns: the clock of the stamps. estimate: to begin with, None for
     what was known before. counter: goes on counting where another loop has ended. v: the newest
     command, 0 as long as nobody knows (knows_v) which one acts. reports: v and stamp [ns] of what
-    the driver has reported since the last call. told: G(z) as the parameters have it.
-    silent: the driver was given up for the time being. standing_down: another controller commands
-    the actuator, so nothing is sent.
+    the driver has reported since the last call. executor: where fits are made, None for here.
+    told: G(z) as the parameters have it. silent: the driver was given up for the time being.
+    standing_down: another controller commands the actuator, so nothing is sent.
     """
 
     def __init__(
         self, p: Parameters, send: Callable[[float], None], now_ns: Callable[[], int],
         estimate: Estimate | None, counter: SampleCounter, v: float | None = None,
         reports: Callable[[], Iterable[tuple[float, int]]] = tuple,
+        executor: Executor | None = None,
     ) -> None:
         self.statistics = LoopStatistics()
         self.counter = counter
@@ -79,7 +81,8 @@ class ControlLoop:
         self._unnoted: tuple[Output, bool] | None = None  # the newest one, whether it is a sample
         self._sent: _Sent | None = None  # the newest command, until it is noted
         self._other_ns = 0  # when another controller was last heard to command
-        self.core = build_controller(p, estimate)
+        self.executor = executor or InlineExecutor()
+        self.core = build_controller(p, estimate, self.executor)
         self.told = build_model(p)
 
     @property
@@ -92,8 +95,10 @@ class ControlLoop:
 
         Nothing is known of the state of the plant then.
         """
-        before, self.core = self.core, build_controller(self._p, estimate)
+        before = self.core
+        self.core = build_controller(self._p, estimate, self.executor)
         self.core.go_on_from(before)
+        before.close()
         self.core.compensating = self.compensating
         self.core.estimator.adapting = self.adapting
         self._begun, self._missing = False, 0
@@ -101,6 +106,10 @@ class ControlLoop:
     def reset(self) -> None:
         """Begin with the estimates of estimator.initial."""
         self.renew(first_guess(self._p))
+
+    def close(self) -> None:
+        """Give back what it holds elsewhere; it answers no more."""
+        self.core.close()
 
     def adapt(self, adapting: bool) -> None:
         """Learn, or hold the estimates."""

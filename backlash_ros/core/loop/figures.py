@@ -96,6 +96,7 @@ class LoopFigures:
     bad_references: int = 0
     limited: int = 0
     unreported: int = 0
+    dead_workers: int = 0
     still: int = 0
     v_swing: float = 0.0
 

@@ -62,7 +62,7 @@ class Diagnosis:
             'lost': statistics.lost, 'unsent': statistics.unsent, 'late': loop.commands.late,
             'bad_outputs': statistics.bad_outputs,
             'bad_references': statistics.bad_references, 'limited': statistics.limited,
-            'unreported': loop.commands.unreported,
+            'unreported': loop.commands.unreported, 'dead_workers': loop.executor.restarts,
         }, time.monotonic())
         status = None if loop.last is None else loop.last.estimate.status
         if status != Status.INCONSISTENT:
@@ -183,6 +183,7 @@ def _of_the_fit(loop: ControlLoop) -> dict[str, object]:
         'outliers': report.outliers,
         'commands found to be late': report.reattributed,
         'failed fits': report.failed_fits,
+        'processes for fits that died': loop.executor.restarts,
         'G(z)': 'as told' if _same(learned.transfer_function, loop.told) else 'learned',
     }
 
