@@ -120,12 +120,11 @@ def test_each_cause_is_named_with_its_figure_and_its_cure(
     assert finding.level == level
 
 
-@pytest.mark.parametrize(('changes', 'level', 'text'), CASES, ids=IDS)
-def test_what_is_known_goes_before_the_model(
-    changes: dict[str, Any], level: Level, text: str,
-) -> None:
-    if 'status' not in changes:
-        assert first(replace(INCONSISTENT, **changes)).text.startswith(text)
+@pytest.mark.parametrize(('changes', 'text'), [
+    (changes, text) for changes, _, text in CASES if 'status' not in changes
+])
+def test_what_is_known_goes_before_the_model(changes: dict[str, Any], text: str) -> None:
+    assert first(replace(INCONSISTENT, **changes)).text.startswith(text)
 
 
 def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import subprocess
 import sys
 
@@ -12,7 +13,10 @@ import backlash_ros.core as core
 
 @pytest.mark.parametrize('name', core.__all__)
 def test_every_public_name_is_there(name: str) -> None:
-    assert getattr(core, name).__doc__
+    found = getattr(core, name)
+    assert found.__module__.startswith('backlash_ros.core.')
+    # That of a class without one would be its parent's.
+    assert vars(found).get('__doc__') or (inspect.isfunction(found) and found.__doc__)
 
 
 def test_unknown_names_are_refused() -> None:

@@ -70,7 +70,11 @@ def test_deviation_is_that_of_plants_drawn_from_the_posterior() -> None:
     difference[:2] = 1.0, -1.0
     shares = transform(answers(error, difference)) / model.response(POINTS)[:, None]
     squares = np.zeros(len(POINTS))
-    draws = rng.multivariate_normal(posterior.mean, cov, 2000)
+    # Rounding may have left it a little outside of the positive ones.
+    values, axes = np.linalg.eigh(0.5 * (cov + cov.T))
+    assert values.min() > -1e-9 * values.max()
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    draws = posterior.mean + rng.standard_normal((2000, len(values))) @ root.T
     for drawn in draws:
         m, e = drawn[layout.n + 1], drawn[layout.base:layout.base + layout.errors]
         # The record says m G (1 + Delta).
