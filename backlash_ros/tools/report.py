@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -33,7 +32,6 @@ from backlash_ros.tools.runs.analysis import (
     followed_reference,
     interesting_parts,
 )
-from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import (
     CONFIG,
     SUMMARY,
@@ -52,29 +50,14 @@ SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 UNITS = {'m': 'of u/v', 'c_r': 'of v', 'c_l': 'of v'}
 
 
-def report_bag(bag: Path, out: Path, parameters: Parameters) -> dict[str, Any]:
-    """Write report, figures, samples.csv and summary.json of a bag to out; return the summary.
-
-    Prints on stderr what is wrong with the bag. Raises InputError for one without a run.
-    """
-    run = read_bag(bag, parameters.get_float('sample_period'))
-    return write_report(replace(run, parameters=parameters), out)
-
-
-def report_run(record: RunRecord, out: Path, parameters: Parameters) -> dict[str, Any]:
-    """Write report, figures, samples.csv and summary.json of a simulation to out."""
-    return write_report(Run(record, parameters), out)
-
-
-def print_notes(tool: str, run: Run) -> None:
-    """Print on stderr what the user has to know about the source of a run."""
-    for note in run.notes:
-        print(f'{tool}: warning: {note}', file=sys.stderr)
-
-
 def write_report(run: Run, out: Path) -> dict[str, Any]:
-    """Write all files of a run to out; return the summary. Raises InputError for an empty one."""
-    print_notes('report', run)
+    """Write report, figures, samples.csv and summary.json of a run to out; return the summary.
+
+    Prints on stderr what the user has to know about the source. Raises InputError for a run without
+    samples.
+    """
+    for note in run.notes:
+        print(f'report: warning: {note}', file=sys.stderr)
     summary = summarise(run.record, run.parameters, run.latency_s)
     write_run(run.record, out)
     write_summary(summary, out / SUMMARY)

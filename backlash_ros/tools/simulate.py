@@ -23,7 +23,7 @@ from backlash_ros.tools.cli import DEFAULT_DURATION_S, NOTHING, InputError, form
 from backlash_ros.tools.cluster import run_on_cluster
 from backlash_ros.tools.config import effective_parameters, write_config
 from backlash_ros.tools.runs.files import CONFIG, result_directory, write_table
-from backlash_ros.tools.runs.run import run_loop
+from backlash_ros.tools.runs.run import Run, run_loop
 from backlash_ros.tools.runs.summary import estimate_table
 from backlash_ros.topics import BACKLASH
 
@@ -79,7 +79,7 @@ def _simulate(args: Sequence[str] | None) -> None:
 
 def _once(parameters: Parameters, duration: float | None, out: Path | None) -> None:
     # Drawing libraries take a second to load, which neither a worker nor bad input should cost.
-    from backlash_ros.tools.report import PAGE, report_run
+    from backlash_ros.tools.report import PAGE, write_report
     samples = cli.number_of_samples(parameters, duration)
     loop = build_closed_loop(parameters)
     cli.print_warnings('simulate', parameters)
@@ -88,7 +88,7 @@ def _once(parameters: Parameters, duration: float | None, out: Path | None) -> N
     with tqdm(total=samples, desc='simulate', unit='sample', disable=None) as bar:
         run = run_loop(loop, samples, lambda _: bar.update())
     directory = result_directory(out)
-    print(estimate_table(report_run(run, directory, parameters)))
+    print(estimate_table(write_report(Run(run, parameters), directory)))
     print(f'report: {directory / PAGE}')
 
 

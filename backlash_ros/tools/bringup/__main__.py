@@ -151,10 +151,11 @@ def report(axis: AxisPlan) -> bool:
         return True
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.bringup.watch import complain
-    from backlash_ros.tools.report import PAGE, report_bag
+    from backlash_ros.tools.report import PAGE, write_report
+    from backlash_ros.tools.runs.source import read_run
     from backlash_ros.tools.runs.summary import estimate_table
     try:
-        summary = report_bag(axis.bag, axis.out, axis.parameters)
+        summary = write_report(read_run(axis.bag), axis.out)
     except (InputError, OSError) as error:
         complain(axis.titled(f'no report: {error}'))
         return False

@@ -152,10 +152,11 @@ def _one(job: _Job, out: Path | None) -> None:
     from backlash_ros.atomic_file import write_atomically
     from backlash_ros.tools.figures import png
     from backlash_ros.tools.replay.replay_figure import draw_replay
-    from backlash_ros.tools.report import PAGE, report_run
+    from backlash_ros.tools.report import PAGE, write_report
     from backlash_ros.tools.runs.files import result_directory
+    from backlash_ros.tools.runs.run import Run
     directory = result_directory(out)
-    summary = report_run(replayed, directory, parameters)
+    summary = write_report(Run(replayed, parameters), directory)
     write_atomically(directory / FIGURE, png(draw_replay(recorded, replayed)))
     print(format_table(('', 'run', 'replay', '±'), _compared(recorded, summary)))
     print(_parted(recorded, replayed))

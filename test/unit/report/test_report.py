@@ -24,6 +24,7 @@ from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs import analysis
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import write_run, write_summary
+from backlash_ros.tools.runs.run import Run
 from backlash_ros.tools.runs.source import read_run
 from backlash_ros.tools.runs.summary import summarise
 
@@ -37,7 +38,9 @@ def run() -> RunRecord:
 def page(run: RunRecord, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a bag in which one sample was lost."""
     out = tmp_path_factory.mktemp('report')
-    report.report_bag(write_bag(out / 'bag', run, lost=frozenset({60})), out, PARAMETERS)
+    write_bag(out / 'bag', run, lost=frozenset({60}))
+    write_config(PARAMETERS, out / 'parameters.yaml')
+    report.write_report(read_run(out), out)
     return out / 'report.html'
 
 
@@ -76,7 +79,7 @@ def test_page_tells_what_is_known_of_the_fit(run: RunRecord, tmp_path: Path) -> 
     pages = {}
     for name, learned in (('known', believed_then), ('unknown', None)):
         (tmp_path / name).mkdir()
-        report.report_run(replace(run, learned=learned), tmp_path / name, PARAMETERS)
+        report.write_report(Run(replace(run, learned=learned), PARAMETERS), tmp_path / name)
         pages[name] = (tmp_path / name / 'report.html').read_text(encoding='utf-8')
     assert '<td>noise on y, learned / nominal</td><td>1.23</td>' in pages['known']
     assert '<td>unexplained motion of u</td><td>5.67 % of m times the gap</td>' in pages['known']
@@ -257,7 +260,7 @@ def test_file_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
     run = build_closed_loop(PARAMETERS).run(1)
-    assert report.report_run(run, tmp_path, PARAMETERS)['samples'] == 1
+    assert report.write_report(Run(run, PARAMETERS), tmp_path)['samples'] == 1
     assert (tmp_path / 'report.html').is_file()
 
 

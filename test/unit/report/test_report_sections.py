@@ -18,6 +18,7 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import Span
 from backlash_ros.tools.runs.bag import read_bag
+from backlash_ros.tools.runs.run import Run
 from backlash_ros.tools.runs.source import read_run
 
 PERIOD_NS = 10_000_000
@@ -148,7 +149,7 @@ def test_topics_of_others_with_the_same_ending_are_left_alone(
 
 @pytest.mark.usefixtures('undrawn')
 def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> None:
-    report.report_run(first, tmp_path, PARAMETERS)
+    report.write_report(Run(first, PARAMETERS), tmp_path)
     part = read_run(tmp_path, span=Span(0.5, 0.8)).record
     assert np.array_equal(part.column('y'), first.column('y')[50:80])
     assert part.column('t')[0] == 0.0
