@@ -19,14 +19,16 @@ class Record:
     """One motion on a uniform grid of sample_period [s], N samples.
 
     v (N,): acts from sample k to k+1, finite. y (N,): at k; nan where there is no reading of its
-    own: lost, or the one before it repeated. commands (N,): what led to v, where v is that of a
-    motor encoder; None where v is the command itself. timing: one sentence on what was done to the
-    stamps. notes: what else was done, a sentence each. source: where it is from.
+    own: lost, or the one before it repeated. quantum: step of the readings of y, 0 where they have
+    none; y that was moved onto the grid hides it. commands (N,): what led to v, where v is that of
+    a motor encoder; None where v is the command itself. timing: one sentence on what was done to
+    the stamps. notes: what else was done, a sentence each. source: where it is from.
     """
 
     v: Array
     y: Array
     sample_period: float
+    quantum: float = 0.0
     source: str = ''
     timing: str = ''
     notes: tuple[str, ...] = ()

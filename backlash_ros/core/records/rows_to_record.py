@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.limits import LARGEST
-from backlash_ros.core.records.readings import failed, held, unwrapped
+from backlash_ros.core.records.readings import failed, held, quantum, unwrapped
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows import in_order, in_seconds, typical_step
 from backlash_ros.core.records.timing import Rows, on_grid, seconds
@@ -57,15 +57,15 @@ def record_of(
         said.append(f'y repeats {per_row:.2g} times: {1.0 / repeated.period:.3g} Hz')
     grid = on_grid(Rows(times, v, y, own, commands), period)
     return usable(Record(
-        grid.v, grid.y, grid.period, timing='; '.join([grid.said, *said]), notes=tuple(notes),
-        commands=grid.commands,
+        grid.v, grid.y, grid.period, quantum(y), timing='; '.join([grid.said, *said]),
+        notes=tuple(notes), commands=grid.commands,
     ))
 
 
 def record_of_samples(t: Array, v: Array, y: Array, period: float) -> Record:
     """A record from samples (N,) of a run of this package, which have their true time t [s]."""
     grid = on_grid(Rows(t - t[0], v, y, np.isfinite(y)), period)
-    return usable(Record(grid.v, grid.y, grid.period, timing=grid.said))
+    return usable(Record(grid.v, grid.y, grid.period, quantum(y), timing=grid.said))
 
 
 def usable(record: Record) -> Record:

@@ -35,6 +35,7 @@ DECIDED = 0.05  # log of the roughness that tells late stamps from true ones
 FINER = (1, 2, 4)  # parts of a period
 HIDDEN, LEAST = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
 ROUNDING = 12.0**-0.5  # deviation of rounding to whole numbers
+TO_STD = 0.61  # of what 90 % of normal values stay within
 MOST_SHARED = 0.02  # share of the readings that may fall onto one instant
 LONGEST = 1_000_000  # samples of a grid
 SPARSE, LONG_BREAK = 20.0, 100.0  # samples per row, and periods of a gap that ends a stretch
@@ -302,10 +303,10 @@ def _true_instants(rows: Rows, period: float, said: str) -> Grid:
 
 
 def _moved_by(t: Array, y: Array, off: Array) -> float:
-    """How much y moves from its instants to others, root mean square."""
+    """How much y moves from its instants to others, a standard deviation but for steps."""
     if len(t) < 2:
         return 0.0
-    return float(np.sqrt(np.mean((np.gradient(y, t) * off)**2)))
+    return TO_STD * float(np.percentile(np.abs(np.gradient(y, t) * off), 90.0))
 
 
 def _bracketed(t: Array, y: Array, step: float) -> tuple[Numbers, Array]:
@@ -318,8 +319,10 @@ def _bracketed(t: Array, y: Array, step: float) -> tuple[Numbers, Array]:
 
 def averaged(t: Array, v: Array, step: float, count: int) -> Array:
     """v (M,), held from each t (M,) to the next, over each of `count` steps."""
-    area = np.append(0.0, np.cumsum(v[:-1] * np.diff(t)))
     edges = step * np.arange(count + 1)
-    row = np.clip(np.searchsorted(t, edges, side='right') - 1, 0, len(t) - 1)
-    integral = area[row] + v[row] * (edges - t[row])
-    return np.asarray(np.diff(integral) / step)
+    begin = np.clip(np.searchsorted(t, edges[:-1], side='right') - 1, 0, len(t) - 1)
+    # Each change counts for what is left of its step: where v rests it stays the same number.
+    changed = np.flatnonzero((t[1:] > edges[0]) & (t[1:] < edges[-1])) + 1
+    of_step = np.searchsorted(edges, t[changed], side='left') - 1
+    share = (v[changed] - v[changed - 1]) * (edges[of_step + 1] - t[changed]) / step
+    return np.asarray(v[begin] + np.bincount(of_step, share, count))

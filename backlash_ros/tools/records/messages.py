@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from backlash_ros import topics
 from backlash_ros.bags.reading import Topic
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
+from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows import in_order
 from backlash_ros.core.records.rows_to_record import record_of_samples, usable
@@ -114,7 +115,7 @@ def from_messages(
         f'{len(index)} messages of y, one every {seconds(step)}'
         + (f', {missing} missing' if missing else ''), *said,
     ])
-    return usable(Record(v, y, step, timing=timing, commands=sent_v))
+    return usable(Record(v, y, step, quantum(y), timing=timing, commands=sent_v))
 
 
 def _by_time(messages: Messages, begin_ns: int, said: list[str]) -> Messages:

@@ -92,12 +92,12 @@ def test_the_file_holds_it_and_forgets_one_that_is_not_there() -> None:
 def test_a_csv_keeps_the_commands_beside_v(tmp_path: Path) -> None:
     commands, motor, y = record()
     path = tmp_path / 'record.csv'
-    write_record(Record(motor, y, PERIOD, '', commands=commands), path)
+    write_record(Record(motor, y, PERIOD, commands=commands), path)
     read = read_record(path)
     assert read.commands is not None
     np.testing.assert_allclose(read.commands, commands)
     np.testing.assert_allclose(read.v, motor)
-    write_record(Record(motor, y, PERIOD, ''), path)
+    write_record(Record(motor, y, PERIOD), path)
     assert read_record(path).commands is None
 
 

@@ -1,0 +1,188 @@
+"""What is not a play is named by what it is; a play, whatever G is behind it, is not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core.identification.not_play import (
+    Observed,
+    coasting,
+    creep,
+    other_nonlinearity,
+    pushed,
+    saturation,
+    stick_slip,
+    varies,
+    what_it_is,
+)
+from backlash_ros.core.identification.play_record import PlayRecord
+
+Array = NDArray[np.float64]
+
+COUNT = 3000
+GAP = 0.6
+NOISE = 2e-3
+K = np.arange(COUNT)
+V = 2.0 * np.sin(0.02 * K) + 0.9 * np.sin(0.047 * K + 1.0)
+PLANTS: dict[str, tuple[list[float], list[float]]] = {
+    'gain': ([0.0, 1.0], [1.0]),
+    'lag': ([0.0, 0.1], [1.0, -0.9]),
+    'two lags': ([0.0, 0.0, 0.02], [1.0, -1.7, 0.72]),
+    'resonance': ([0.0, 0.05, 0.05], [1.0, -1.8, 0.9]),
+    'integrator': ([0.0, 0.02], [1.0, -1.0]),
+}
+
+
+def play(v: Array, gap: float) -> Array:
+    return np.asarray(PlayRecord(v).output(gap, float(v[0]) + 0.5 * gap).p - 0.5 * gap)
+
+
+def dead_zone(v: Array) -> Array:
+    return np.asarray(np.sign(v) * np.maximum(np.abs(v) - 0.4, 0.0))
+
+
+def sticking(v: Array, band: float = 0.9, jump: float = 0.4) -> Array:
+    """Static friction above the sliding one, by its forces."""
+    place, out = float(v[0]), []
+    for value in v.tolist():
+        if abs(value - place) > 0.5 * (band + jump):
+            place = value - np.sign(value - place) * 0.5 * (band - jump)
+        out.append(place)
+    return np.array(out)
+
+
+def behind(u: Array, plant: str, noise: float = NOISE) -> Array:
+    """y of a plant that was at rest before."""
+    numerator, denominator = PLANTS[plant]
+    if plant == 'integrator':
+        y = lfilter(numerator, denominator, u - u.mean())
+    else:
+        y = lfilter(numerator, denominator, np.append(np.full(300, u[0]), u))[300:]
+    return np.asarray(y + noise * np.random.default_rng(5).standard_normal(len(u)))
+
+
+def observed(v: Array, y: Array, gap: float = GAP, noise: float = NOISE) -> Observed:
+    """With the best that a play of this gap and a dozen lags can do."""
+    p = play(v, gap)
+    columns = [np.ones(len(v)), K[:len(v)] * 1e-3, np.cumsum(p - p.mean())]
+    columns += [np.append(np.full(k, p[0]), p[:len(p) - k]) for k in range(12)]
+    for a in (0.7, 0.9, 0.97, 0.99):
+        columns.append(lfilter([1.0 - a], [1.0, -a], p, zi=[a * p[0]])[0])
+    whole = np.column_stack(columns)
+    known = np.isfinite(y)
+    solution = np.linalg.lstsq(whole[known], y[known], rcond=None)[0]
+    return Observed(v, y, p, whole @ solution, noise, gap)
+
+
+OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
+    'dead zone': (dead_zone, 'a dead zone'),
+    'compensated already': (lambda v: 2.0 * v - play(v, 0.3), 'the drive compensates'),
+    'plays in parallel': (
+        lambda v: 0.3 * v + sum(0.14 * play(v, w) for w in (0.4, 0.9, 1.5, 2.2, 3.0)),
+        'plays in parallel'),
+}
+
+
+@pytest.mark.parametrize('name', OTHERS)
+@pytest.mark.parametrize('plant', ['gain', 'two lags'])
+def test_another_nonlinearity_is_named(name: str, plant: str) -> None:
+    nonlinearity, said = OTHERS[name]
+    (text,) = what_it_is(observed(V, behind(nonlinearity(V), plant)))
+    assert said in text
+
+
+def test_stick_and_slip_is_named() -> None:
+    o = observed(V, behind(sticking(V), 'gain'), 0.9)
+    assert 'y sticks and slips' in stick_slip(o)
+    assert what_it_is(o) == [stick_slip(o)]
+
+
+@pytest.mark.parametrize('plant', PLANTS)
+@pytest.mark.parametrize(('gap', 'noise'), [(0.0, NOISE), (0.05, NOISE), (GAP, NOISE), (GAP, 0.05)])
+def test_a_play_is_nothing_else(plant: str, gap: float, noise: float) -> None:
+    y = behind(play(V, gap), plant, noise)
+    o = observed(V, y, gap, noise)
+    assert what_it_is(o) == []
+    # Not even where the residual asks for it.
+    alone = [test(o) for test in (
+        other_nonlinearity, saturation, pushed, creep, stick_slip, coasting)]
+    assert alone == [''] * 6
+
+
+@pytest.mark.parametrize('noise', [0.05, 0.3])
+def test_noise_that_is_not_white_is_no_nonlinearity(noise: float) -> None:
+    rng = np.random.default_rng(8)
+    wander = lfilter([noise], [1.0, -0.95], rng.standard_normal(COUNT))
+    o = observed(V, behind(play(V, GAP), 'lag') + wander)
+    assert o.unexplained
+    assert other_nonlinearity(o) == ''
+    assert saturation(o) == ''
+
+
+def test_a_quantised_play_is_nothing_else() -> None:
+    y = np.round(behind(play(V, GAP), 'lag', 0.0) / 0.05) * 0.05
+    assert what_it_is(observed(V, y, GAP, 0.05 / np.sqrt(12.0))) == []
+
+
+def test_a_dead_zone_before_an_integrator_is_named() -> None:
+    assert 'a dead zone' in other_nonlinearity(observed(V, behind(dead_zone(V), 'integrator')))
+
+
+@pytest.mark.parametrize('side', ['both', 'one'])
+def test_a_y_that_is_at_its_end_is_named(side: str) -> None:
+    y = np.minimum(behind(play(V, GAP), 'lag', 0.0), 0.9)
+    y = np.maximum(y, -0.9 if side == 'both' else -9.0)
+    o = observed(V, y + NOISE * np.random.default_rng(1).standard_normal(COUNT))
+    assert 'y stays at its largest value, about 0.9' in saturation(o)
+
+
+def test_a_load_that_is_pushed_at_rest_is_named() -> None:
+    v = 2.0 * np.round(np.sin(0.01 * K))
+    push = 0.3 * ((K % 70) > 45)
+    assert 'while v is at rest' in pushed(observed(v, behind(play(v, GAP), 'lag') + push))
+    assert pushed(observed(v, behind(play(v, GAP), 'lag'))) == ''
+
+
+def test_a_y_that_does_not_return_with_v_is_named() -> None:
+    u = play(V, GAP)
+    moved = np.append(0.0, np.cumsum(np.where(np.diff(u) > 0.0, 1.0, 0.8) * np.diff(u)))
+    o = observed(V, behind(moved, 'lag'))
+    said = creep(o)
+    assert 'y creeps by' in said
+    assert what_it_is(o) == [said]
+
+
+def test_a_load_that_coasts_through_the_gap_is_named() -> None:
+    p = play(V, GAP)
+    resting = np.append(False, np.diff(p) == 0.0)
+    speed = np.append(0.0, np.diff(p))
+    coast, v, way = np.zeros(COUNT), 0.0, 0.0
+    for k in range(COUNT):
+        v, way = (0.97 * v, way + v) if resting[k] else (speed[k], 0.0)
+        coast[k] = min(max(way, -0.2), 0.2)
+    o = observed(V, behind(p + coast, 'gain'))
+    assert 'it coasts there' in coasting(o)
+
+
+def thirds() -> list[NDArray[np.bool_]]:
+    return [k == K // 1000 for k in range(3)]
+
+
+@pytest.mark.parametrize('plant', ['gain', 'lag', 'two lags'])
+def test_the_gap_of_each_part_is_told(plant: str) -> None:
+    u = np.where(K < 2000, play(V, GAP), play(V, 0.75))
+    found, std = varies(observed(V, behind(u, plant)), thirds())
+    assert found - found[0] == pytest.approx([0.0, 0.0, 0.15], abs=0.02)
+    assert std.max() < 0.02
+
+
+def test_a_gap_that_stays_is_the_same_in_each_part() -> None:
+    for plant in ('gain', 'lag', 'resonance'):
+        found, std = varies(observed(V, behind(play(V, GAP), plant)), thirds())
+        assert np.abs(found - GAP).max() < 0.004
+        assert (np.abs(found - GAP) < 5.0 * std).all()
