@@ -8,9 +8,9 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures
 
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
-# Share by which the rate of y may differ from that of the model; and by which nearly all intervals
-# have to differ where they do not tell the period.
-RATE_TOLERANCE, PACE_TOLERANCE = 0.005, 0.1
+# Shares: by which the rate of y may differ from that of the model, by which pauses may stretch it,
+# and by which nearly all intervals have to differ where they do not tell the period.
+RATE_TOLERANCE, PAUSE_TOLERANCE, PACE_TOLERANCE = 0.005, 0.01, 0.1
 # Share of late, lost or bad samples from which on the loop is told to suffer from them, and an
 # estimate that does not fit the data is put down to them.
 TROUBLE = 0.01
@@ -222,8 +222,8 @@ def _timing(f: LoopFigures) -> list[Finding]:
     found = []
     rate = _wrong_rate(f)
     if isfinite(rate):
-        wrong = abs(f.period.median / f.sample_period - 1.0) < 0.5 * RATE_TOLERANCE
-        cure = 'is the driver held up?' if wrong else 'correct one of them'
+        stretched = f.period.is_stretched(f.sample_period, PAUSE_TOLERANCE)
+        cure = 'is the driver held up?' if stretched else 'correct one of them'
         found.append(Finding(
             Level.WARN, 'rate', f'{f.output.name} comes at {rate:.4g} Hz, sample_period is '
             f'{f.sample_period:g} s ({1.0 / f.sample_period:.4g} Hz): {cure}',
@@ -266,7 +266,8 @@ def _wrong_rate(f: LoopFigures) -> float:
     Losses and stalls lengthen some of the intervals, messages sent twice shorten some: where the
     period is not known, the rate is wrong only if nearly all intervals are off to the same side.
     """
-    if f.period.differs_from(f.sample_period, RATE_TOLERANCE):
+    if f.period.differs_from(f.sample_period, RATE_TOLERANCE) \
+            or f.period.is_stretched(f.sample_period, PAUSE_TOLERANCE):
         return 1.0 / f.period.mean
     low, mean, high = f.intervals_s
     slow = low > (1.0 + PACE_TOLERANCE) * f.sample_period

@@ -24,8 +24,15 @@ class Period(NamedTuple):
     median: float = nan
 
     def differs_from(self, nominal_s: float, tolerance: float) -> bool:
-        """Whether it certainly is off by more than a share; False where it is not known."""
-        return abs(self.mean - nominal_s) > tolerance * nominal_s + 3.0 * self.std
+        """Whether it certainly is off by more than a share, and the median interval likewise."""
+        off = self.mean - nominal_s
+        return abs(off) > tolerance * nominal_s + 3.0 * self.std \
+            and (self.median - nominal_s) * off > 0.5 * tolerance * nominal_s * abs(off)
+
+    def is_stretched(self, nominal_s: float, tolerance: float) -> bool:
+        """Whether it certainly is longer by more than a share though the median interval is not."""
+        return self.mean - nominal_s > tolerance * nominal_s + 3.0 * self.std \
+            and not self.differs_from(nominal_s, tolerance)
 
 
 UNKNOWN_PERIOD = Period()

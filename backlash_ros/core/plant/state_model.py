@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
@@ -30,11 +29,12 @@ class StateModel:
             rows.append(row)
             row = row @ a
         # R of the observability matrix: R' R is its Gramian, without squaring the condition.
-        r = linalg.qr(np.array(rows), mode='r')[0][: self.order]
+        r = np.linalg.qr(np.array(rows))[1]
         # A rotation keeps the Gramian and turns C onto the first axis.
-        rotation, triangle = linalg.qr(linalg.solve(r.T, c)[:, None])
-        self.to_state: Array = rotation.T @ r  # from the observer form, whose first state is y
-        self.to_observer: Array = linalg.inv(self.to_state)
+        rotation, triangle = np.linalg.qr(np.linalg.solve(r.T, c)[:, None], mode='complete')
+        # From the observer form, whose first state is y.
+        self.to_state: Array = np.asarray(rotation.T @ r, np.float64)
+        self.to_observer: Array = np.asarray(np.linalg.inv(self.to_state), np.float64)
         self.a: Array = self.to_state @ a @ self.to_observer
         self.b: Array = self.to_state @ b
         self.c = float(triangle[0, 0])
@@ -46,7 +46,7 @@ class StateModel:
         n = self.order
         rest = np.zeros((n + 1, n + 1))
         rest[:n, :n], rest[:n, n], rest[n, 0] = self.a - np.eye(n), self.b, self.c
-        return np.asarray(linalg.lstsq(rest, np.eye(n + 1)[n])[0][:n])
+        return np.asarray(np.linalg.lstsq(rest, np.eye(n + 1)[n])[0][:n])
 
 
 def _horizon(model: TransferFunction) -> int:

@@ -12,8 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from backlash_ros.core.parameters.table import NODES
 
 OPTION = '--params-file'
@@ -83,6 +81,8 @@ def _section_names(content: Mapping[Any, Any], prefix: str = '') -> Iterator[str
 
 
 def _content(file: str) -> Mapping[Any, Any]:
+    import yaml  # most nodes start without a file
+
     # ROS 2 itself has refused what cannot be read.
     content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
     return content if isinstance(content, Mapping) else {}
