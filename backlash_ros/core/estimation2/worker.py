@@ -27,13 +27,19 @@ from typing import Any, NamedTuple
 from backlash_ros.core.estimation2.executor import LOST, Channel, Failure, Job, Record, computed
 
 NICENESS = 5  # beyond that of the loop
-OPEN, EXTEND, SUBMIT, CLOSE, RESULT = range(5)  # kinds of messages
+OPEN, EXTEND, SUBMIT, CLOSE, RESULT, READY = range(6)  # kinds of messages
 HEADER = Struct('<BQQ')  # kind, number of the channel, bytes that follow
 RECORD = Struct('<QQQ')  # quantities, capacity and number of the first sample
 READ_BYTES, WRITTEN_MESSAGES = 65536, 32  # at once, at most
-# Wait before a worker is replaced that has died without a result since the last one [s]: the
-# first, and the longest, by doubling.
+# Wait before a worker is replaced [s] that died at its start or at a job, as the one before it did:
+# the first, and the longest, by doubling.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 10.0
+
+
+class _Received(NamedTuple):
+    kind: int
+    number: int  # of the channel
+    body: bytes
 
 
 class WorkerExecutor:
@@ -53,7 +59,8 @@ class WorkerExecutor:
         self._begun = 0  # bytes of the first of them that are written
         self._at_work = 0  # jobs that are written and have no result
         self._received = bytearray()
-        self._deaths = 0  # since the last result
+        self._deaths = 0  # in a row at the start of a worker or at a job
+        self._ready = False  # whether the worker has started
         self._closed = Event()
         self._starting: Thread | None = None
         self._started: SimpleQueue[subprocess.Popen[bytes]] = SimpleQueue()
@@ -127,12 +134,15 @@ class WorkerExecutor:
             self._replace(process)
             return
         self._received += received
-        for number, result in _results_in(self._received):
+        for kind, number, body in _messages_in(self._received):
+            self._ready = True
+            if kind == READY:
+                continue
             self._deaths = 0
             self._at_work -= 1
             self._submitted.popleft()
             if number in self._channels:
-                self._channels[number].finish(result)
+                self._channels[number].finish(pickle.loads(body))
 
     def _write_to(self, pipe: int) -> None:
         messages = self._unwritten
@@ -151,13 +161,13 @@ class WorkerExecutor:
         """Start another worker in the background; the job that was under way is lost."""
         self._process = None
         self.restarts += 1
-        self._deaths += 1
+        self._deaths = self._deaths + 1 if self._at_work or not self._ready else 0
         if self._at_work:
             lost = self._submitted.popleft()
             lost.finish(Failure(LOST, f'the worker (process {dead.pid}) died'))
         self._unwritten.clear()
         self._received.clear()
-        self._begun = self._at_work = 0
+        self._begun, self._at_work, self._ready = 0, 0, False
         wait_s = 0.0
         if self._deaths > 1:
             wait_s = min(FIRST_WAIT_S * 2.0 ** min(self._deaths - 2, 10), LONGEST_WAIT_S)
@@ -236,16 +246,16 @@ def _message(kind: int, number: int, body: bytes = b'') -> bytes:
     return HEADER.pack(kind, number, len(body)) + body
 
 
-def _results_in(received: bytearray) -> Iterator[tuple[int, Any]]:
-    """Take the complete messages out of what was received: channel and result."""
+def _messages_in(received: bytearray) -> Iterator[_Received]:
+    """Take the complete messages out of what was received."""
     while len(received) >= HEADER.size:
-        _, number, length = HEADER.unpack_from(received)
+        kind, number, length = HEADER.unpack_from(received)
         end = HEADER.size + length
         if len(received) < end:
             return
-        result = pickle.loads(received[HEADER.size:end])
+        body = bytes(received[HEADER.size:end])
         del received[:end]
-        yield number, result
+        yield _Received(kind, number, body)
 
 
 def _start(preload: tuple[str, ...]) -> subprocess.Popen[bytes]:
@@ -278,12 +288,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 # --- in the worker ------------------------------------------------------------------------------
 
 
-class _Received(NamedTuple):
-    kind: int
-    number: int
-    body: bytes
-
-
 def serve(preload: Sequence[str] = ()) -> None:
     """Compute jobs until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -294,6 +298,7 @@ def serve(preload: Sequence[str] = ()) -> None:
     Thread(target=_receive, args=(messages,), daemon=True).start()
     for name in preload:
         import_module(name)
+    _send(results, _message(READY, 0))
     records: dict[int, Record | None] = {}
     while True:
         kind, number, body = messages.get()
