@@ -7,6 +7,10 @@ APPLIED_CONTROL = 'applied_control'
 # In place of plant_output and control with io.style: ros2_control.
 JOINT_STATES = 'joint_states'
 JOINT_COMMANDS = 'forward_command_controller/commands'
+# ... and in place of reference, plant_output, control with io.style: joint_state_topic.
+ROBOT_COMMAND, ROBOT_STATES = 'robot_joint_command', 'robot_joint_states'
+JOINT_STATE_COMMANDS = 'joint_commands'
+APPLIED_JOINT_COMMANDS = 'applied_joint_commands'
 ESTIMATES = 'controller/estimates'
 SIGNALS = 'controller/signals'
 MODEL = 'controller/model'
@@ -37,6 +41,11 @@ def of_node(topic: str) -> str:
     return '~/' + topic.partition('/')[2]
 
 
-def watched(label: str) -> str:
+def watched(label: str, joint: str = '') -> str:
     """The topic of one of WATCH_LABELS."""
-    return f'{WATCH}/{label}'
+    return f'{WATCH}/{joint}/{label}' if joint else f'{WATCH}/{label}'
+
+
+def of_joint(label: str, joint: str) -> str:
+    """The label of a quantity of a joint; that of the only, nameless one is the label itself."""
+    return f'{joint}.{label}' if joint else label

@@ -68,8 +68,7 @@ class Fuzzer:
         node, rng = self._node, self._rng
         self._untyped.trigger_configure()
         self._untyped.trigger_activate()
-        loop = node.loop
-        assert loop is not None
+        (loop,) = node.configured
         self._number = 0
         # Some drivers are sound most of the time: only then is there anything to learn.
         soundness = float(rng.choice([0.3, 0.9, 0.98]))
@@ -90,8 +89,7 @@ class Fuzzer:
     def _event(self, soundness: float) -> None:
         """Let something happen."""
         node, rng = self._node, self._rng
-        loop = node.loop
-        assert loop is not None
+        (loop,) = node.configured
         if rng.random() < soundness:
             self._output(self._sound_y(), PERIOD_NS, 1)
             hand_over(node, float(5.0 * np.sin(0.1 * self._number)), None)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -23,13 +23,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from ros_processes import Probe
-from std_msgs.msg import Float64
 from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.sample_counter import Output
+from backlash_ros.core.loop.sample_counter import JointOutputs, Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
@@ -66,9 +65,9 @@ def catch_commands(node: ControllerNode, sent: Callable[[float], None]) -> None:
     io: Any = node._io
     publish = io.publish
 
-    def note(v: float) -> None:
-        sent(v)
-        publish(v)
+    def note(commands: Mapping[str, float]) -> None:
+        sent(commands[''])
+        publish(commands)
 
     io.publish = note
 
@@ -77,16 +76,17 @@ def hand_over(node: ControllerNode, y_m: float | None, output: Output | None) ->
     """Let the node hear a reference and an output, as if the messages had come."""
     untyped: Any = node
     if y_m is not None:
-        untyped._on_reference(Float64(data=y_m))
+        untyped._on_reference({'': y_m})
     if output is not None:
-        untyped._on_output(output)
+        y, *rest = output
+        untyped._on_output(JointOutputs({'': y}, *rest))
 
 
 def look_for_silence(node: ControllerNode) -> None:
     """Let the node find that nothing was heard for longer than any timeout."""
     untyped: Any = node
-    assert node.loop is not None
-    node.loop.heard_at = -1e9
+    for loop in node.configured:
+        loop.heard_at = -1e9
     untyped._look_for_silence()
 
 
@@ -111,8 +111,7 @@ class Bench:
 
     @property
     def loop(self) -> ControlLoop:
-        loop = self.node.loop
-        assert loop is not None
+        (loop,) = self.node.configured
         return loop
 
     @property

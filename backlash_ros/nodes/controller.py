@@ -5,54 +5,45 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping, Set
 from concurrent.futures import Future
+from math import isfinite, nan
 from typing import Any
 
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import (
     WORKER_MODULES,
     build_controller,
-    first_guess,
     known_before,
     warnings_of,
 )
 from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
-from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.estimation2.executor import Executor, InlineExecutor
 from backlash_ros.core.estimation2.worker import WorkerExecutor
-from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.figures import Finding, Level
-from backlash_ros.core.loop.sample_counter import Output, SampleCounter, kept_outputs
-from backlash_ros.core.parameters import NOISE, Parameters
+from backlash_ros.core.loop.joint_loops import JointLoops
+from backlash_ros.core.loop.sample_counter import (
+    JointOutputs,
+    SampleCounter,
+    kept_outputs,
+)
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.nodes.control.estimate_saver import EstimateSaver
-from backlash_ros.nodes.control.first_command import FirstCommand
+from backlash_ros.core.parameters.table import CONTROLLER, JOINTS
+from backlash_ros.nodes.control.joint import Joint
 from backlash_ros.nodes.control.last_command_sender import LastCommandSender
-from backlash_ros.nodes.control.model_publisher import ModelPublisher
+from backlash_ros.nodes.control.reports import Reports
 from backlash_ros.nodes.control.services import offer_services
 from backlash_ros.nodes.control.step_publisher import StepPublisher
-from backlash_ros.nodes.diagnostics.diagnosis import Diagnosis, counts_of, values_of, worst
 from backlash_ros.nodes.diagnostics.rivals import RivalWatch
 from backlash_ros.nodes.runtime.declare import LiveParameters
-from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
+from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.events import emit
-from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.lifecycle import ManagedNode
-from backlash_ros.nodes.runtime.messages import (
-    DEPTH,
-    DIAGNOSTICS_PERIOD_S,
-    KEPT,
-    DiagnosticsPublisher,
-    stamp_ns_of,
-)
+from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT, stamp_ns_of
 from backlash_ros.nodes.runtime.spin import run
 
 # Share of a period for which the controller sleeps after the command: on a busy processor the
@@ -65,65 +56,61 @@ class ControllerNode(ManagedNode):
     """Answers every plant_output with a control; estimates and signals follow after it.
 
     In lockstep the k-th tick of /clock, reference and plant_output belong together, so that
-    runs are repeatable; else the newest reference counts.
+    runs are repeatable; else the newest reference counts. With `joints` there is a loop for each
+    of them: a message has y of all, and one with v of all answers it.
     """
 
     def __init__(self) -> None:
         super().__init__(CONTROLLER)
         p = self.settings
-        if p.get_bool('lockstep') and p.get_str('io.style') != 'native':
-            raise ParameterError('lockstep', True, 'needs io.style: native')
-        # Whatever is wrong with the parameters ends the process before it takes part in anything.
-        build_controller(p)
-        for warning in warnings_of(p, with_reference=False):
-            self.log.warning(warning)
-        self.loop: ControlLoop | None = None  # None while unconfigured
+        _check_style(p)
+        for joint in p.joints:
+            # Whatever is wrong with the parameters ends the process before it takes part in
+            # anything.
+            own = p.of_joint(joint)
+            build_controller(own)
+            for warning in warnings_of(own, with_reference=False):
+                self.log.warning(f'{joint}: {warning}' if joint else warning)
+        self.loops: JointLoops | None = None  # None while unconfigured
         self._lockstep = p.get_bool('lockstep')
         # A fit that shared the process of the loop would hold up its commands.
         self._executor: Executor = (
             InlineExecutor() if self._lockstep else WorkerExecutor(WORKER_MODULES)
         )
         self._behind = 0  # outputs in a row that were answered after the next one had come
+        self._turn = 0  # of the joint that fits next
         self._io = DriverIo(self, p)
         # Whoever waits for the others begins with them; who does not may have been restarted.
         self._set_up(
             p, from_zero=not self._lockstep and p.get_int('wait_for_subscribers') > 0
         )
-        self._saver = EstimateSaver(p.get_str('estimates.file'))
         self._saved_at = time.monotonic()
         self._queues: tuple[deque[Any], deque[Any], deque[Any]] = (deque(), deque(), deque())
         self._ticks, self._references, self._outputs = self._queues
-        self._reference_at: float | None = None  # on the steady clock [s]
-        self._told: Status | None = None  # the newest one that /diagnostics has
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._last_commands = LastCommandSender(self, self._io)
+        self.joints: list[Joint] = []
         self._rivals = RivalWatch(
             self, self._io.topics.control, self._io.advertise, self._mind_rivals
         )
         self._told_rivals = self._rivals.found
         self._commands_of_rivals: Subscription | None = None  # heard while standing down
-        self._steps = StepPublisher(self)
-        self._model = ModelPublisher(self)
-        self._diagnostics = DiagnosticsPublisher(
-            self, p.get_str('io.joint') or self._io.publisher.topic_name
-        )
+        self._steps = StepPublisher(self, p.joints)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
-        self._reference = self.create_subscription(
-            Float64, topics.REFERENCE, self._on_reference, KEPT if self._lockstep else 1
+        self._reference = self._io.listen_to_references(
+            self._on_reference, KEPT if self._lockstep else 1
         )
         # The first command begins with what the driver reports, even if it is not learned from.
-        self._reports = (
-            None if self._lockstep else Inbox(self, Float64, topics.APPLIED_CONTROL, REMEMBERED)
-        )
-        self._first_command = FirstCommand(self, self._io, self._reports)
-        self._diagnosis = Diagnosis(
-            self, self._io, output_qos(p, DEPTH), self._reference.qos_profile
-        )
+        self._reports = None if self._lockstep else Reports(self, self._io, p.joints)
+        self.joints += [
+            Joint(self, joint, p.of_joint(joint), self._io, self._reports,
+                  self._reference.qos_profile) for joint in p.joints
+        ]
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
         offer_services(self, self)
         self._live = LiveParameters(
-            self, p, self._check_change, self._take_up, lambda: self.loop is None
+            self, p, self._check_change, self._take_up, lambda: self.loops is None
         )
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         if not self._lockstep:
@@ -134,48 +121,51 @@ class ControllerNode(ManagedNode):
 
     def _announce(self) -> None:
         """Say in the log what the node is about."""
-        p, output, control = self.settings, self._io.topics.output, self._io.topics.control
-        name, period = self.resolve_topic_name, p.get_float('sample_period')
+        p, to, name = self.settings, self._io.topics, self.resolve_topic_name
+        period = p.get_float('sample_period')
+        joints = f'joints {", ".join(p.joints)}: ' if p.joints[0] else ''
         self.log.info(
-            f'started: {name(output)} and {name(topics.REFERENCE)} in, {name(control)} out, '
-            f'sample_period {period:g} s ({1.0 / period:.4g} Hz); '
-            + (f'waits for {topics.REFERENCE} and {output}' if p.get_bool('autostart')
+            f'started: {joints}{name(to.output)} and {name(to.reference)} in, {name(to.control)} '
+            f'out, sample_period {period:g} s ({1.0 / period:.4g} Hz); '
+            + (f'waits for {to.reference} and {to.output}' if p.get_bool('autostart')
                else 'autostart is false: waits for '
                     f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
         )
 
     @property
-    def estimates_file(self) -> str:
-        """Where estimates are saved, empty for nowhere."""
-        return self._saver.file
+    def configured(self) -> list[ControlLoop]:
+        """The loops, none while there are none."""
+        return [] if self.loops is None else list(self.loops.by_name.values())
 
-    def save_estimates(self) -> Future[str]:
-        """Begin to save the estimates; the result says why it failed, empty if it did not."""
-        assert self.loop is not None
-        return self._saver.save(self.loop.estimate, self._live.parameters)
+    @property
+    def estimates_files(self) -> str:
+        """Where estimates are saved, empty for nowhere."""
+        return ', '.join(joint.saver.file for joint in self.joints)
+
+    def save_estimates(self) -> list[Future[str]]:
+        """Begin to save what is worth it; each result says why it failed, empty if it did not."""
+        return [saved for joint in self.joints if (saved := joint.save()) is not None]
 
     def configure(self) -> None:
         p = self._live.parameters
-        before = known_before(p)
-        self.loop = ControlLoop(
+        before = {joint.name: known_before(joint.p) for joint in self.joints}
+        self.loops = JointLoops(
             p, self._io.publish, self._io.now_ns, before, self._counter,
-            self._first_command.v_at_start(p), self._new_reports, self._executor,
+            {joint.name: joint.first_command.v_at_start(joint.p) for joint in self.joints},
+            self._reports.of if self._reports is not None else lambda joint: (),
+            self._executor,
         )
-        self._model.publish(self.loop)
-        if before.learned:
-            self.log.info(
-                f'going on with the estimates in {self.estimates_file}: m={before.m:.6g}, '
-                f'c_r={before.c_r:.6g}, c_l={before.c_l:.6g}'
-            )
+        for joint in self.joints:
+            joint.begin(self.loops.by_name[joint.name], before[joint.name])
 
     def activate(self) -> None:
-        assert self.loop is not None
         self._rivals.begin()
         if self._driver is not None:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
             # that nobody was listened to is no silence of the driver.
-            self.loop.renew(self.loop.estimate)
-            self.loop.heard_at = None
+            for loop in self.configured:
+                loop.renew(loop.estimate)
+                loop.heard_at = None
             return
         if self._lockstep:  # simulated time hurts nobody
             self._await_loop()
@@ -195,43 +185,40 @@ class ControllerNode(ManagedNode):
         needed = self._conditions_of_start()
         self.call_when(
             lambda: all(condition() for condition in needed), self._listen_to_driver,
-            f'{topics.REFERENCE} and the listeners of {self._io.topics.control}',
+            f'{self._io.topics.reference} and the listeners of {self._io.topics.control}',
         )
 
     def deactivate(self) -> None:
         """Send the last command as on_stop says, and save what was learned."""
-        loop, p = self.loop, self._live.parameters
-        assert loop is not None
+        loops, p = self.loops, self._live.parameters
+        assert loops is not None
         self._last_commands.end()
-        if loop.last is not None:
+        if any(loop.last is not None for loop in self.configured):
             # Before a ramp: whoever stops this process may not wait for its end.
-            self._save(loop)
-            if not loop.standing_down:
-                self._last_commands.send_all(
-                    loop, p.get_str('on_stop'), p.get_float('timeout.ramp'), self._diagnose
-                )
-            self._model.publish(loop)
+            self._save()
+            self._last_commands.send_all(
+                loops, p.get_str('on_stop'), p.get_float('timeout.ramp'), self._diagnose
+            )
+            for joint in self.joints:
+                joint.model.publish(loops.by_name[joint.name])
         self._rivals.end()
         self._diagnose()
 
     def cleanup(self) -> None:
-        if self.loop is not None and self.loop.knows_v:
-            self._first_command.before = self.loop.v
-        if self.loop is not None:
-            self.loop.close()
-        self.loop = None
+        for joint in self.joints:
+            joint.end()
+        for loop in self.configured:
+            loop.close()
+        self.loops = None
         self._diagnose()
 
     def finish(self) -> None:
         super().finish()
         self._rivals.close()
-        self._saver.close()
+        for joint in self.joints:
+            joint.saver.close()
+            joint.sum_up()
         self._executor.close()
-        if self.loop is not None:
-            self.log.info(', '.join(
-                f'{key}: {count}' for key, count in counts_of(self.loop).items()
-                if count or key == 'samples'
-            ))
 
     def _conditions_of_start(self) -> list[Callable[[], bool]]:
         """What has to be there before plant_output is listened to, for that starts the loop."""
@@ -243,7 +230,7 @@ class ControllerNode(ManagedNode):
             # Beside the driver, those who listen want to hear everything.
             lambda: self._steps.listeners >= wanted - 1,
             (lambda: self._reference.get_publisher_count() > 0) if self._lockstep
-            else (lambda: self._reference_at is not None),
+            else (lambda: all(joint.reference_at is not None for joint in self.joints)),
         ]
 
     def _listen_to_driver(self) -> None:
@@ -254,119 +241,129 @@ class ControllerNode(ManagedNode):
             self._driver = self._io.listen(self._on_output, min(kept, DEPTH))
             emit('ready')
 
-    def _on_reference(self, message: Float64) -> None:
-        loop = self.loop
-        if loop is None:
+    def _on_reference(self, y_m: Mapping[str, float]) -> None:
+        if self.loops is None:
             return
-        if loop.take_reference(message.data):
-            self._reference_at = time.monotonic()
+        taken = self.loops.take_references(y_m)
+        now = time.monotonic()
+        for joint in self.joints:
+            if joint.name in taken:
+                joint.reference_at = now
         if self._lockstep:
-            self._references.append(loop.y_m)
+            self._references.append(self.loops.by_name[''].y_m)
             self._pair()
 
     def _on_clock(self, message: Clock) -> None:
         self._ticks.append(stamp_ns_of(message))
         self._pair()
 
-    def _on_output(self, output: Output) -> None:
-        loop = self.loop
-        if loop is None:
-            for _ in self._new_reports():  # which are of no use to a loop that begins later
-                pass
+    def _on_output(self, outputs: JointOutputs) -> None:
+        loops = self.loops
+        if loops is None:
+            if self._reports is not None:
+                self._reports.forget()
             return
-        if loop.begins or not self.active:
-            loop.hear_reports()
+        for loop in loops.by_name.values():
+            if loop.begins or not self.active:
+                loop.hear_reports()
         if not self.active:
             return
         if self._lockstep:
-            self._outputs.append(output)
+            self._outputs.append(outputs)
             self._pair()
             return
-        if loop.begins and not loop.standing_down and not (
-            self._knows_rivals()
-            and self._first_command.may_follow(loop, output, self._live.parameters)
-        ):
+        waiting = self._waiting(loops, outputs)
+        if waiting >= outputs.y.keys():
             return
-        was_silent = loop.silent
-        step = loop.command(output)
+        silent = {joint for joint, loop in loops.by_name.items() if loop.silent}
+        steps = loops.command(outputs, waiting)
         # Where the next output is waiting already, there is no time for what may be put off.
-        behind = 0 < output.received_ns < time.time_ns() - self._period_ns
-        if step is not None and not behind:
+        behind = 0 < outputs.received_ns < time.time_ns() - self._period_ns
+        if steps and not behind:
             time.sleep(self._post_command_sleep_s)
-        loop.note()
-        if was_silent and not loop.silent:
-            self._last_commands.end()
-        if step is None:
+        loops.note()
+        back = [loops.by_name[joint] for joint in silent if not loops.by_name[joint].silent]
+        if back:
+            self._last_commands.end(*back)
+        if not steps:
             return
         self._behind = self._behind + 1 if behind else 0
         if self._behind % PUT_OFF == 0:
-            loop.core.refine(self._refine_budget_s)
-        self._follow_up(loop, step, was_silent)
+            self._turn = (self._turn + 1) % len(self.joints)
+            self.configured[self._turn].core.refine(self._refine_budget_s)
+        self._follow_up(loops, steps, silent)
 
-    def _new_reports(self) -> Iterator[tuple[float, int]]:
-        """What the driver has reported to have applied since the last look: v, stamp [ns]."""
-        if self._reports is not None:
-            for message, info in self._reports.take_all():
-                yield message.data, self._io.stamp_ns(info)
+    def _waiting(self, loops: JointLoops, outputs: JointOutputs) -> Set[str]:
+        """Joints of a message that are not answered yet: what to begin with is not known."""
+        if self._together and any(
+            loop.silent and not isfinite(outputs.y.get(joint, nan))
+            for joint, loop in loops.by_name.items()
+        ):
+            return outputs.y.keys()
+        return {
+            joint.name for joint in self.joints
+            if (loop := loops.by_name[joint.name]).begins and not loop.standing_down
+            and joint.name in outputs.y
+            and not (self._knows_rivals() and joint.may_begin(outputs))
+        }
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
-        while self.loop is not None and self.active and all(self._queues):
-            arrival = self.loop.counter.count(self._ticks.popleft())
+        while self.loops is not None and self.active and all(self._queues):
+            loop = self.loops.by_name['']
+            arrival = self.loops.counter.count(self._ticks.popleft())
             y_m = self._references.popleft()
-            step = self.loop.step(self._outputs.popleft(), arrival, y_m)
+            step = loop.step(self._outputs.popleft().of(''), arrival, y_m)
+            self.loops.send()
             if step is not None:
-                self.loop.core.refine()
-                self._follow_up(self.loop, step, was_silent=False)
+                loop.core.refine()
+                self._follow_up(self.loops, {'': step}, silent=set())
 
-    def _follow_up(self, loop: ControlLoop, step: ControlStep, was_silent: bool) -> None:
-        """Tell of a step."""
-        self._steps.publish(loop, step)
-        self._model.follow(loop, self.settings.get_float('sample_period'))
-        if was_silent or step.estimate.status != self._told:
-            self._told = step.estimate.status
-            self._diagnose()
+    def _follow_up(
+        self, loops: JointLoops, steps: Mapping[str, ControlStep], silent: Set[str],
+    ) -> None:
+        """Tell of the steps of a sample. silent: joints that were until then."""
+        self._steps.publish(loops.by_name, steps)
+        for joint in self.joints:
+            if joint.name in steps and joint.follow(steps[joint.name], joint.name in silent):
+                joint.diagnose(self._rivals, self.active)
 
     def _check_change(self, p: Parameters) -> None:
-        """Raise ParameterError for values that the running loop cannot take up."""
-        build_controller(p, first_guess(p))
-        changes = p[NOISE] != self._live.parameters[NOISE]
-        if self.loop is not None and changes and NOISE not in self.loop.core.estimator.RETUNED:
-            raise ParameterError(
-                NOISE, p[NOISE], f'is not taken up live by {p.get_str("estimator.law")}',
-                'clean the node up, set it, and configure again',
-            )
+        """Raise ParameterError for values that the running loops cannot take up."""
+        for joint in self.joints:
+            joint.check_change(p.of_joint(joint.name))
 
     def _take_up(self, p: Parameters) -> None:
         before, self.settings = self.settings, p
-        if self.loop is not None:
-            self.loop.take_up(p)
-        else:
-            self._saver.file = p.get_str('estimates.file')
-            if p['sample_period'] != before['sample_period']:
-                self._set_up(p, from_zero=False)
+        for joint in self.joints:
+            joint.take_up(p.of_joint(joint.name))
+        if self.loops is None and p['sample_period'] != before['sample_period']:
+            self._set_up(p, from_zero=False)
         self._mind_rivals()
 
     def _set_up(self, p: Parameters, from_zero: bool) -> None:
         """Take up what follows from the sample period."""
         period = p.get_float('sample_period')
+        self._together = p.get_bool('io.together')
         self._post_command_sleep_s, self._period_ns = POST_COMMAND_SLEEP * period, period * 1e9
         self._refine_budget_s = REFINE_SHARE * period
         self._counter = SampleCounter(period, from_zero)
 
     def _mind_rivals(self) -> None:
         """Stand down or command again, as on_rival says, and tell of it."""
-        loop, found = self.loop, self._rivals.found
+        found = self._rivals.found
         on_rival = self._live.parameters.get_str('on_rival')
         stand_down = on_rival == 'stand_down' and not self._rivals.came_first
-        if loop is not None and stand_down != loop.standing_down:
-            if stand_down:
-                self._last_commands.end()
+        changing = [loop for loop in self.configured if loop.standing_down != stand_down]
+        if changing and stand_down:
+            self._last_commands.end()
+            for loop in changing:
                 loop.stand_down()
-                self._commands_of_rivals = self._io.listen_to_commands(loop.hear_other)
-            else:
-                assert self._commands_of_rivals is not None
-                self.destroy_subscription(self._commands_of_rivals)
+            self._commands_of_rivals = self._io.listen_to_commands(self._hear_rival)
+        elif changing:
+            assert self._commands_of_rivals is not None
+            self.destroy_subscription(self._commands_of_rivals)
+            for loop in changing:
                 loop.resume()
         if found != self._told_rivals:
             self._told_rivals = found
@@ -374,50 +371,58 @@ class ControllerNode(ManagedNode):
                 self.log.info(f'nobody else publishes {self._rivals.topic} any more')
         self._diagnose()
 
+    def _hear_rival(self, commands: Mapping[str, float]) -> None:
+        for joint in self.joints:
+            if joint.loop is not None and joint.name in commands:
+                joint.loop.hear_other(commands[joint.name])
+
     def _look_for_silence(self) -> None:
-        loop = self.loop
-        if loop is None or not self.active:
+        loops = self.loops
+        if loops is None or not self.active:
             return
-        self._save_now_and_then(loop)
-        timeout = self._live.parameters.get_float('timeout.plant_output')
-        if loop.heard_at is None or loop.silent or timeout == 0.0:
-            return
-        if time.monotonic() > loop.heard_at + timeout:
-            loop.give_up()
-            self._last_commands.begin(loop, self._live.parameters.get_str('on_timeout'))
+        self._save_now_and_then()
+        overdue = [joint for joint in self.joints if joint.is_overdue()]
+        if overdue:
+            # An arm of which one joint is lost stops as one, unless told otherwise.
+            ending = [
+                joint.loop for joint in (self.joints if self._together else overdue)
+                if joint.loop is not None and not joint.loop.silent
+            ]
+            for loop in ending:
+                loop.give_up()
+            on_timeout = self._live.parameters.get_str('on_timeout')
+            self._last_commands.begin(loops, ending, on_timeout)
             self._diagnose()
 
-    def _save_now_and_then(self, loop: ControlLoop) -> None:
+    def _save_now_and_then(self) -> None:
         period = self._live.parameters.get_float('estimates.save_period')
         if period > 0.0 and time.monotonic() > self._saved_at + period:
             self._saved_at = time.monotonic()
-            self._save(loop)
+            self._save()
 
-    def _save(self, loop: ControlLoop) -> None:
-        if self.estimates_file and worth_saving(loop.estimate):
-            self.save_estimates().add_done_callback(
+    def _save(self) -> None:
+        for saving in self.save_estimates():
+            saving.add_done_callback(
                 lambda saved: self.log.error(saved.result()) if saved.result() else None
             )
 
     def _diagnose(self) -> None:
-        loop = self.loop
-        if loop is None:
-            self._diagnostics.publish(
-                Finding(Level.OK, 'unconfigured', 'unconfigured'), self._rivals.claim
-            )
-            return
-        values = values_of(loop)
-        if not self.active:
-            text = f'inactive: no {self._io.topics.control} is published'
-            self._diagnostics.publish(
-                Finding(Level.OK, 'inactive', text), {**values, **self._rivals.claim}
-            )
-            return
-        findings, details = self._diagnosis.findings(
-            loop, self._live.parameters, self._reference_at,
-            tuple(rival.name for rival in self._rivals.found),
+        for joint in self.joints:
+            joint.diagnose(self._rivals, self.active)
+
+
+def _check_style(p: Parameters) -> None:
+    """Raise ParameterError where the messages of io.style cannot carry what is asked for."""
+    style = p.get_str('io.style')
+    if p.get_bool('lockstep') and style != 'native':
+        raise ParameterError('lockstep', True, 'needs io.style: native')
+    if p[JOINTS] and style == 'native':
+        raise ParameterError(
+            'io.style', style, 'has messages for one joint only',
+            'set joint_state_topic or ros2_control',
         )
-        self._diagnostics.publish(worst(findings), {**details, **values, **self._rivals.claim})
+    if style == 'joint_state_topic' and not (p[JOINTS] or p['io.joint']):
+        raise ParameterError(JOINTS, (), 'is empty', f'name them, io.style is {style}')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -26,7 +26,7 @@ from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.parameters.table import RECORDER
 from backlash_ros.nodes.recording.channel import Channel
 from backlash_ros.nodes.recording.progress import Progress
-from backlash_ros.nodes.runtime.driver_io import STYLES, output_qos
+from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
 from backlash_ros.nodes.runtime.events import ENABLED, emit
 from backlash_ros.nodes.runtime.messages import (
     DIAGNOSTICS_PERIOD_S,
@@ -77,7 +77,7 @@ class RecorderNode(ProcessNode):
         else:
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
-        self._driver = STYLES[p.get_str('io.style')]
+        self._driver = driver_topics(p)
         wanted = (*NEEDED_PUBLISHERS, self._driver.control)
         recorded = {**OF_THE_LOOP, self._driver.control: self._driver.control_type}
         for topic, message_type in recorded.items():

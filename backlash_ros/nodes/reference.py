@@ -11,7 +11,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.loop.reference_pace import ReferencePace
-from backlash_ros.core.loop.sample_counter import Output, SampleCounter
+from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import REFERENCE
 from backlash_ros.core.reference.signal import PERIODIC
@@ -156,7 +156,7 @@ class ReferenceNode(ProcessNode):
     def _on_clock(self, message: Clock) -> None:
         self._publish(round(stamp_ns_of(message) * 1e-9 / self._sample_period))
 
-    def _on_output(self, output: Output) -> None:
+    def _on_output(self, output: JointOutputs) -> None:
         if self._counter.count(
             output.stamp_ns, output.sequence, output.numbered
         ).is_sample:

@@ -101,7 +101,7 @@ def test_a_page_is_for_this_machine_alone_and_a_run_goes_on_without_it(run: Sess
 
     assert asyncio.run(statuses()) == [200, 403]
     os.kill(run.node('live.command'), signal.SIGKILL)
-    said = 'live died (killed by SIGKILL), the run continues without it'
+    said = 'live died (killed by SIGKILL), the run goes on without it'
     wait_until(lambda: said in run.stderr, said)
     lines = len(run.stderr.splitlines())
     wait_until(lambda: len(run.stderr.splitlines()) > lines, 'progress')

@@ -155,7 +155,7 @@ class ControlLoop:
         period_ns = self._p.get_float('sample_period') * 1e9
         commanded_ns = max(self._other_ns, self.commands.newest_ns)
         if isfinite(reported) and stamp_ns > commanded_ns + period_ns:
-            self._go_on_from(self.core.command_of(reported))
+            self.go_on_from(self.core.command_of(reported))
         return self.knows_v
 
     @property
@@ -171,12 +171,21 @@ class ControlLoop:
         self.note()
         return step
 
-    def command(self, output: Output) -> ControlStep | None:
-        """The same, but what v(k) need not wait for is left to `note`, which has to follow."""
-        return self._answer(
-            output, self.counter.count(output.stamp_ns, output.sequence, output.numbered),
-            self.y_m,
-        )
+    def command(self, output: Output, arrival: Arrival | None = None) -> ControlStep | None:
+        """The same, but what v(k) need not wait for is left to `note`, which has to follow.
+
+        arrival: of an output that was counted already.
+        """
+        if arrival is None:
+            arrival = self.counter.count(output.stamp_ns, output.sequence, output.numbered)
+        return self._answer(output, arrival, self.y_m)
+
+    def skip(self, arrival: Arrival) -> None:
+        """Leave a sample unanswered of which this loop has no output."""
+        if arrival.is_sample and not self.standing_down:
+            if arrival.missing or arrival.restarted:
+                self._note_missing(arrival)
+            self._missing += 1
 
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """Like `answer`, for a sample that was counted already, with its own reference."""
@@ -269,7 +278,7 @@ class ControlLoop:
     def hear_other(self, v: float) -> None:
         """Take in a command of the controller that is in charge."""
         if self.standing_down and plausible(v):
-            self._go_on_from(v)
+            self.go_on_from(v)
             self._other_ns = self._now_ns()
 
     def resume(self) -> None:
@@ -309,7 +318,8 @@ class ControlLoop:
         if is_sample and not self.standing_down:
             self.commands.note_transit(output.received_ns - output.sent_ns)
 
-    def _go_on_from(self, told: float) -> None:
+    def go_on_from(self, told: float) -> None:
+        """Take this v for the one that acts."""
         known = self.v if self.knows_v else None
         self.v, self.knows_v = self.core.limits.go_on_from(told, known), True
 

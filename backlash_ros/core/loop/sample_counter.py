@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from itertools import islice
 from typing import NamedTuple
 
@@ -51,6 +52,24 @@ class Output(NamedTuple):
     received_ns: int
     sequence: int
     numbered: bool = True
+
+
+class JointOutputs(NamedTuple):
+    """y of the joints, by name, in one message; the rest as in Output. Joints may be missing."""
+
+    y: Mapping[str, float]
+    stamp_ns: int
+    sent_ns: int
+    received_ns: int
+    sequence: int
+    numbered: bool = True
+
+    def of(self, joint: str) -> Output:
+        """What it says of one of its joints."""
+        return Output(
+            self.y[joint], self.stamp_ns, self.sent_ns, self.received_ns, self.sequence,
+            self.numbered,
+        )
 
 
 class Arrival(NamedTuple):

@@ -9,6 +9,7 @@ Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 
 CONTROLLER, PLANT, REFERENCE, RECORDER = 'controller', 'plant', 'reference', 'recorder'
 BRINGUP = 'bringup'
+JOINTS = 'joints'
 # Whose names the sections of a parameter file have.
 NODES = (CONTROLLER, PLANT, REFERENCE, RECORDER, BRINGUP)
 
@@ -182,13 +183,26 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter('estimates.save_period', 10.0,
               'time between two savings while running, 0 to save on request and at the end only',
               's', low=0.0, high=86400.0, live=True),
+    Parameter(JOINTS, (),
+              'joints of an arm, each a loop of its own in one controller, in the order of their '
+              'commands in an array; empty for one loop', names=True),
     Parameter('io.style', 'native',
               'native: Float64 on plant_output and control; ros2_control: JointState on '
-              'joint_states and Float64MultiArray on forward_command_controller/commands',
-              choices=('native', 'ros2_control'), used_by=(CONTROLLER, REFERENCE, RECORDER)),
-    Parameter('io.joint', '', 'ros2_control: name of the joint, empty where there is just one',
+              'joint_states and Float64MultiArray on forward_command_controller/commands; '
+              'joint_state_topic: JointState, references on robot_joint_command, outputs on '
+              'robot_joint_states, commands as io.command says',
+              choices=('native', 'ros2_control', 'joint_state_topic'),
+              used_by=(CONTROLLER, REFERENCE, RECORDER)),
+    Parameter('io.command', 'joint_state',
+              'joint_state_topic: JointState on joint_commands, or an array of all joints on '
+              'forward_command_controller/commands', choices=('joint_state', 'array'),
+              used_by=(CONTROLLER, RECORDER)),
+    Parameter('io.together', True,
+              'where one joint is silent for timeout.plant_output, all joints do on_timeout, until '
+              'it is back'),
+    Parameter('io.joint', '', 'name of the joint in JointState, empty where there is just one',
               used_by=(CONTROLLER, REFERENCE)),
-    Parameter('io.field', 'position', 'ros2_control: what of the joint is y',
+    Parameter('io.field', 'position', 'what of the joint is y in JointState',
               choices=('position', 'velocity', 'effort'), used_by=(CONTROLLER, REFERENCE)),
     Parameter('io.best_effort', False,
               'listen to a driver that publishes best effort, which may lose messages',
@@ -264,6 +278,14 @@ PARAMETERS: tuple[Parameter, ...] = (
               'none waits for a driver that is started elsewhere, empty is the simulated plant',
               used_by=(BRINGUP,)),
 )
+
+# What a controller with several joints has once.
+NODE_WIDE = frozenset((
+    'sample_period', 'lockstep', 'wait_for_subscribers', JOINTS, 'autostart', 'on_stop',
+    'on_timeout', 'on_rival', 'timeout.plant_output', 'timeout.reference', 'timeout.ramp',
+    'estimates.file', 'estimates.load', 'estimates.save_period',
+    'io.style', 'io.command', 'io.together', 'io.joint', 'io.field', 'io.best_effort',
+))
 
 BY_NAME: dict[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
 

@@ -9,7 +9,8 @@ from math import hypot, isfinite, isinf, isnan, sqrt
 from typing import cast
 
 from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
-from backlash_ros.core.parameters.table import BY_NAME, PARAMETERS, Parameter, Value
+from backlash_ros.core.parameters.joints import check_joints, split, values_of
+from backlash_ros.core.parameters.table import BY_NAME, JOINTS, PARAMETERS, Parameter, Value
 
 NOISE = 'estimator.output_noise_std'
 LARGEST = 1e100  # squares, and products of two, still are numbers
@@ -22,8 +23,11 @@ class Parameters(Mapping[str, Value]):
 
     def __init__(self, values: Mapping[str, object] | None = None) -> None:
         """Take given values and the defaults of all others; raises ParameterError."""
-        self._given = given = dict(values or {})
-        check_names(given)
+        self._given = dict(values or {})
+        joints = _names(BY_NAME[JOINTS], self._given.get(JOINTS, ()))
+        given, own = split(self._given, joints)
+        check_joints(joints)
+        check_names(given, joints)
         self._values = {
             p.name: check_value(p, given[p.name]) if p.name in given else p.default
             for p in PARAMETERS
@@ -34,6 +38,16 @@ class Parameters(Mapping[str, Value]):
                 self.get_float('output_noise_std'), self.get_float('output_quantum') / sqrt(12.0)
             )
             self._values[NOISE] = max(self.get_float(NOISE), simulated)
+        self._of_joints = {joint: _of_joint(joint, given, own[joint]) for joint in joints}
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints; a single one without `joints` is nameless."""
+        return tuple(self._of_joints) or ('',)
+
+    def of_joint(self, joint: str) -> Parameters:
+        """Those of one of the `joints`, or of the only one, which may be nameless."""
+        return self._of_joints[joint] if self._of_joints else self
 
     def __getitem__(self, name: str) -> Value:
         return self._values[name]
@@ -100,12 +114,25 @@ def missing_limits(p: Parameters) -> list[str]:
     return [name for name in LIMITS if isinf(p.get_float(name))]
 
 
-def check_names(names: Iterable[str]) -> None:
+def check_names(names: Iterable[str], joints: Iterable[str] = ()) -> None:
     """Raise ParameterError for the first unknown name, naming the nearest valid one."""
     for name in names:
         if name not in BY_NAME:
-            near = difflib.get_close_matches(name, BY_NAME, n=1, cutoff=0.0)[0]
+            valid = [*BY_NAME, *(f'{joint}.{own}' for joint in joints for own in BY_NAME)]
+            near = difflib.get_close_matches(name, valid, n=1, cutoff=0.0)[0]
             raise ParameterError(name, UNTOLD, 'is not a parameter', f'did you mean {near}?')
+
+
+def _of_joint(
+    joint: str, shared: Mapping[str, object], own: Mapping[str, object],
+) -> Parameters:
+    values = values_of(joint, shared, own)
+    try:
+        return Parameters(values)
+    except ParameterError as error:
+        if error.name in own:
+            raise error.under(joint) from None
+        raise
 
 
 def check_value(parameter: Parameter, value: object) -> Value:

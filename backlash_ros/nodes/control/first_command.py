@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from math import isfinite
 
-from backlash_ros import topics
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.report_use import AWAITED_REPORTS
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters, missing_limits
+from backlash_ros.nodes.control.reports import Reports
 from backlash_ros.nodes.runtime.driver_io import DriverIo
-from backlash_ros.nodes.runtime.inbox import Inbox
 from backlash_ros.nodes.runtime.spin import ProcessNode
 
 
@@ -20,7 +19,7 @@ class FirstCommand:
     reports: those of the driver, None in lockstep. before: v before a cleanup, None without one.
     """
 
-    def __init__(self, node: ProcessNode, io: DriverIo, reports: Inbox | None) -> None:
+    def __init__(self, node: ProcessNode, io: DriverIo, reports: Reports | None) -> None:
         self._node, self._io, self._reports = node, io, reports
         self.before: float | None = None
         self._warned: set[str] = set()  # texts
@@ -49,9 +48,13 @@ class FirstCommand:
         self._unanswered += 1
         if reported and self._unanswered <= AWAITED_REPORTS:
             return False
+        if self._io.in_joint_space:
+            # v and y are the same angle but for the gap: the joint holds where it stands.
+            loop.go_on_from(output.y / loop.estimate.m)
+            return True
         self._warn_once(
             'nobody says which v acts now, so the first command goes on from 0: publish '
-            f'{topics.APPLIED_CONTROL}, or set control.initial'
+            f'{self._io.topics.applied}, or set control.initial'
         )
         return True
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 from rclpy.timer import Timer
 
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.messages import DIAGNOSTICS_PERIOD_S
 from backlash_ros.nodes.runtime.spin import ProcessNode
@@ -22,48 +23,64 @@ class LastCommandSender:
     def __init__(self, node: ProcessNode, io: DriverIo) -> None:
         self._node, self._io = node, io
         self._ramp: Timer | None = None
+        self._commands: dict[ControlLoop, Iterator[float]] = {}  # of loops that are on their way
 
     @property
     def _step_s(self) -> float:
         return max(self._node.settings.get_float('sample_period'), SHORTEST_STEP_S)
 
-    def begin(self, loop: ControlLoop, action: str) -> None:
-        """Send them from a timer while the node goes on."""
-        commands = loop.last_commands(action)
+    def begin(self, loops: JointLoops, ending: Iterable[ControlLoop], action: str) -> None:
+        """Send those of some loops from a timer while the node goes on."""
+        self._commands |= {loop: loop.last_commands(action) for loop in ending}
 
         def send_next() -> None:
-            v = next(commands, None)
-            if v is None:
-                self.end()
-            else:
-                loop.send(v)
+            for loop, commands in list(self._commands.items()):
+                v = next(commands, None)
+                if v is None:
+                    self.end(loop)
+                else:
+                    loop.send(v)
+            loops.send()
 
-        self.end()
-        self._ramp = self._node.create_timer(
-            self._step_s, send_next, clock=self._node.steady_clock
-        )
+        if self._ramp is None:
+            self._ramp = self._node.create_timer(
+                self._step_s, send_next, clock=self._node.steady_clock
+            )
 
-    def end(self) -> None:
-        """Send no more of them."""
-        if self._ramp is not None:
+    def end(self, *loops: ControlLoop) -> None:
+        """Send no more of them, of these loops or, where none is named, of all."""
+        for loop in loops or list(self._commands):
+            self._commands.pop(loop, None)
+        if self._ramp is not None and not self._commands:
             self._node.destroy_timer(self._ramp)
             self._ramp = None
 
     def send_all(
-        self, loop: ControlLoop, action: str, longest_s: float, tell: Callable[[], None],
+        self, loops: JointLoops, action: str, longest_s: float, tell: Callable[[], None],
     ) -> None:
-        """Send them now; v comes to rest where that takes longer than longest_s [s].
+        """Send those of all loops now; v comes to rest where that takes longer than longest_s [s].
 
         So it does at a SIGTERM that comes meanwhile: whoever sends it will kill the process next.
         tell: called at least every second, so that who stands down does not take this node for
         gone.
         """
+        under_way = {
+            loop: loop.last_commands(action) for loop in loops.by_name.values()
+            if loop.last is not None and not loop.standing_down
+        }
         told = time.monotonic()
         deadline, step_s = told + longest_s, self._step_s
-        commands, cut_short = loop.last_commands(action), ''
-        while (v := next(commands, None)) is not None:
-            loop.send(v)
-            if v == loop.zero and loop.core.motion.move == 0.0:
+        cut_short = ''
+        held: tuple[ControlLoop, ...] = ()
+        while True:
+            for loop, commands in list(under_way.items()):
+                v = next(commands, None)
+                if v is not None:
+                    loop.send(v)
+                if v is None or (v == loop.zero and loop.core.motion.move == 0.0):
+                    del under_way[loop]
+            loops.send()
+            if not under_way:
                 break
             if not cut_short:
                 if self._node.urged.is_set():
@@ -71,12 +88,14 @@ class LastCommandSender:
                 elif time.monotonic() + step_s > deadline:
                     cut_short = f'it did not reach zero within timeout.ramp={longest_s:g} s'
                 if cut_short:
-                    commands = loop.last_commands('hold')
+                    under_way = {loop: loop.last_commands('hold') for loop in under_way}
+                    held = tuple(under_way)
                     continue
             time.sleep(step_s) if cut_short else self._node.urged.wait(step_s)
             if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
                 told = time.monotonic()
                 tell()
         if cut_short:
-            self._node.log.warning(f'v={loop.v:.6g} is held: {cut_short}')
+            for loop in held:
+                self._node.log.warning(f'v={loop.v:.6g} is held: {cut_short}')
         self._io.wait_until_received(CONFIRMED_WITHIN_S)

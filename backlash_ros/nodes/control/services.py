@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future as Writing
 from typing import Protocol, cast
 
@@ -20,13 +20,15 @@ UNCONFIGURED = 'the controller is unconfigured: configure it first'
 class Served(Protocol):
     """What the services are about."""
 
-    loop: ControlLoop | None
+    @property
+    def configured(self) -> Sequence[ControlLoop]:
+        """The loops, none while there are none."""
 
-    def save_estimates(self) -> Writing[str]:
-        """Begin to save the estimates; the result says why it failed, empty if it did not."""
+    def save_estimates(self) -> list[Writing[str]]:
+        """Begin to save what is worth it; each result says why it failed, empty if it did not."""
 
     @property
-    def estimates_file(self) -> str:
+    def estimates_files(self) -> str:
         """Where to, empty for nowhere."""
 
 
@@ -34,55 +36,53 @@ def offer_services(node: Node, served: Served) -> None:
     """Create ~/freeze_adaptation, ~/enable_compensation, ~/reset_estimates, ~/save_estimates."""
 
     def when_configured(
-        response: SetBool.Response | Trigger.Response, action: Callable[[ControlLoop], str],
+        response: SetBool.Response | Trigger.Response, action: Callable[[ControlLoop], None],
+        done: str,
     ) -> None:
-        loop = served.loop
-        response.success = loop is not None
-        response.message = UNCONFIGURED if loop is None else action(loop)
+        loops = served.configured
+        for loop in loops:
+            action(loop)
+        response.success = bool(loops)
+        response.message = done if loops else UNCONFIGURED
         node.get_logger().info(response.message)
 
     def freeze(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        def set_adapting(loop: ControlLoop) -> str:
-            loop.adapt(not request.data)
-            return 'estimates are held' if request.data else 'the controller learns'
-
-        when_configured(response, set_adapting)
+        when_configured(
+            response, lambda loop: loop.adapt(not request.data),
+            'estimates are held' if request.data else 'the controller learns',
+        )
         return response
 
     def enable(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        def set_compensating(loop: ControlLoop) -> str:
-            loop.compensate(request.data)
-            return 'the gap is compensated' if request.data else 'the gap is not compensated'
-
-        when_configured(response, set_compensating)
+        when_configured(
+            response, lambda loop: loop.compensate(request.data),
+            'the gap is compensated' if request.data else 'the gap is not compensated',
+        )
         return response
 
     def reset(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        def begin_anew(loop: ControlLoop) -> str:
-            loop.reset()
-            return 'the estimates are those of estimator.initial'
-
-        when_configured(response, begin_anew)
+        when_configured(
+            response, lambda loop: loop.reset(),
+            'the estimates are those of estimator.initial',
+        )
         return response
 
     async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        loop = served.loop
-        if loop is None:
+        if not served.configured:
             response.message = UNCONFIGURED
-        elif not served.estimates_file:
+        elif not served.estimates_files:
             response.message = 'estimates.file is empty, so there is nowhere to save: start with ' \
                 '-p estimates.file:=PATH, or set it while unconfigured'
-        elif not worth_saving(loop.estimate):
+        elif not any(worth_saving(loop.estimate) for loop in served.configured):
             response.message = 'nothing was learned yet'
         else:
             # The loop goes on while the disk takes its time.
-            written: Future = Future()
-            saved = served.save_estimates()
-            saved.add_done_callback(lambda _: written.set_result(None))
-            await written
-            why = saved.result()
+            reasons = []
+            for saved in served.save_estimates():
+                reasons.append(await _result_of(saved))
+            why = '; '.join(filter(None, reasons))
             response.success = not why
-            response.message = why or f'saved in {served.estimates_file}'
+            response.message = why or f'saved in {served.estimates_files}'
         return response
 
     node.create_service(SetBool, '~/freeze_adaptation', freeze)
@@ -94,3 +94,10 @@ def offer_services(node: Node, served: Served) -> None:
         callback_group=MutuallyExclusiveCallbackGroup(),
     )
 
+
+async def _result_of(writing: Writing[str]) -> str:
+    """What a thread comes to, while the executor goes on."""
+    written: Future = Future()
+    writing.add_done_callback(lambda _: written.set_result(None))
+    await written
+    return writing.result()

@@ -22,14 +22,16 @@ BAND = 2.0  # half width of the band around an estimate, in standard deviations
 class WatchPublisher:
     """Publishes `controller/watch/<label>` for each label of which there is a subscriber.
 
+    Of a joint that has a name: `controller/watch/<joint>/<label>`.
+
     The topics take turns, so that after a command of a fast loop one message leaves, not all.
     After v(k) comes the u that it led to, which is known with y(k+1): points of their loop.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, joint: str = '') -> None:
         self._publishers: dict[str, Publisher] = {
             label: node.create_publisher(
-                Float64, topics.of_node(topics.watched(label)), DEPTH,
+                Float64, topics.of_node(topics.watched(label, joint)), DEPTH,
                 event_callbacks=without_events(),
             ) for label in topics.WATCH_LABELS
         }

@@ -8,9 +8,7 @@ from math import isfinite, isnan, nan
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Float64
 
-from backlash_ros import topics
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.loop.causes import LONGEST_TEXT, findings_of
@@ -24,17 +22,20 @@ from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.diagnostics.neighbours import publishers_of, subscribers_of
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 
+ABSENT = 5  # messages in a row without a joint that is not there
+
 
 class Diagnosis:
-    """Collects what is known of the loop and its neighbours, and says what is wrong with it.
+    """Collects what is known of a loop and its neighbours, and says what is wrong with it.
 
-    output_qos, reference_qos: with which the controller listens.
+    joint: of the loop. output_qos, reference_qos: with which the controller listens.
     """
 
     def __init__(
-        self, node: Node, io: DriverIo, output_qos: QoSProfile, reference_qos: QoSProfile,
+        self, node: Node, io: DriverIo, joint: str, output_qos: QoSProfile,
+        reference_qos: QoSProfile,
     ) -> None:
-        self._node, self._io = node, io
+        self._node, self._io, self._joint = node, io, joint
         self._output_qos, self._reference_qos = output_qos, reference_qos
         self._lately = Lately()
         self._consistent_at = time.monotonic()  # the newest look at which it was, or there was none
@@ -69,13 +70,17 @@ class Diagnosis:
             self._consistent_at = time.monotonic()
         gap = loop.estimate.c_r - loop.estimate.c_l
         timeout = p.get_float('timeout.reference')
-        overdue = reference_at_s is not None and not p.get_bool('lockstep') \
+        # Hardware on topics falls silent where all joints are where they belong.
+        needed = not (p.get_bool('lockstep') or self._io.in_joint_space)
+        overdue = reference_at_s is not None and needed \
             and 0.0 < timeout < time.monotonic() - reference_at_s
         control = io.topics.control
         return LoopFigures(
             p.get_float('sample_period'),
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
-            publishers_of(node, topics.REFERENCE, Float64, self._reference_qos),
+            publishers_of(
+                node, io.topics.reference, io.topics.reference_type, self._reference_qos
+            ),
             subscribers_of(node, control, io.topics.control_type), rivals,
             standing_down=loop.standing_down,
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
@@ -98,7 +103,7 @@ class Diagnosis:
 
     def _of_messages(self, p: Parameters) -> list[Finding]:
         io = self._io
-        if not io.skipped:
+        if io.skipped[self._joint] < ABSENT:
             return []
         text = (
             f'{io.topics.output} has no {p.get_str("io.field")} of joint {p.get_str("io.joint")!r} '

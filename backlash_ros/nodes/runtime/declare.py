@@ -16,7 +16,8 @@ from rclpy.parameter import Parameter as RosParameter
 
 from backlash_ros.core.parameters import Parameters, check_value
 from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
-from backlash_ros.core.parameters.table import BY_NAME, PARAMETERS, Parameter, Value
+from backlash_ros.core.parameters.joints import entry_of
+from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS, Parameter, Value
 
 # Declared by rclpy itself in every node.
 ROS_OWN = {'use_sim_time', 'start_type_description_service'}
@@ -24,8 +25,8 @@ ROS_OWN = {'use_sim_time', 'start_type_description_service'}
 
 # What decides on the topics and the life of a node stays as it was at its start.
 FIXED = (
-    'autostart', 'estimator.use_applied_control', 'io.best_effort', 'io.field', 'io.joint',
-    'io.style', 'lockstep', 'wait_for_subscribers',
+    'autostart', 'estimator.use_applied_control', 'io.best_effort', 'io.command', 'io.field',
+    'io.joint', 'io.style', 'io.together', 'joints', 'lockstep', 'wait_for_subscribers',
 )
 
 
@@ -42,15 +43,20 @@ def declare_parameters(
     parameters = Parameters({
         name: _given_value(parameter) for name, parameter in given.items() if name not in ROS_OWN
     })
-    declared = [p for p in PARAMETERS if executable in p.used_by]
+    values = {p.name: parameters[p.name] for p in PARAMETERS if executable in p.used_by}
+    if executable == CONTROLLER:
+        # Of a joint's own parameters those that were given: all of them would be hundreds.
+        values |= {
+            name: parameters.of_joint(joint)[own] for name in given
+            for joint, _, own in [name.partition('.')] if joint in parameters.joints
+        }
     node.declare_parameters('', [
-        (p.name, _declarable(parameters[p.name]), ParameterDescriptor()) for p in declared
+        (name, _declarable(name, value), ParameterDescriptor()) for name, value in values.items()
     ], ignore_override=True)
-    empty = [_ros_parameter(p.name, ()) for p in declared if parameters[p.name] == ()]
     # With one value missing rclpy tells none of those that it is asked for.
-    node.set_parameters(empty)
-    for p in declared:
-        node.set_descriptor(p.name, describe(p, reconfigurable))
+    node.set_parameters([_ros_parameter(name, ()) for name, v in values.items() if v == ()])
+    for name in values:
+        node.set_descriptor(name, describe(_entry(name), name, reconfigurable))
     return parameters
 
 
@@ -63,7 +69,7 @@ def changed_values(node: Node, requested: Sequence[RosParameter]) -> list[RosPar
     changes = []
     for change in requested:
         present = node.get_parameter(change.name).value if node.has_parameter(change.name) else None
-        parameter = BY_NAME.get(change.name)
+        parameter = entry_of(change.name)
         if parameter is None or present is None:
             if present is None or change.value != present:
                 changes.append(change)
@@ -74,12 +80,14 @@ def changed_values(node: Node, requested: Sequence[RosParameter]) -> list[RosPar
     return changes
 
 
-def describe(parameter: Parameter, reconfigurable: bool = False) -> ParameterDescriptor:
+def describe(
+    parameter: Parameter, name: str, reconfigurable: bool = False,
+) -> ParameterDescriptor:
     """What tools like rqt and `ros2 param describe` show."""
     changes = parameter.live or (reconfigurable and parameter.name not in FIXED)
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
-        name=parameter.name, type=_ros_parameter(parameter.name, parameter.default).type_.value,
+        name=name, type=_ros_parameter(name, parameter.default).type_.value,
         description=parameter.description + unit,
         additional_constraints=_constraints(parameter), read_only=not changes,
     )
@@ -113,7 +121,8 @@ class LiveParameters:
 
     def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
         for change in changes:
-            if change.name in BY_NAME and not (BY_NAME[change.name].live or self._is_free()):
+            entry = entry_of(change.name)
+            if entry is not None and not (entry.live or self._is_free()):
                 return SetParametersResult(successful=False, reason=(
                     f'{change.name} is read-only while the node is configured: deactivate it and '
                     'clean it up first'
@@ -130,7 +139,7 @@ class LiveParameters:
 
     def _with(self, changes: list[RosParameter]) -> Parameters:
         return self.parameters.replaced(
-            {change.name: change.value for change in changes if change.name in BY_NAME}
+            {change.name: change.value for change in changes if entry_of(change.name) is not None}
         )
 
 
@@ -138,7 +147,7 @@ def _given_value(parameter: RosParameter) -> object:
     """The value that somebody has given; rcl reads an empty list as no value at all."""
     if parameter.value is not None:
         return parameter.value
-    declared = BY_NAME.get(parameter.name)
+    declared = entry_of(parameter.name)
     if declared is not None and (declared.names or declared.may_be_empty):
         return ()
     raise ParameterError(
@@ -146,15 +155,26 @@ def _given_value(parameter: RosParameter) -> object:
     )
 
 
-def _declarable(value: Value) -> object:
+def _entry(name: str) -> Parameter:
+    entry = entry_of(name)
+    assert entry is not None
+    return entry
+
+
+def _declarable(name: str, value: Value) -> object:
     """The value, or one in place of an empty list, whose type rclpy could not tell."""
-    return [0.0] if value == () else list(value) if isinstance(value, tuple) else value
+    if value == ():
+        return [''] if _entry(name).names else [0.0]
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _ros_parameter(name: str, value: Value) -> RosParameter:
     if value == ():
-        return RosParameter(name, RosParameter.Type.DOUBLE_ARRAY, [])
-    return RosParameter(name, value=_declarable(value))
+        kind = RosParameter.Type
+        return RosParameter(
+            name, kind.STRING_ARRAY if _entry(name).names else kind.DOUBLE_ARRAY, []
+        )
+    return RosParameter(name, value=_declarable(name, value))
 
 
 def _constraints(parameter: Parameter) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
@@ -15,28 +15,55 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.sample_counter import Output
+from backlash_ros.core.loop.sample_counter import JointOutputs
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.table import JOINTS
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.number_message import message_with, number_of
 from backlash_ros.nodes.runtime.spin import ProcessNode
 
 
 class DriverTopics(NamedTuple):
-    """Where y comes from and v goes to."""
+    """Where y_m and y come from, where v goes to, and where the driver reports it."""
 
+    reference: str
+    reference_type: type[Any]
     output: str
     output_type: type[Any]
     control: str
     control_type: type[Any]
+    applied: str
+    applied_type: type[Any]
 
 
 STYLES = {
-    'native': DriverTopics(topics.PLANT_OUTPUT, Float64, topics.CONTROL, Float64),
+    'native': DriverTopics(
+        topics.REFERENCE, Float64, topics.PLANT_OUTPUT, Float64, topics.CONTROL, Float64,
+        topics.APPLIED_CONTROL, Float64,
+    ),
     'ros2_control': DriverTopics(
-        topics.JOINT_STATES, JointState, topics.JOINT_COMMANDS, Float64MultiArray
+        topics.REFERENCE, Float64, topics.JOINT_STATES, JointState, topics.JOINT_COMMANDS,
+        Float64MultiArray, topics.APPLIED_CONTROL, Float64,
+    ),
+    'joint_state_topic': DriverTopics(
+        topics.ROBOT_COMMAND, JointState, topics.ROBOT_STATES, JointState,
+        topics.JOINT_STATE_COMMANDS, JointState, topics.APPLIED_JOINT_COMMANDS, JointState,
     ),
 }
+
+
+def driver_topics(p: Parameters) -> DriverTopics:
+    """The topics and types that io.style, io.command and joints ask for."""
+    found = STYLES[p.get_str('io.style')]
+    if p.get_str('io.style') == 'joint_state_topic':
+        if p.get_str('io.command') == 'array':
+            found = found._replace(control=topics.JOINT_COMMANDS, control_type=Float64MultiArray)
+    elif p[JOINTS]:
+        found = found._replace(
+            reference_type=JointState, applied=topics.APPLIED_JOINT_COMMANDS,
+            applied_type=JointState,
+        )
+    return found
 
 
 def output_qos(p: Parameters, depth: int) -> QoSProfile:
@@ -47,31 +74,30 @@ def output_qos(p: Parameters, depth: int) -> QoSProfile:
     ))
 
 
-def message_with_one(v: float) -> Float64MultiArray:
-    """A message with this number as the only one of several."""
-    return Float64MultiArray(data=array('d', (v,)))
-
-
 class DriverIo:
     """What a node says to the driver and hears from it, in the messages that io.style names.
 
-    skipped: messages without the joint. seen: the joints of the newest one of them.
-    repeats_stamps: whether the driver has sent a stamp twice; since then the time of sending
-    counts. simulated_time: whether stamps are those of /clock.
+    Joints are told apart by name; the only one of a controller without `joints` is nameless, and
+    io.joint says what it is called in messages. skipped: messages in a row without a joint. seen:
+    the joints of the newest of these. repeats_stamps: whether the driver has sent a stamp twice;
+    since then the time of sending counts. simulated_time: whether stamps are those of /clock.
     """
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
-        self.skipped, self.seen = 0, ''
+        self.skipped, self.seen = dict.fromkeys(p.joints, 0), ''
         self.repeats_stamps = False
-        self._header_ns = self._number = 0  # of the newest message with the joint
+        self._header_ns = self._number = 0  # of the newest message with a joint
         self._node, self._p = node, p
-        self.topics = STYLES[p.get_str('io.style')]
-        self._joint, self._field = p.get_str('io.joint'), p.get_str('io.field')
+        self.topics = driver_topics(p)
+        self._field = p.get_str('io.field')
+        self._joints = p.joints
+        self._called = {joint: joint or p.get_str('io.joint') for joint in p.joints}
+        self._joint_of = {called: joint for joint, called in self._called.items()}
         # On simulated time the stamps of the middleware, which are real time, say nothing.
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._publisher: Publisher | None = None
-        several = self.topics.control_type is Float64MultiArray
-        self._message_with = message_with_one if several else message_with
+        self._newest: dict[str, float] = {}  # v by joint
+        self._referred = JointState()  # the newest message of references
 
     @property
     def publisher(self) -> Publisher:
@@ -89,6 +115,11 @@ class DriverIo:
         """Whether y comes from the plant of this package: no other one tells the truth."""
         return self._node.count_publishers(topics.TRUTH) > 0
 
+    @property
+    def in_joint_space(self) -> bool:
+        """Whether v is where the joint is to go, in the unit of y."""
+        return self._p.get_str('io.style') == 'joint_state_topic'
+
     def now_ns(self) -> int:
         """Time on the clock of the stamps."""
         # time.time_ns() is the system clock of ROS, without the detour.
@@ -99,35 +130,65 @@ class DriverIo:
         """When a message left, on the clock of the stamps."""
         return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
 
-    def listen(self, hear: Callable[[Output], None], depth: int) -> Subscription:
+    def listen(self, hear: Callable[[JointOutputs], None], depth: int) -> Subscription:
         """Call hear with every y."""
         def hear_number(message: bytes, info: dict[str, Any]) -> None:
             sent_ns = info['source_timestamp']
             stamp_ns = self.now_ns() if self.simulated_time else sent_ns
-            hear(Output(
-                number_of(message), stamp_ns, sent_ns, info['received_timestamp'],
+            hear(JointOutputs(
+                {'': number_of(message)}, stamp_ns, sent_ns, info['received_timestamp'],
                 info['publication_sequence_number'],
             ))
 
-        def hear_joint(message: JointState, info: dict[str, Any]) -> None:
-            values = getattr(message, self._field)
-            row = self._row(message.name, len(values))
-            if row < 0:
-                self.skipped, self.seen = self.skipped + 1, ', '.join(message.name)
+        def hear_joints(message: JointState, info: dict[str, Any]) -> None:
+            values = self.values(message)
+            for joint in self._joints:
+                self.skipped[joint] = 0 if joint in values else self.skipped[joint] + 1
+            if len(values) < len(self._joints):
+                self.seen = ', '.join(message.name)
+            if not values:
                 return
             stamp, number = message.header.stamp, info['publication_sequence_number']
             stamp_ns = self._header_stamp_ns(stamp.sec * 10**9 + stamp.nanosec, number)
             # Drivers that leave the header empty are known by the stamp of the middleware.
-            hear(Output(
-                values[row], stamp_ns or self.stamp_ns(info), info['source_timestamp'],
+            hear(JointOutputs(
+                values, stamp_ns or self.stamp_ns(info), info['source_timestamp'],
                 info['received_timestamp'], number, numbered=False,
             ))
 
         of_joints = self.topics.output_type is JointState
         return self._node.listen(
-            self.topics.output_type, self.topics.output, hear_joint if of_joints else hear_number,
+            self.topics.output_type, self.topics.output, hear_joints if of_joints else hear_number,
             output_qos(self._p, depth), raw=not of_joints,
         )
+
+    def listen_to_references(
+        self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int,
+    ) -> Subscription:
+        """Call hear with every y_m."""
+        def hear_values(message: Float64 | JointState) -> None:
+            if isinstance(message, JointState):
+                self._referred = message
+            hear(self.values(message))
+
+        return self._node.create_subscription(
+            self.topics.reference_type, self.topics.reference, hear_values, qos
+        )
+
+    def values(self, message: Float64 | Float64MultiArray | JointState) -> dict[str, float]:
+        """What a message says about the joints of this node, by their names."""
+        if isinstance(message, Float64):
+            return {'': message.data}
+        if isinstance(message, Float64MultiArray):
+            fits = len(message.data) == len(self._joints)
+            return dict(zip(self._joints, message.data, strict=True)) if fits else {}
+        values = getattr(message, self._field)
+        if '' in self._joint_of:
+            return {'': values[0]} if len(values) == 1 else {}
+        return {
+            self._joint_of[name]: value
+            for name, value in zip(message.name, values, strict=False) if name in self._joint_of
+        }
 
     def advertise(self) -> Publisher:
         """Make the publisher of v."""
@@ -136,25 +197,39 @@ class DriverIo:
         self._publisher = publisher
         return publisher
 
-    def listen_to_commands(self, hear: Callable[[float], None]) -> Subscription:
+    def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
         """Call hear with every v that anybody sends to the driver."""
-        def hear_number(message: Float64) -> None:
-            hear(message.data)
-
-        def hear_numbers(message: Float64MultiArray) -> None:
-            if len(message.data) == 1:
-                hear(message.data[0])
-
-        several = self.topics.control_type is Float64MultiArray
         return self._node.create_subscription(
             self.topics.control_type, self.topics.control,
-            hear_numbers if several else hear_number, 1,
+            lambda message: hear(self.values(message)), 1,
         )
 
-    def publish(self, v: float) -> None:
-        """Send v to the driver."""
+    def publish(self, commands: Mapping[str, float]) -> None:
+        """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""
         assert self._publisher is not None
-        self._publisher.publish(self._message_with(v))
+        if self.topics.control_type is Float64:
+            self._publisher.publish(message_with(commands['']))
+        elif self.topics.control_type is JointState:
+            self._publisher.publish(self._joint_state(commands))
+        else:
+            self._newest.update(commands)
+            if len(self._newest) == len(self._joints):
+                data = array('d', map(self._newest.__getitem__, self._joints))
+                self._publisher.publish(Float64MultiArray(data=data))
+
+    def _joint_state(self, commands: Mapping[str, float]) -> JointState:
+        """v, and what the newest reference says of the joints besides."""
+        names = [self._called[joint] for joint in commands]
+        message = JointState(name=names)
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        row = {name: i for i, name in enumerate(self._referred.name)}
+        for field in ('position', 'velocity', 'effort'):
+            passed = getattr(self._referred, field)
+            if field == self._field:
+                setattr(message, field, list(commands.values()))
+            elif all(row.get(name, len(passed)) < len(passed) for name in names):
+                setattr(message, field, [passed[row[name]] for name in names])
+        return message
 
     def wait_until_received(self, timeout_s: float) -> None:
         """Wait until the driver has confirmed the newest v, or the timeout is over."""
@@ -168,13 +243,3 @@ class DriverIo:
             self.repeats_stamps = self._node.count_publishers(self.topics.output) == 1
         self._header_ns, self._number = stamp_ns, number
         return 0 if self.repeats_stamps else stamp_ns
-
-    def _row(self, names: list[str], count: int) -> int:
-        """Row of the joint, -1 where it is missing."""
-        if not self._joint:
-            return 0 if count == 1 else -1
-        try:
-            row = names.index(self._joint)
-        except ValueError:
-            return -1
-        return row if row < count else -1

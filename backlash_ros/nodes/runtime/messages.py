@@ -60,16 +60,17 @@ class DiagnosticsPublisher:
     """Publishes the state of one node to /diagnostics, and its changes to the log.
 
     hardware_id: what the node has to do with. logs: False for a node that says itself what has
-    changed.
+    changed. part: what of the node it is about, empty for all of it.
     """
 
-    def __init__(self, node: Node, hardware_id: str, logs: bool = True) -> None:
-        self._node = node
+    def __init__(self, node: Node, hardware_id: str, logs: bool = True, part: str = '') -> None:
+        self._node, self._part = node, part
         self._publisher = node.create_publisher(
             DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=without_events()
         )
+        name = node.get_fully_qualified_name().strip('/')
         self._status = DiagnosticStatus(
-            name=node.get_fully_qualified_name().strip('/'), hardware_id=hardware_id
+            name=f'{name}: {part}' if part else name, hardware_id=hardware_id
         )
         self._message = DiagnosticArray(status=[self._status])
         self._log = LevelLog(self._write) if logs else None
@@ -89,6 +90,7 @@ class DiagnosticsPublisher:
     def _write(self, level: Level, text: str) -> None:
         # rclpy remembers a severity for each place in the code.
         log = Node.get_logger(self._node)
+        text = f'{self._part}: {text}' if self._part else text
         if level == Level.OK:
             log.info(text)
         elif level == Level.WARN:

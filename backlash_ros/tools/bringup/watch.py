@@ -1,4 +1,4 @@
-"""A run in progress: what its processes report, how long to wait, when it is over, what failed."""
+"""A run in progress: what its processes say, how long to wait, when it is over, what went wrong."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ PLAIN_LINE_PERIOD_S = 2.0  # between two lines of progress where there is no ter
 
 # Where y may come from, as the ends of full names.
 OUTPUTS = (f'/{topics.PLANT_OUTPUT}', f'/{topics.JOINT_STATES}')
-# Exit codes of a driver that ended on SIGINT or SIGTERM; a shell adds 128 to the signal.
-ENDED_BY_SIGNAL = {
+# How a driver may end that was told to by a signal; a shell adds 128 to its number.
+TOLD_TO_END = {
     code for number in (signal.SIGINT, signal.SIGTERM) for code in (-number, 128 + number)
 }
 
 
 def complain(message: str) -> None:
-    """Print on stderr what went wrong."""
+    """Say on stderr what went wrong."""
     print(f'bringup: {message}', file=sys.stderr, flush=True)
 
 
 class ProgressDisplay:
     """Progress of an axis: a bar on a terminal, now and then a plain line anywhere else.
 
-    line: position of its bar among those of all axes.
+    line: the one of its bar among those of all axes.
     """
 
     def __init__(self, plan: AxisPlan, stream: TextIO, line: int = 0) -> None:
         self._plan, self._stream = plan, stream
         self._next_line = 0.0  # when a plain one is due, on the monotonic clock [s]
         self._bar: tqdm[None] | None = None
-        # Terminals of containers may have no size: tqdm would show nothing.
+        # The terminals of containers and recorders may have no size: tqdm would show nothing.
         if stream.isatty() and all(os.get_terminal_size(stream.fileno())):
             tqdm.monitor_interval = 0  # no thread beside the loop that starts processes
             done = '{percentage:3.0f} % |{bar:16}| {n_fmt}/{total_fmt}' if plan.samples \
@@ -68,9 +68,9 @@ class ProgressDisplay:
             self._next_line = time.monotonic() + PLAIN_LINE_PERIOD_S
             of_all = f'/{self._plan.samples}' if self._plan.samples else ''
             t = made * self._plan.sample_period
-            self.print(self._plan.titled(f'{t:7.2f} s  {made}{of_all}  {describe(progress)}'))
+            self.say(self._plan.titled(f'{t:7.2f} s  {made}{of_all}  {describe(progress)}'))
 
-    def print(self, line: str) -> None:
+    def say(self, line: str) -> None:
         """Print a line above the bar."""
         if self._bar is not None:
             self._bar.write(line, file=self._stream)
@@ -102,7 +102,7 @@ def _number(values: Mapping[str, object], name: str) -> float:
 
 
 def _counts(values: Mapping[str, object], name: str) -> dict[str, int]:
-    """The counts of an event by what was counted, empty where they are missing."""
+    """The counts in an event by what was counted, empty where they are missing."""
     value = values.get(name)
     return value if isinstance(value, dict) else {}
 
@@ -110,9 +110,9 @@ def _counts(values: Mapping[str, object], name: str) -> dict[str, int]:
 class AxisProgress:
     """How far an axis has come, and how long to wait for its next sample.
 
-    made: samples so far. first: number of the one that counts as the first. began, moved: time of
-    the beginning and of the newest sample, on the monotonic clock [s]. published: how many samples,
-    and messages by topic, a simulated plant has published, once it is done.
+    made: samples so far. first: number of the one that counts as the first. began, moved: when the
+    run began, and when the newest sample was heard of, on the monotonic clock [s]. published:
+    samples and messages by topic that can have been heard of a simulated plant, once it is done.
     """
 
     def __init__(self, plan: AxisPlan, display: ProgressDisplay) -> None:
@@ -120,8 +120,8 @@ class AxisProgress:
         self.made = self.first = 0
         self.began = self.moved = time.monotonic()
         self.published: Mapping[str, int] | None = None
-        self._received: dict[str, int] = {}
-        self._silence_reported = False
+        self._heard: dict[str, int] = {}
+        self._silence_told = False
 
     @property
     def patience(self) -> float:
@@ -137,26 +137,26 @@ class AxisProgress:
 
     @property
     def complete(self) -> bool:
-        """Whether all samples were made: a plant reports its end, a driver does not."""
+        """Whether all samples were made; a driver does not say so, the recorder hears it."""
         if self.plan.has_driver:
             return 0 < self.plan.samples <= self.made
         return self.published is not None
 
     @property
     def unheard(self) -> dict[str, int]:
-        """How much of what was published the recorder has not received yet."""
+        """What is missing of the published ones."""
         missing = {
-            what: count - self._received.get(what, 0)
+            what: count - self._heard.get(what, 0)
             for what, count in (self.published or {}).items()
         }
         return {what: count for what, count in missing.items() if count > 0}
 
     def begin(self) -> None:
-        """Start the clock."""
+        """The time starts to run."""
         self.began = self.moved = time.monotonic()
 
     def take(self, progress: Mapping[str, object]) -> None:
-        """Use a progress event of the recorder."""
+        """Take in what the recorder says."""
         sample = _number(progress, 'sample')
         if not isfinite(sample):
             return
@@ -165,9 +165,9 @@ class AxisProgress:
             # A driver may have been running before; a simulated plant begins with sample 0.
             self.first = int(sample) if self.plan.has_driver else 0
         made = int(sample) + 1 - self.first
-        self._received = {'samples': made, **_counts(progress, 'received')}
+        self._heard = {'samples': made, **_counts(progress, 'received')}
         if made > self.made:
-            self.made, self.moved, self._silence_reported = made, time.monotonic(), False
+            self.made, self.moved, self._silence_told = made, time.monotonic(), False
             self.display.show(progress, made)
 
     def check_pace(self) -> None:
@@ -177,7 +177,7 @@ class AxisProgress:
             if not plan.driver_is_elsewhere and now > self.began + FIRST_SAMPLE_DEADLINE_S:
                 raise BrokenOffError(plan.titled(
                     f'no sample within {FIRST_SAMPLE_DEADLINE_S:g} s: does the driver publish its '
-                    f'output? See {plan.logs}; if it needs longer, start it yourself '
+                    f'output? See {plan.logs}; where it needs longer, start it yourself '
                     '(--driver none)'
                 ))
             return
@@ -185,7 +185,7 @@ class AxisProgress:
             return
         if now > self.deadline:
             raise BrokenOffError(plan.titled(
-                f'only {self.made} of {plan.samples} samples {LATE_DEADLINE_S:g} s after the end '
+                f'only {self.made} of {plan.samples} samples, {LATE_DEADLINE_S:g} s after the end '
                 f'was due, see {plan.logs}'
             ))
         if now > self.moved + self.patience:
@@ -194,9 +194,9 @@ class AxisProgress:
             if not plan.has_driver:
                 raise BrokenOffError(f'{silence}, see {plan.logs}')
             # The controller knows what to do when a real plant falls silent.
-            if not self._silence_reported:
-                self._silence_reported = True
-                self.display.print(f'bringup: {silence}, waiting for the driver')
+            if not self._silence_told:
+                self._silence_told = True
+                self.display.say(f'bringup: {silence}, waiting for the driver')
 
 
 class RunWatch:
@@ -224,27 +224,26 @@ class RunWatch:
 
     def execute(self) -> None:
         """Wait until all samples are made, then stop everything; sets failure."""
-        axes = self._axes.values()
         try:
             self._wait_until_ready()
-            for axis in axes:
+            for axis in self._axes.values():
                 if axis.made == 0:
                     axis.begin()
-            while not (self._over or all(axis.complete for axis in axes)):
+            while not (self._over or all(axis.complete for axis in self._axes.values())):
                 self._listen()
-                for axis in axes:
+                for axis in self._axes.values():
                     axis.check_pace()
             self._catch_up()
             if self._over:
-                self._print(f'{self._requests.last} ends the run')
+                self._say(f'{self._requests.last} ends the run')
         except BrokenOffError as error:
-            # Printed before the processes are stopped, which may take a while.
+            # Said before the processes are stopped, which may take a while.
             self._fail(str(error))
         for event in self._supervisor.stop():
             self._note(event)
         if not self.failure:
             self._judge_exits()
-        for axis in axes:
+        for axis in self._axes.values():
             axis.display.close()
 
     @property
@@ -257,11 +256,11 @@ class RunWatch:
 
     def _fail(self, message: str) -> None:
         self.failure = message
-        self._print(message)
+        self._say(message)
 
-    def _print(self, message: str) -> None:
+    def _say(self, message: str) -> None:
         """Print a line above all bars."""
-        next(iter(self._axes.values())).display.print(f'bringup: {message}')
+        next(iter(self._axes.values())).display.say(f'bringup: {message}')
 
     def _wait_until_ready(self) -> None:
         deadline = time.monotonic() + READY_DEADLINE_S
@@ -284,7 +283,7 @@ class RunWatch:
         ]
 
     def _may_wait(self, child: Child) -> bool:
-        """Whether it waits for a driver or an operator who may come at any time."""
+        """Whether it waits for somebody who may come at any time."""
         axis = self._axes[child.plan.axis].plan
         waiting = []
         if axis.driver_is_elsewhere or axis.is_managed:
@@ -295,7 +294,7 @@ class RunWatch:
         return child.plan.name in waiting
 
     def _catch_up(self) -> None:
-        """Wait until the recorder has received all that was published, and name what is missing."""
+        """Wait until the recorder has told of all that was published, and say what is missing."""
         deadline = time.monotonic() + CATCH_UP_DEADLINE_S
         while not self._over and time.monotonic() < deadline and any(
             axis.unheard for axis in self._axes.values()
@@ -304,8 +303,8 @@ class RunWatch:
         for axis in self._axes.values():
             if axis.unheard:
                 missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
-                self._print(axis.plan.titled(
-                    f'the plant has published more than the recorder received: {missing}'
+                self._say(axis.plan.titled(
+                    f'the plant has published more than the recorder heard: {missing}'
                 ))
 
     def _listen(self) -> None:
@@ -318,13 +317,13 @@ class RunWatch:
             raise BrokenOffError('\n'.join(_end(child, 'died') for child in dead))
 
     def _may_end(self, child: Child) -> bool:
-        """Whether the run continues without it, which is reported once."""
+        """Whether the run goes on without it, which is said once."""
         name = child.plan.name
         if not child.plan.spectator or name not in self._ready:
             return False
         if name not in self._gone:
             self._gone.add(name)
-            self._print(_end(child, 'died', ', the run continues without it'))
+            self._say(_end(child, 'died', ', the run goes on without it'))
         return True
 
     def _note(self, event: Event) -> None:
@@ -339,20 +338,24 @@ class RunWatch:
             axis.take(event.content)
         elif event.kind == 'recording_stopped':
             # The log may lie on the very disk that is full.
-            self._print(str(event.content.get('reason', '')))
+            self._say(str(event.content.get('reason', '')))
         elif event.kind == 'closed' and axis.plan.record and axis.made:
-            if event.content.get('failure'):
-                return
-            for topic, count in _counts(event.content, 'messages').items():
-                if topic.endswith(OUTPUTS) and count == 0:
-                    self._print(
-                        f'the bag holds no message of {topic}, although the controller received '
-                        'them: the recorder did not discover the publisher before the run ended; '
-                        f'let the driver wait until {topic} has two subscribers, or run longer'
-                    )
+            self._report_unheard(event.content)
+
+    def _report_unheard(self, closed: Mapping[str, object]) -> None:
+        """Say so where the bag holds what the controller made of y, but no y."""
+        if closed.get('failure'):
+            return
+        for topic, count in _counts(closed, 'messages').items():
+            if topic.endswith(OUTPUTS) and count == 0:
+                self._say(
+                    f'the bag holds no message of {topic}, which the controller has heard: the '
+                    'recorder did not discover its publisher before the end of the run; let the '
+                    f'driver wait until {topic} has two subscribers, or run longer'
+                )
 
     def _judge_exits(self) -> None:
-        """Check how the processes that were stopped have ended."""
+        """Look at how the processes have ended that were told to."""
         bad = []
         for child in self._supervisor.children:
             code = child.process.returncode
@@ -360,15 +363,15 @@ class RunWatch:
                 continue
             if not child.plan.foreign or code == -signal.SIGKILL:
                 bad.append(_end(child, 'did not stop cleanly'))
-            elif code not in ENDED_BY_SIGNAL:
-                # Which exit code a driver of the user chooses is not for us to judge.
-                self._print(_end(child, 'was stopped'))
+            elif code not in TOLD_TO_END:
+                # How a program of the user says good-bye is its own affair.
+                self._say(_end(child, 'was stopped'))
         if bad:
             self._fail('\n'.join(bad))
 
 
 def _end(child: Child, what: str, further: str = '') -> str:
     return (
-        f'{child.plan.name} {what} ({child.describe_exit()}){further}; the end of '
+        f'{child.plan.name} {what} ({child.describe_exit()}){further}, the end of '
         f'{child.end_of_log()}'
     )

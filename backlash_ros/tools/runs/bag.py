@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import inf
 from pathlib import Path
@@ -33,16 +33,16 @@ LABELS = {
 LARGEST_RESTART_SHARE = 0.1
 
 
-@dataclass(frozen=True)
+@dataclass
 class Content:
-    """Decoded messages of a bag by recorded topic, with stamps [ns], in the order of the stamps.
+    """Stamps [ns] and messages of the wanted topics by recorded name, in the order of stamps.
 
-    names: of all its topics. damage: what is wrong with it and the cure, '' for nothing.
+    names: of all topics of the bag. damage: what is wrong with it and the cure, '' for nothing.
     """
 
-    messages: Mapping[str, list[tuple[int, Any]]]
-    names: Sequence[str]
-    damage: str
+    names: set[str] = field(default_factory=set)
+    messages: dict[str, list[tuple[int, Any]]] = field(default_factory=dict)
+    damage: str = ''
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Table:
 
     @property
     def sample(self) -> Stamps:
-        """Number of the sample of each row."""
+        """The count of each row."""
         return self.column('sample').astype(np.int64)
 
     def rows(self, chosen: Any) -> Table:
@@ -78,11 +78,11 @@ class Table:
 def read_bag(
     path: Path, sample_period: float | None = None, span: Span = WHOLE, axis: str = '',
 ) -> Run:
-    """Read the run that a bag holds, without its parameters.
+    """Read the run that a bag holds; nothing is said about its parameters.
 
     t = (sample - first) * sample_period; None takes the median distance of the stamps. A gap in
-    the sample numbers is a lost sample. Of a damaged bag what is left is read. If the controller
-    was restarted, only its last run within the span is read. axis: of several, '' for the first.
+    the count is a lost sample. Of a damaged bag what is left is read. Where the controller was
+    restarted, it is what the last one did within the span. axis: of several, '' for the first.
     Raises InputError, in one line, for a bag that cannot be read or holds no run.
     """
     content = read_topics(path, lambda topic: topic.message_type == ARRAY and any(
@@ -94,7 +94,9 @@ def read_bag(
         raise InputError(f'{error}; {content.damage}' if content.damage else str(error)) from None
     begin_ns = float(tables[topics.SIGNALS].stamps[0])
     restarted = _choose_section(tables, span)
-    signals, estimates = tables[topics.SIGNALS], tables[topics.ESTIMATES]
+    signals, estimates, truth = (
+        tables[topic] for topic in (topics.SIGNALS, topics.ESTIMATES, topics.TRUTH)
+    )
     if not signals.stamps.size:
         raise InputError(f'{path}: holds no sample between --from and --to')
     count, of_signals, of_estimates = np.intersect1d(
@@ -105,7 +107,7 @@ def read_bag(
     if sample_period is None:
         sample_period = _median_period(path, count, signals.stamps[of_signals])
         notes.append(
-            f'the sample period of {sample_period:.6g} s was derived from the stamps of the bag, '
+            f'the sample period of {sample_period:.6g} s was taken from the stamps of the bag, '
             'as no parameters were given'
         )
     rows = np.full((count.size, len(COLUMNS)), np.nan)
@@ -113,28 +115,29 @@ def read_bag(
         for i, name in enumerate(COLUMNS):
             if name in table.labels:
                 rows[:, i] = table.column(name)[index]
-    _fill_in_truth(rows, count, tables[topics.TRUTH])
+    _fill_in_truth(rows, count, truth)
     rows[:, COLUMNS.index('t')] = (count - count[0]) * sample_period
-    recorded = np.union1d(signals.sample, estimates.sample)
-    if recorded.size > count.size:
+    heard = np.union1d(signals.sample, estimates.sample)
+    if heard.size > count.size:
         notes.append(
-            f'{recorded.size - count.size} samples were left out: the bag holds only one of '
-            'signals and estimates'
+            f'{heard.size - count.size} samples were left out: only one of signals and estimates '
+            'is in the bag'
         )
+    learned = _newest_model(models, signals.stamps[0], begin_ns + span.to_s * 1e9)
     record = RunRecord(
-        rows, sample_period, int(recorded[-1] - recorded[0]) + 1 - recorded.size,
-        _newest_model(models, signals.stamps[0], begin_ns + span.to_s * 1e9),
+        rows, sample_period, int(heard[-1] - heard[0]) + 1 - heard.size, learned
     )
     notes = [content.damage, *notes, restarted]
     latency_s = signals.column('latency_s')[of_signals]
-    return Run(record, None, latency_s, tuple(filter(None, notes)))
+    return Run(record, None, latency_s, tuple(note for note in notes if note))
 
 
 def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
     """Decode the wanted topics of a bag, or what is left of them; raises InputError."""
     types = get_typestore(Stores.ROS2_JAZZY)
-    found: dict[str, list[tuple[int, Any]]] = {}
-    garbled = 0
+    content = Content()
+    count = garbled = 0
+    first, last = 2**63, 0
     try:
         reader = BagReader(path)
     except BagError as error:
@@ -146,22 +149,21 @@ def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
         except Exception:
             garbled += 1
             continue
-        found.setdefault(topic.name, []).append((stamp_ns, message))
-    if reader.damage and not reader.topics:
+        content.messages.setdefault(topic.name, []).append((stamp_ns, message))
+        first, last, count = min(first, stamp_ns), max(last, stamp_ns), count + 1
+    content.names = {topic.name for topic in reader.topics}
+    if reader.damage and not content.names:
         raise InputError(f'{path}: {reader.damage}, and nothing of it can be read')
-    for messages in found.values():
-        messages.sort(key=lambda each: each[0])
-    damage = ''
     if reader.damage or garbled:
         unread = f', {garbled} more cannot be decoded' if garbled else ''
-        span_ns = max((each[-1][0] for each in found.values()), default=0) - \
-            min((each[0][0] for each in found.values()), default=0)
-        damage = (
-            f'{path} {reader.damage or "is damaged"}: this is what is left, '
-            f'{sum(map(len, found.values()))} messages of {span_ns * 1e-9:.1f} s{unread}; once '
-            f'recording has ended, `{CURE} {path}` completes it'
+        content.damage = (
+            f'{path} {reader.damage or "is damaged"}: this is what is left, {count} messages of '
+            f'{max(last - first, 0) * 1e-9:.1f} s{unread}; once it is not being recorded any more, '
+            f'`{CURE} {path}` completes it'
         )
-    return Content(found, sorted(topic.name for topic in reader.topics), damage)
+    for messages in content.messages.values():
+        messages.sort(key=lambda each: each[0])
+    return content
 
 
 def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
@@ -225,19 +227,19 @@ def _find_tables(
             models = messages
         elif messages:
             tables[topic] = _tabulate(path, name, labels, messages)
-        elif topic == topics.TRUTH:  # unknown for a real plant
+        elif topic == topics.TRUTH:  # which a real plant does not know
             tables[topic] = Table(labels, np.empty((0, len(labels))), np.empty(0, np.int64))
         elif name:
             raise InputError(f'{path}: holds no message of {name}')
         else:
+            heard = ', '.join(sorted(content.names)) or 'nothing'
             of_axis = f' of axis {axis}' if axis else ''
-            names = ', '.join(content.names) or 'nothing'
-            raise InputError(f'{path}: holds no {topic}{of_axis}, only {names}')
+            raise InputError(f'{path}: holds no {topic}{of_axis}, only {heard}')
     return tables, models, notes
 
 
 def _names_of(content: Content, topic: str, labels: Sequence[str]) -> list[str]:
-    """Under which names a topic was recorded, those of renamed nodes last."""
+    """Under which names a topic was recorded; nodes that were renamed stand behind the others."""
     kept = {name for name in content.names if f'/{name}'.endswith(f'/{topic}')}
     renamed = {
         name for name, messages in content.messages.items()
@@ -331,10 +333,10 @@ def _unique(values: Array) -> tuple[Array, NDArray[np.intp]]:
 
 def _median_period(path: Path, count: Stamps, stamps: Stamps) -> float:
     if count.size < 2:
-        raise InputError(f'{path}: one sample does not show the sample period: give --config')
+        raise InputError(f'{path}: the sample period cannot be told from one sample: give --config')
     period = float(np.median(np.diff(stamps) / np.diff(count))) * 1e-9
     if not period > 0.0:
-        raise InputError(f'{path}: its stamps do not show the sample period: give --config')
+        raise InputError(f'{path}: its stamps do not tell the sample period: give --config')
     return period
 
 

@@ -153,7 +153,7 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
         raise InputError(f'{path}: line {line_number}: t must rise from row to row')
     if sample_period is None:
         if not len(steps):
-            raise InputError(f'{path}: one sample does not show the sample period: give --config')
+            raise InputError(f'{path}: needs two samples to tell the sample period')
         sample_period = float(steps.min())
     lost = max(round((t[-1] - t[0]) / sample_period) + 1 - len(t), 0)
     return RunRecord(rows, sample_period, lost)

@@ -87,7 +87,7 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
     axis.began -= 1.0 + LATE_DEADLINE_S - 0.5
     axis.check_pace()
     axis.began -= 1.0
-    with pytest.raises(BrokenOffError, match=r'^only 42 of 100 samples '):
+    with pytest.raises(BrokenOffError, match=r'^only 42 of 100 samples, '):
         axis.check_pace()
 
 

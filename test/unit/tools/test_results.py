@@ -226,7 +226,7 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
         (f'{OLD_HEADER}\n0,1\n', 'line 2: must hold 10 numbers'),
         (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', 'line 2: must hold 10 numbers'),
         (f'{OLD_HEADER}\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
-        (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\n', 'does not show the sample period'),
+        (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
     ],
 )
 def test_mistake_in_samples_names_the_line(tmp_path: Path, text: str, message: str) -> None:

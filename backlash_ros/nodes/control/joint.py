@@ -1,0 +1,137 @@
+"""One joint of the controller: its loop, and what is said and kept of it."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import Future
+
+from rclpy.qos import QoSProfile
+
+from backlash_ros.core.assembly import build_controller, first_guess
+from backlash_ros.core.control.controller import ControlStep
+from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.estimates_file import worth_saving
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.figures import Finding, Level
+from backlash_ros.core.loop.sample_counter import JointOutputs
+from backlash_ros.core.parameters import NOISE, Parameters
+from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.nodes.control.estimate_saver import EstimateSaver
+from backlash_ros.nodes.control.first_command import FirstCommand
+from backlash_ros.nodes.control.model_publisher import ModelPublisher
+from backlash_ros.nodes.control.reports import Reports
+from backlash_ros.nodes.diagnostics.diagnosis import Diagnosis, counts_of, values_of, worst
+from backlash_ros.nodes.diagnostics.rivals import RivalWatch
+from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
+from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
+from backlash_ros.nodes.runtime.spin import ProcessNode
+
+
+class Joint:
+    """What the controller has of each joint; a single one is nameless.
+
+    p: its parameters. loop: None while the node is unconfigured. reference_at: when the newest y_m
+    came, on the steady clock [s].
+    """
+
+    def __init__(
+        self, node: ProcessNode, name: str, p: Parameters, io: DriverIo, reports: Reports | None,
+        reference_qos: QoSProfile,
+    ) -> None:
+        self.name, self.p = name, p
+        self.loop: ControlLoop | None = None
+        self.reference_at: float | None = None
+        self.model = ModelPublisher(node, name)
+        self.first_command = FirstCommand(node, io, reports)
+        self.saver = EstimateSaver(p.get_str('estimates.file'))
+        self._node, self._io = node, io
+        self._told: Status | None = None  # the newest one that /diagnostics has
+        self._diagnosis = Diagnosis(node, io, name, output_qos(p, DEPTH), reference_qos)
+        self._diagnostics = DiagnosticsPublisher(
+            node, p.get_str('io.joint') or io.publisher.topic_name, part=name
+        )
+
+    def begin(self, loop: ControlLoop, before: Estimate) -> None:
+        """Take a new loop."""
+        self.loop = loop
+        self.model.publish(loop)
+        if before.learned:
+            self._node.log.info(
+                f'going on with the estimates in {self.saver.file}: m={before.m:.6g}, '
+                f'c_r={before.c_r:.6g}, c_l={before.c_l:.6g}'
+            )
+
+    def end(self) -> None:
+        """Give the loop up, but remember its v."""
+        if self.loop is not None and self.loop.knows_v:
+            self.first_command.before = self.loop.v
+        self.loop = None
+
+    def may_begin(self, outputs: JointOutputs) -> bool:
+        """Whether it is known from which v the first command goes on, or waiting is in vain."""
+        assert self.loop is not None
+        return self.first_command.may_follow(self.loop, outputs.of(self.name), self.p)
+
+    def follow(self, step: ControlStep, was_silent: bool) -> bool:
+        """Tell of a step; returns whether there is something new to say in /diagnostics."""
+        assert self.loop is not None
+        self.model.follow(self.loop, self.p.get_float('sample_period'))
+        news = was_silent or step.estimate.status != self._told
+        self._told = step.estimate.status
+        return news
+
+    def is_overdue(self) -> bool:
+        """Whether its driver has been silent for too long, and that is new."""
+        loop, timeout = self.loop, self.p.get_float('timeout.plant_output')
+        return loop is not None and loop.heard_at is not None and not loop.silent \
+            and 0.0 < timeout < time.monotonic() - loop.heard_at
+
+    def check_change(self, p: Parameters) -> None:
+        """Raise ParameterError for values that the running loop cannot take up."""
+        build_controller(p, first_guess(p))
+        loop = self.loop
+        if loop is not None and p[NOISE] != self.p[NOISE] \
+                and NOISE not in loop.core.estimator.RETUNED:
+            raise ParameterError(
+                NOISE, p[NOISE], f'is not taken up live by {p.get_str("estimator.law")}',
+                'clean the node up, set it, and configure again',
+            )
+
+    def take_up(self, p: Parameters) -> None:
+        """Use other values."""
+        self.p = p
+        if self.loop is not None:
+            self.loop.take_up(p)
+        else:
+            self.saver.file = p.get_str('estimates.file')
+
+    def save(self) -> Future[str] | None:
+        """Begin to save the estimates; None where there is nothing worth it, or nowhere to."""
+        if self.loop is None or not self.saver.file or not worth_saving(self.loop.estimate):
+            return None
+        return self.saver.save(self.loop.estimate, self.p)
+
+    def diagnose(self, rivals: RivalWatch, active: bool) -> None:
+        """Publish what is going on to /diagnostics."""
+        loop, claim = self.loop, rivals.claim
+        if loop is None:
+            self._diagnostics.publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), claim)
+        elif not active:
+            text = f'inactive: no {self._io.topics.control} is published'
+            self._diagnostics.publish(
+                Finding(Level.OK, 'inactive', text), {**values_of(loop), **claim}
+            )
+        else:
+            findings, details = self._diagnosis.findings(
+                loop, self.p, self.reference_at, tuple(rival.name for rival in rivals.found)
+            )
+            self._diagnostics.publish(worst(findings), {**details, **values_of(loop), **claim})
+
+    def sum_up(self) -> None:
+        """Say in the log what was counted."""
+        if self.loop is not None:
+            said = ', '.join(
+                f'{key}: {count}' for key, count in counts_of(self.loop).items()
+                if count or key == 'samples'
+            )
+            self._node.log.info(f'{self.name}: {said}' if self.name else said)

@@ -1,0 +1,104 @@
+"""Loops of several joints in one: each is the loop that it would be alone, whatever others do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import inf, isnan, nan
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.assembly import first_guess
+from backlash_ros.core.loop.joint_loops import JointLoops
+from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.plant.backlash import Backlash
+
+PERIOD, SAMPLES, FAULTS = 0.01, 4000, 1000
+JOINTS = ('waist', 'elbow', 'wrist', 'gripper')
+Outputs = dict[str, float]
+Spoil = Callable[[int, Outputs], Outputs]
+
+
+def parameters() -> Parameters:
+    """An arm of joints with a lag behind their gaps; the gripper passes through."""
+    values: dict[str, object] = {
+        'joints': JOINTS, 'sample_period': PERIOD, 'control.rate_max': 20.0,
+        'estimator.law': 'lms', 'estimator.initial.c_r': 0.02, 'estimator.initial.c_l': -0.02,
+        'estimator.initial.m': 1.0, 'proportional.f': 0.0,
+    }
+    for k, joint in enumerate(JOINTS[:-1]):
+        pole = 0.5 + 0.1 * k
+        values |= {f'{joint}.plant.numerator': [1.0 - pole],
+                   f'{joint}.plant.denominator': [1.0, -pole]}
+    return Parameters(values)
+
+
+def run(spoil: Spoil, samples: int = SAMPLES) -> dict[str, list[float]]:
+    """Commands of each joint, a number per sample; nan where none was sent."""
+    sent: dict[str, list[float]] = {joint: [] for joint in JOINTS}
+    newest: dict[str, float] = {}
+
+    def send(commands: Mapping[str, float]) -> None:
+        newest.update(commands)
+
+    p = parameters()
+    before = {joint: first_guess(p.of_joint(joint)) for joint in JOINTS}
+    loops = JointLoops(p, send, lambda: now_ns, before, SampleCounter(PERIOD))
+    plays = {joint: Backlash(1.0, 0.03 + 0.01 * k, -0.04) for k, joint in enumerate(JOINTS)}
+    y = dict.fromkeys(JOINTS, 0.0)
+    v = dict.fromkeys(JOINTS, 0.0)
+    for k in range(samples):
+        now_ns = round((1.0 + k * PERIOD) * 1e9)
+        loops.take_references({
+            joint: 0.5 * np.sin(0.02 * k + i) for i, joint in enumerate(JOINTS)
+        })
+        newest.clear()
+        loops.command(JointOutputs(spoil(k, dict(y)), now_ns, now_ns, now_ns, k, False))
+        loops.note()
+        for i, joint in enumerate(JOINTS):
+            sent[joint].append(newest.get(joint, nan))
+            v[joint] = newest.get(joint, v[joint])
+            pole = 0.5 + 0.1 * i
+            y[joint] = pole * y[joint] + (1.0 - pole) * plays[joint].step(v[joint])
+    return sent
+
+
+def test_a_thousand_faults_of_a_joint_change_no_command_of_another_by_a_bit() -> None:
+    rng = np.random.default_rng(1)
+    faults = dict(zip(
+        rng.choice(SAMPLES - 1, FAULTS, replace=False) + 1, rng.integers(5, size=FAULTS),
+        strict=True,
+    ))
+
+    def spoil(k: int, y: Outputs) -> Outputs:
+        if k not in faults:
+            return y
+        bad = (nan, inf, 1e200, -3.0)[faults[k]] if faults[k] < 4 else None
+        names = list(rng.permutation(JOINTS))
+        return {
+            name: bad if name == 'elbow' else y[name] for name in names
+            if name != 'elbow' or bad is not None
+        }
+
+    alone, beside = run(lambda k, y: y), run(spoil)
+    for joint in JOINTS:
+        same = np.array_equal(alone[joint], beside[joint], equal_nan=True)
+        assert same == (joint != 'elbow')
+    # A sensor that has nothing to say is not answered, one that lies is.
+    unanswered = sum(map(isnan, beside['elbow']))
+    assert unanswered == sum(fault != 3 for fault in faults.values())
+
+
+def test_a_joint_in_an_arm_is_the_loop_that_it_is_alone() -> None:
+    together = run(lambda k, y: y, 400)
+    for joint in JOINTS:
+        one = run(lambda k, y, joint=joint: {joint: y[joint]}, 400)  # type: ignore[misc]
+        assert one[joint] == together[joint]
+
+
+def test_a_joint_that_nobody_describes_gets_its_reference() -> None:
+    commands = run(lambda k, y: y, 400)['gripper']
+    assert commands[100:] == pytest.approx(
+        [0.5 * np.sin(0.02 * k + 3) for k in range(100, 400)], abs=1e-12
+    )

@@ -1,0 +1,221 @@
+"""A controller with several joints, through the messages of topic-based hardware."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from math import nan, sin
+from pathlib import Path
+
+import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from ros_processes import NodeProcess, RosWorld, ros_world
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray, Header
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import first_guess
+from backlash_ros.core.loop.joint_loops import JointLoops
+from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
+from backlash_ros.core.parameters import Parameters
+
+JOINTS = ['waist', 'elbow', 'gripper']
+PERIOD = 0.02
+ARM: dict[str, object] = {
+    'joints': JOINTS, 'io.style': 'joint_state_topic', 'sample_period': PERIOD,
+    'estimator.law': 'fixed', 'proportional.f': 0.0, 'control.rate_max': 50.0,
+    'control.min': -3.0, 'control.max': 3.0, 'timeout.plant_output': 0.0,
+    'estimator.initial.m': 1.0, 'estimator.initial.c_r': 0.02, 'estimator.initial.c_l': -0.03,
+    'waist.plant.numerator': [0.5], 'waist.plant.denominator': [1.0, -0.5],
+    'elbow.plant.numerator': [0.2], 'elbow.plant.denominator': [1.0, -0.8],
+    'elbow.estimator.initial.c_r': 0.05,
+}
+
+
+class Arm:
+    """Plays the hardware: sends states one by one, and waits for the commands that answer them."""
+
+    def __init__(self, world: RosWorld, changes: Mapping[str, object]) -> None:
+        self.parameters = Parameters({**ARM, **changes})
+        self.controller: NodeProcess = world.start('controller', {**ARM, **changes})
+        self.probe = world.probe()
+        array = self.parameters['io.command'] == 'array'
+        self.commands = self.probe.collect(
+            topics.JOINT_COMMANDS if array else topics.JOINT_STATE_COMMANDS,
+            Float64MultiArray if array else JointState,
+        )
+        self.diagnostics = self.probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
+        self.signals = self.probe.collect(topics.SIGNALS, Float64MultiArray)
+        self._states = self.probe.publisher(topics.ROBOT_STATES, JointState)
+        self._references = self.probe.publisher(topics.ROBOT_COMMAND, JointState)
+        self.probe.wait_until(
+            lambda: self.controller.events('ready') and self._states.get_subscription_count()
+            and self._references.get_subscription_count()
+            and self.probe.node.count_publishers(topics.SIGNALS), 'the controller',
+        )
+        self.k = 0
+
+    def refer(self, y_m: Mapping[str, float], velocity: float = 0.5) -> None:
+        """Send references, and let them arrive before what is sent next."""
+        self._references.publish(JointState(
+            name=list(y_m), position=list(y_m.values()), velocity=[velocity] * len(y_m)
+        ))
+        self.probe.spin(0.02)
+
+    def send(self, y: Mapping[str, float]) -> None:
+        """Send the states of the next sample."""
+        stamp_ns = self.stamp_ns(self.k)
+        self.k += 1
+        self._states.publish(JointState(
+            header=Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)),
+            name=list(y), position=list(y.values()),
+        ))
+
+    def answer(self, y: Mapping[str, float]) -> JointState | Float64MultiArray:
+        """Send states; returns the commands for them."""
+        before = len(self.commands)
+        self.send(y)
+        self.probe.wait_until(lambda: len(self.commands) > before, 'an answer')
+        return self.commands[-1]
+
+    @staticmethod
+    def stamp_ns(k: int) -> int:
+        """Of sample k."""
+        return round((1000.0 + k * PERIOD) * 1e9)
+
+    def says(self, joint: str, words: str) -> Callable[[], bool]:
+        """Whether a joint has said these words in /diagnostics."""
+        return lambda: any(
+            status.name == f'controller: {joint}' and words in text
+            for message in self.diagnostics for status in message.status
+            for text in (status.message, *(pair.value for pair in status.values))
+        )
+
+
+@contextmanager
+def arm(folder: Path, **changes: object) -> Iterator[Arm]:
+    with ros_world(folder) as world:
+        made = Arm(world, {name.replace('__', '.'): value for name, value in changes.items()})
+        yield made
+        assert made.controller.stop() == 0
+
+
+def reference(k: int) -> dict[str, float]:
+    return {joint: 0.4 * sin(0.3 * k + i) for i, joint in enumerate(JOINTS)}
+
+
+def output(k: int) -> dict[str, float]:
+    return {joint: 0.3 * sin(0.3 * k + i) for i, joint in enumerate(JOINTS)}
+
+
+def expected(p: Parameters, samples: int) -> list[dict[str, float]]:
+    """Commands of the same loops in this process; they begin where the joints stand."""
+    sent: list[dict[str, float]] = []
+    before = {joint: first_guess(p.of_joint(joint)) for joint in JOINTS}
+    loops = JointLoops(
+        p, lambda commands: sent.append(dict(commands)), lambda: 0, before,
+        SampleCounter(PERIOD, from_zero=False), dict(output(0)),
+    )
+    for k in range(samples):
+        loops.take_references(reference(k))
+        stamp_ns = Arm.stamp_ns(k)
+        loops.command(JointOutputs(output(k), stamp_ns, stamp_ns, stamp_ns, k, numbered=False))
+        loops.note()
+    return sent
+
+
+def test_every_joint_is_answered_by_its_own_loop_in_one_message(tmp_path: Path) -> None:
+    with arm(tmp_path) as it:
+        answers = []
+        for k in range(8):
+            it.refer(reference(k))
+            answers.append(it.answer(output(k)))
+        wanted = expected(it.parameters, 8)
+        for answer, commands in zip(answers, wanted, strict=True):
+            assert list(answer.name) == JOINTS
+            assert list(answer.position) == [commands[joint] for joint in JOINTS]
+            assert list(answer.velocity) == [0.5] * 3  # passed through
+        # Nobody has described the gripper.
+        assert answers[-1].position[2] == pytest.approx(reference(7)['gripper'], abs=1e-12)
+        it.probe.wait_until(lambda: len(it.signals) >= 8, 'signals')
+        labels = [dimension.label for dimension in it.signals[-1].layout.dim]
+        row = dict(zip(labels, it.signals[-1].data, strict=True))
+        assert row['elbow.v'] == wanted[-1]['elbow']
+        assert row['waist.y'] == output(7)['waist']
+        for joint in JOINTS:
+            it.probe.wait_until(it.says(joint, ''), f'diagnostics of {joint}')
+
+
+def test_joints_go_by_name_in_any_order_and_who_is_missing_is_said(tmp_path: Path) -> None:
+    with arm(tmp_path) as it:
+        it.refer({'elbow': 0.2, 'nobody': 7.0, 'waist': 0.1, 'gripper': nan})
+        it.refer({'gripper': 0.3})
+        first = it.answer({'stranger': 9.0, 'gripper': 0.0, 'elbow': 0.0, 'waist': 0.0})
+        assert list(first.name) == JOINTS
+        for _ in range(8):
+            answer = it.answer({'elbow': 0.0, 'waist': 0.0})
+            assert list(answer.name) == ['waist', 'elbow']
+        it.probe.wait_until(
+            it.says('gripper', "no position of joint 'gripper' but elbow, waist"), 'who is missing'
+        )
+        assert list(it.answer({'gripper': 0.0, 'elbow': 0.0, 'waist': 0.0}).name) == JOINTS
+
+
+def test_an_array_has_the_commands_of_all_joints_in_their_order(tmp_path: Path) -> None:
+    with arm(tmp_path, io__command='array') as it:
+        it.refer(reference(0))
+        it.send({'waist': 0.0, 'elbow': 0.0})  # no array before there is a v for all
+        for k in range(1, 4):
+            it.refer(reference(k))
+            answer = it.answer(output(k))
+        assert len(answer.data) == 3
+        assert len(it.commands) == 3
+        assert answer.data[2] == pytest.approx(reference(3)['gripper'], abs=1e-12)
+
+
+@pytest.mark.parametrize('together', [True, False])
+def test_an_arm_that_has_lost_a_joint_stops_as_one_or_goes_on_as_told(
+    tmp_path: Path, together: bool,
+) -> None:
+    changes = {'timeout__plant_output': 0.3, 'io__together': together}
+    with arm(tmp_path, **changes) as it:
+        it.refer({'waist': 0.5, 'elbow': 0.5, 'gripper': 0.5})
+        it.answer(dict.fromkeys(JOINTS, 0.0))
+        others, silence = {'waist': 0.0, 'elbow': 0.0}, 'no robot_joint_states for 0.3 s'
+
+        def lost() -> bool:
+            it.send(others)
+            it.probe.spin(0.02)
+            stopped = not together or it.says('waist', silence)()
+            return stopped and it.says('gripper', silence)()
+
+        def back() -> bool:
+            it.send(dict.fromkeys(JOINTS, 0.0))
+            it.probe.spin(0.02)
+            return list(it.commands[-1].name) == JOINTS
+
+        it.probe.wait_until(lost, 'the silence of the gripper')
+        for _ in range(5):
+            it.send(others)
+        sent = it.k - 1
+        it.probe.wait_until(back, 'all joints')
+        answered = sum(list(command.name) == ['waist', 'elbow'] for command in it.commands)
+        assert (answered == sent) == (not together)
+        assert answered <= sent - 5 * together
+
+
+@pytest.mark.parametrize(('changes', 'said'), [
+    ({'io.style': 'native'}, "io.style='native' has messages for one joint only"),
+    ({'joints': ['']}, 'joints'),
+    ({'elbow.plant.numerators': [1.0]}, 'elbow.plant.numerators is not a parameter'),
+])
+def test_a_mistake_ends_the_process_with_a_sentence(
+    tmp_path: Path, changes: Mapping[str, object], said: str,
+) -> None:
+    with ros_world(tmp_path) as world:
+        controller = world.start('controller', {**ARM, **changes})
+        assert controller.wait() == 2
+        assert said in controller.stderr
+
+
