@@ -1,0 +1,82 @@
+"""How many small faults, put into the package by a seed, the tests find.
+
+    .venv/bin/python benchmarks/mutants.py --seed 1 --count 80 [--rooms unit loop system]
+
+A mutant has one operator, comparison, constant or call changed. It meets the test files whose
+imports lead to its module, the nearest first, until one of them fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import random
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from reporting import ROOT
+
+PAIRS = [(ast.Lt, ast.LtE), (ast.Gt, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot),
+         (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or)]
+SWAPS = dict([*PAIRS, *((b, a) for a, b in PAIRS)])
+LEFT_OUT = shutil.ignore_patterns('.git', '.venv', 'results', 'build', '__pycache__', '.*_cache')
+
+
+def mutations(tree: ast.Module) -> list[tuple[ast.AST, str, object]]:
+    """All that may be changed: a node, its field, the other value."""
+    found: list[tuple[ast.AST, str, object]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.BinOp, ast.BoolOp)) and type(node.op) in SWAPS:
+            found.append((node, 'op', SWAPS[type(node.op)]()))
+        elif isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
+            found.append((node, 'ops', [SWAPS[type(node.ops[0])](), *node.ops[1:]]))
+        elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
+            flipped = not node.value if isinstance(node.value, bool) else 1.3 * node.value + 1
+            found.append((node, 'value', type(node.value)(flipped)))
+        elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+            found.append((node, 'value', ast.Constant(None)))
+    return found
+
+
+def tests_of(module: str, rooms: list[str]) -> list[str]:
+    """Test files whose imports lead to a module, the nearest first."""
+    files = {'.'.join(path.relative_to(ROOT).with_suffix('').parts): path
+             for path in ROOT.glob('backlash_ros/**/*.py')}
+    files |= {p.stem: p for room in ('test', 'benchmarks') for p in (ROOT / room).rglob('*.py')}
+    needs = {name: {part for node in ast.walk(ast.parse(path.read_text()))
+                    if isinstance(node, ast.ImportFrom) and node.module
+                    for part in (node.module, *(f'{node.module}.{a.name}' for a in node.names))}
+             for name, path in files.items()}
+    near = [module]
+    for name in near:
+        near += [other for other in files if other not in near and name in needs[other]]
+    found = [files[name].relative_to(ROOT) for name in near if name.startswith('test_')]
+    return [str(path) for path in found if path.parts[1] in rooms and 'project' not in path.parts]
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--seed', type=int, default=1)
+    parser.add_argument('--count', type=int, default=80)
+    parser.add_argument('--rooms', nargs='+', default=['unit', 'loop'])
+    options, caught = parser.parse_args(), 0
+    places = [(path, i) for path in sorted(ROOT.glob('backlash_ros/**/*.py'))
+              for i in range(len(mutations(ast.parse(path.read_text()))))]
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(shutil.copytree(ROOT, f'{folder}/copy', ignore=LEFT_OUT))
+        for path, i in random.Random(options.seed).sample(places, options.count):
+            node, field, value = mutations(tree := ast.parse(path.read_text()))[i]
+            before, where = ast.unparse(node), path.relative_to(ROOT)
+            setattr(node, field, value)
+            (copy / where).write_text(ast.unparse(tree))
+            tests = tests_of('.'.join(where.with_suffix('').parts), options.rooms)
+            pytest = [sys.executable, '-m', 'pytest', '-xqq', '-p', 'no:cacheprovider', *tests]
+            fails = bool(tests) and subprocess.run(pytest, cwd=copy, capture_output=True).returncode
+            caught += bool(fails)
+            shutil.copy(path, copy / where)
+            print('caught' if fails else 'MISSED', f'{where}:{node.lineno}: {before} ->',
+                  ast.unparse(node), f'({len(tests)} files)', flush=True)
+    print(f'{caught} of {options.count} caught')
