@@ -128,8 +128,8 @@ class Bench:
                 self.node, self._reference(0.01 * self._k),
                 Output(self.plant.measure(), self._now_ns, 0, 0, self._k),
             )
-            if self.node.loop is not None:
-                self.loop.core.refine()  # however long it takes
+            for loop in self.node.configured:
+                loop.core.refine()  # however long it takes
 
     def serve(self) -> None:
         """Let the node do what it has to do besides."""
