@@ -7,12 +7,11 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from math import inf, nan
+from multiprocessing.pool import Pool
 
 import numpy as np
 import yaml
@@ -23,13 +22,11 @@ from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.table import BY_NAME, Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
-from backlash_ros.options import FAILED
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples
 from backlash_ros.tools.runs.run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
 
-PATIENCE_S = 5.0  # after an interruption, until the process ends whatever it waits for
 # The matrices are tiny: threads of the linear algebra would only disturb the other processes.
 ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
 GROUPS = {'': 'final', 'std_': 'final_std', 'true_': 'truth', 'settling_': 'settling_time_s'}
@@ -147,68 +144,57 @@ def run_jobs(jobs: Sequence[Job], workers: int | None = None, label: str = '') -
     """Outcomes in the order of the jobs, whatever the number of processes.
 
     workers: None takes one process per processor, 1 none besides this one. Call it from the main
-    thread, which alone is told of signals.
+    thread, which alone receives signals. Raises BrokenOffError if a worker was killed.
     """
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
             os.cpu_count() or 1)
     workers = min(workers, len(jobs))
-    tqdm.monitor_interval = 0  # a thread would take the signals that are held back below
+    tqdm.monitor_interval = 0  # a thread would take the signal that is held back below
     # disable=None: no bar where stderr is not a terminal.
-    with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
-        outcomes: dict[int, Outcome] = {}
-        if workers <= 1:
-            for i, job in enumerate(jobs):
-                outcomes[i] = run_job(job)
+    with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar, ExitStack() as stack:
+        outcomes: list[Outcome] = []
+        if workers > 1:
+            # Left in any way, the context kills the workers: they have nothing to save.
+            pool = stack.enter_context(_pool(workers))
+            children = set(multiprocessing.active_children())
+            results = pool.imap(run_job, jobs)
+        while len(outcomes) < len(jobs):
+            try:
+                outcomes.append(results.next(timeout=1.0) if workers > 1 else
+                                run_job(jobs[len(outcomes)]))
                 bar.update()
-        else:
-            with _pool(workers) as pool:
-                with _signals_held_back():
-                    futures = {pool.submit(run_job, job): i for i, job in enumerate(jobs)}
-                for future in as_completed(futures):
-                    outcomes[futures[future]] = future.result()
-                    bar.update()
-        return [outcomes[i] for i in range(len(jobs))]
+            except multiprocessing.TimeoutError:
+                if not children <= set(multiprocessing.active_children()):
+                    raise BrokenOffError(
+                        'a worker process was killed: is there enough memory?'
+                    ) from None
+        return outcomes
 
 
-@contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Spawned workers, killed when the caller is interrupted: they have nothing to save."""
-    os.environ.update(ONE_THREAD)  # read when a worker imports numpy
-    others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
-        workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent
-    )
-    try:
-        yield pool
-    except BrokenProcessPool:
-        raise BrokenOffError('a worker process was killed: is there enough memory?') from None
-    except BaseException as error:
-        for worker in set(multiprocessing.active_children()) - others:
-            worker.kill()
-        if isinstance(error, KeyboardInterrupt):
-            # The thread of the pool may wait for ever for a worker that was killed as it began.
-            pool.shutdown(wait=False, cancel_futures=True)
-            leave = threading.Timer(PATIENCE_S, os._exit, (FAILED,))
-            leave.daemon = True
-            leave.start()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
+def _pool(workers: int) -> Pool:
+    """Spawned workers, which no Ctrl-C reaches: that is for their parent alone.
 
-
-@contextmanager
-def _signals_held_back() -> Iterator[None]:
-    """Let no signal cut short the start of a worker; one that came takes effect afterwards.
-
-    Workers inherit for good what is blocked: Ctrl-C is for their parent alone.
+    A signal that would cut short their start takes effect afterwards.
     """
-    numbers = (signal.SIGINT, signal.SIGTERM)
-    signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
+    os.environ.update(ONE_THREAD)  # read when a worker imports numpy
+    held: list[int] = []
+    handlers = {
+        number: signal.signal(number, lambda number, _: held.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    # Workers inherit for good what is blocked while they start.
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
-        yield
+        pool = multiprocessing.get_context('spawn').Pool(workers, _end_with_parent)
     finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    if held:
+        pool.terminate()
+        raise KeyboardInterrupt
+    return pool
 
 
 def _end_with_parent() -> None:
