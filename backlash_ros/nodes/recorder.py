@@ -16,7 +16,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
-from std_msgs.msg import Float64, Float64MultiArray
+from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.bags.reading import CURE
@@ -44,14 +44,13 @@ FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that
 DRAIN_S = 0.3
 IDLE_SPINS = 5  # without a message, timers being served in between
 
-# All but those of the driver; y comes last of all: it starts the loop.
+# All but those that io.style names; y comes last of all: it starts the loop.
 OF_THE_LOOP: dict[str, type[Any]] = {
-    topics.REFERENCE: Float64, topics.APPLIED_CONTROL: Float64,
     topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
     topics.MODEL: Float64MultiArray, topics.TRUTH: Float64MultiArray,
     topics.DIAGNOSTICS: DiagnosticArray,
 }
-NEEDED_PUBLISHERS = (topics.REFERENCE, topics.ESTIMATES, topics.SIGNALS)
+NEEDED_PUBLISHERS = (topics.ESTIMATES, topics.SIGNALS)
 
 
 class RecorderNode(ProcessNode):
@@ -77,9 +76,12 @@ class RecorderNode(ProcessNode):
         else:
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
-        self._driver = driver_topics(p)
-        wanted = (*NEEDED_PUBLISHERS, self._driver.control)
-        recorded = {**OF_THE_LOOP, self._driver.control: self._driver.control_type}
+        self._driver = to = driver_topics(p)
+        wanted = (*NEEDED_PUBLISHERS, to.reference, to.control)
+        recorded = {
+            **OF_THE_LOOP, to.reference: to.reference_type, to.applied: to.applied_type,
+            to.control: to.control_type,
+        }
         for topic, message_type in recorded.items():
             # A G that was learned before this recorder came belongs into the bag as well.
             qos: QoSProfile | int = KEPT if topic == topics.MODEL else DEPTH

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -17,7 +18,8 @@ from backlash_ros.nodes.runtime.spin import ProcessNode
 from backlash_ros.topics import BACKLASH
 
 NICENESS = 10  # of a process that only shows: the loop comes first
-MARK = topics.of_node(topics.watched(BACKLASH[0])).removeprefix('~')  # of a controller
+# By which a controller is known, or a joint of it.
+WATCHED = re.compile(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}')
 
 
 def give_way() -> None:
@@ -31,16 +33,19 @@ def give_way() -> None:
 
 
 class Followed:
-    """State of one controller, and its messages below `controller/watch`.
+    """State of one controller, or of one joint of it, and its messages below `controller/watch`.
 
     labels: which of these, m, c_r and c_l among them. depth: how many of each may wait.
     """
 
-    def __init__(self, node: ProcessNode, name: str, labels: Sequence[str], depth: int) -> None:
-        self.state = ControllerState(name)
+    def __init__(
+        self, node: ProcessNode, controller: str, joint: str, labels: Sequence[str], depth: int,
+    ) -> None:
+        self.state = ControllerState(controller, joint)
         self._inboxes = {
-            label: Inbox(node, Float64, name + topics.of_node(topics.watched(label))[1:], depth)
-            for label in labels
+            label: Inbox(
+                node, Float64, controller + topics.of_node(topics.watched(label, joint))[1:], depth
+            ) for label in labels
         }
 
     def take(self) -> Iterator[tuple[str, int, float]]:
@@ -99,13 +104,15 @@ class FollowedControllers:
 
     def _look(self) -> None:
         """Whoever publishes what a controller publishes is one."""
-        found = sorted(
-            topic.removesuffix(MARK) for topic, _ in self._node.get_topic_names_and_types()
-            if topic.endswith(MARK)
-        )
-        for name in found:
-            if name not in self.by_name and self._is_wanted(name):
-                self.by_name[name] = Followed(self._node, name, self._labels, self._depth)
+        for topic, _ in sorted(self._node.get_topic_names_and_types()):
+            found = WATCHED.fullmatch(topic)
+            if found and self._is_wanted(found['node']):
+                controller, joint = found['node'], found['joint'] or ''
+                name = f'{controller}: {joint}' if joint else controller
+                if name not in self.by_name:
+                    self.by_name[name] = Followed(
+                        self._node, controller, joint, self._labels, self._depth
+                    )
 
     def _is_wanted(self, name: str) -> bool:
         return not self._wanted or any(

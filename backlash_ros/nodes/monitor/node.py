@@ -108,9 +108,9 @@ class MonitorNode(ProcessNode):
 
     def _refresh(self) -> None:
         self._followed.take_diagnostics()
-        for name, followed in self._followed.by_name.items():
+        for followed in self._followed.by_name.values():
             # Here already: it takes a moment until a client has found its service.
-            self._clients_of(name)
+            self._clients_of(followed.state.node)
             for _ in followed.take():
                 pass  # the state has it
 
@@ -151,9 +151,9 @@ class MonitorNode(ProcessNode):
             self._say(f'press r once more to reset the estimates of {state.name}')
             return
         self._confirmed_until_s = 0.0
-        client = self._clients_of(state.name)[service]
+        client = self._clients_of(state.node)[service]
         if not client.service_is_ready():
-            self._say(f'{state.name}/{service} is not there')
+            self._say(f'{state.node}/{service} is not there')
             return
         request: Any = Trigger.Request()
         then: dict[str, str] = {}
@@ -164,7 +164,7 @@ class MonitorNode(ProcessNode):
         self._pending.append(Asked(
             client.call_async(request), time.monotonic() + ANSWER_S, state, service, then
         ))
-        self._say(f'{state.name}/{service} ...')
+        self._say(f'{state.node}/{service} ...')
 
     def _look_for_answers(self) -> None:
         for asked in list(self._pending):

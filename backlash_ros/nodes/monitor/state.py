@@ -16,14 +16,15 @@ DIGITS = re.compile(r'[\d.]+')  # a text in which a figure has changed tells not
 
 @dataclass
 class ControllerState:
-    """One controller. name: of its node, with namespace. level: of /diagnostics, 0 to 2.
+    """One controller, or a joint of it. node: its name, with namespace. level: of /diagnostics.
 
     values: of /diagnostics, as they stand there. estimates: value and half width of its band of
     two deviations (nan where there are none). scales: the largest magnitudes that were shown.
     events: time of day and text, the newest one last.
     """
 
-    name: str
+    node: str
+    joint: str = ''
     level: int = 0
     message: str = ''
     heard_at_s: float = -inf  # on the steady clock
@@ -33,6 +34,11 @@ class ControllerState:
     )
     scales: dict[str, float] = field(default_factory=lambda: dict.fromkeys(BACKLASH, 0.0))
     events: deque[tuple[str, str]] = field(default_factory=lambda: deque(maxlen=20))
+
+    @property
+    def name(self) -> str:
+        """As /diagnostics calls it."""
+        return f'{self.node}: {self.joint}' if self.joint else self.node
 
     def take_diagnostics(
         self, level: int, message: str, values: Mapping[str, str], now_s: float, clock: str,

@@ -1,4 +1,4 @@
-"""How the run is going, as its messages tell."""
+"""How the run is going, as its messages tell; of several joints, how that of the first one is."""
 
 from __future__ import annotations
 
@@ -54,4 +54,4 @@ class Progress:
 
 
 def _row(message: bytes, labels: tuple[str, ...]) -> dict[str, float]:
-    return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=True))
+    return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=False))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import inf
 from pathlib import Path
@@ -217,6 +217,10 @@ def _find_tables(
     tables: dict[str, Table] = {}
     models: Sequence[tuple[int, Any]] = ()
     notes: list[str] = []
+    joint, note = _choose_joint(content, axis)
+    if joint:
+        notes.append(note)
+        axis = ''
     for topic, labels in LABELS.items():
         name, note = choose_namespace(_names_of(content, topic, labels), axis)
         if topic == topics.SIGNALS and note:
@@ -224,9 +228,9 @@ def _find_tables(
             axis = name.strip('/').split('/')[0]
         messages = content.messages.get(name, ())
         if topic == topics.MODEL:
-            models = messages
+            models = _of_joint(messages, joint)
         elif messages:
-            tables[topic] = _tabulate(path, name, labels, messages)
+            tables[topic] = _tabulate(path, name, labels, _of_joint(messages, joint))
         elif topic == topics.TRUTH:  # which a real plant does not know
             tables[topic] = Table(labels, np.empty((0, len(labels))), np.empty(0, np.int64))
         elif name:
@@ -247,6 +251,43 @@ def _names_of(content: Content, topic: str, labels: Sequence[str]) -> list[str]:
         and {each.label for each in messages[0][1].layout.dim} >= set(labels)
     }
     return [*sorted(kept), *sorted(renamed - kept)]
+
+
+def _choose_joint(content: Content, axis: str) -> tuple[str, str]:
+    """A joint of the controller of an arm, '' for no such controller, and which others it has.
+
+    axis: the one that is wanted, '' for the first.
+    """
+    name, _ = choose_namespace(_names_of(content, topics.SIGNALS, ()), '')
+    messages = content.messages.get(name, ())
+    labels = [each.label for each in messages[0][1].layout.dim] if messages else []
+    joints = list(dict.fromkeys(label.rpartition('.')[0] for label in labels))
+    if joints in ([], ['']) or (axis and axis not in joints):
+        return '', ''
+    chosen = axis or joints[0]
+    others = ', '.join(joint for joint in joints if joint != chosen)
+    note = f'this is joint {chosen}; --axis chooses one of {others}' if others and not axis else ''
+    return chosen, note
+
+
+def _of_joint(messages: Sequence[tuple[int, Any]], joint: str) -> Sequence[tuple[int, Any]]:
+    """The same with what is about one joint alone, under its plain labels; '' for all of it."""
+    if not joint:
+        return messages
+    found = []
+    for stamp, message in messages:
+        dims, data = [], []
+        begin = 0
+        for each in message.layout.dim:
+            if each.label.startswith(f'{joint}.'):
+                dims.append(replace(each, label=each.label[len(joint) + 1:]))
+                data += message.data[begin:begin + each.size].tolist()
+            begin += each.size
+        # A joint that was not answered has a row of nan.
+        if data and not np.isnan(data).all():
+            layout = replace(message.layout, dim=dims)
+            found.append((stamp, replace(message, layout=layout, data=np.array(data))))
+    return found
 
 
 def _tabulate(
