@@ -276,12 +276,11 @@ class ControllerNode(ManagedNode):
         if waiting >= outputs.y.keys():
             return
         silent = {joint for joint, loop in loops.by_name.items() if loop.silent}
-        steps = loops.command(outputs, waiting)
+        steps = loops.answer(outputs, waiting)
         # Where the next output is waiting already, there is no time for what may be put off.
         behind = 0 < outputs.received_ns < time.time_ns() - self._period_ns
         if steps and not behind:
             time.sleep(self._post_command_sleep_s)
-        loops.note()
         back = [loops.by_name[joint] for joint in silent if not loops.by_name[joint].silent]
         if back:
             self._last_commands.end(*back)

@@ -130,13 +130,12 @@ class HeldUpProcesses:
         y, left, _, number = self._outputs.popleft()
         output = Output(y, _ns(left), _ns(left), _ns(self._now), number)
         self.loop.take_reference(self._reference(self._now))
-        step = self.loop.command(output)
+        step = self.loop.answer(output)
         self._now += ANSWER_S
         if step is not None:
             arrives = self._now + self._random.uniform(*TRANSPORT_S)
             self._command = arrives, self._sent
             self._driver_at = min(self._driver_at, arrives + self._wait())
-        self.loop.note()
         behind = bool(self._outputs) and self._outputs[0][2] < self._now - self.period
         if step is not None and not behind:
             self.loop.core.refine()

@@ -127,8 +127,7 @@ def expected(p: Parameters, samples: int) -> list[dict[str, float]]:
     for k in range(samples):
         loops.take_references(reference(k))
         stamp_ns = Arm.stamp_ns(k)
-        loops.command(JointOutputs(output(k), stamp_ns, stamp_ns, stamp_ns, k, numbered=False))
-        loops.note()
+        loops.answer(JointOutputs(output(k), stamp_ns, stamp_ns, stamp_ns, k, numbered=False))
     return sent
 
 

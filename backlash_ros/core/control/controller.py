@@ -37,9 +37,7 @@ class ControlStep(NamedTuple):
 class AdaptiveController:
     """Learns the backlash from v and y and publishes v = BI(u_d), section 3 of the paper.
 
-    Call `step` once per received y, and `refine` when v is on its way. Learning from y(k) comes
-    before v(k) only where the structure feeds y back; else v(k) need not wait for it. Who is in a
-    hurry there calls `command` and, when v is on its way, `take_in`.
+    Call `step` once per received y, and `refine` when v is on its way.
 
     compensating: False inverts the slope alone, as if there were no gap.
     redesign: whether the structure is designed anew for the better models of G that the estimator
@@ -62,18 +60,13 @@ class AdaptiveController:
         self._design: Iterator[Adoption | None] = iter(())
         self._adoption: Adoption | None = None  # of the finished design, until it may take over
         self._waited = 0  # samples for which it could not
-        self.interval: Interval | None = None  # that which began with the newest command
-        # The measurement that is still to be learned from: y(k), the interval before it, samples
-        # lost before it, what was applied and what was commanded.
-        self._pending: (
-            tuple[float, Interval, int, Sequence[float], Sequence[float], Sequence[float]] | None
-        ) = None
+        self._interval: Interval | None = None  # that which began with the newest command
 
     def step(
         self, y: float, y_m: float, lost: int = 0, applied: Sequence[float] = (),
         alternatives: Sequence[float] = (), commands: Sequence[float] = (),
     ) -> ControlStep:
-        """Return the command for sample k.
+        """Learn from y(k), and return the command for sample k.
 
         y, y_m: output and reference, finite. lost: samples that never arrived since the last
         call; the plant went on with the last v through all of them. applied: the v that was
@@ -82,37 +75,15 @@ class AdaptiveController:
         instead, nan where none may.
         """
         _check_sample(y, y_m)
-        if self._pending is not None:
-            self._learn()
-        self.take_in(y, self.interval, lost, applied, alternatives, commands)
-        if self.structure.needs_output and self._pending is not None:
-            self._learn()
-        return self._command(y, y_m)
-
-    def command(self, y: float, y_m: float) -> ControlStep:
-        """Return the command for sample k before `take_in`: no structure that needs y bears it."""
-        _check_sample(y, y_m)
-        if self._pending is not None:
-            self._learn()
-        return self._command(y, y_m)
-
-    def take_in(
-        self, y: float, interval: Interval | None, lost: int = 0, applied: Sequence[float] = (),
-        alternatives: Sequence[float] = (), commands: Sequence[float] = (),
-    ) -> None:
-        """Keep y(k) until it is learned from, at the next step or by `refine`.
-
-        interval: that which ended with it, None where no command had acted. The others as in
-        `step`.
-        """
         if lost < 0:
             raise ValueError(f'lost={lost!r} must be >= 0')
         if applied or alternatives or commands:
             _check_intervals(lost + 1, applied, alternatives, commands)
-        if interval is not None:
-            self._pending = y, interval, lost, applied, alternatives, commands
+        if self._interval is not None:
+            self._learn(y, self._interval, lost, applied, alternatives, commands)
+        return self._control(y, y_m)
 
-    def _command(self, y: float, y_m: float) -> ControlStep:
+    def _control(self, y: float, y_m: float) -> ControlStep:
         inverse, estimate = self.inverse, self.estimator.estimate
         used = estimate
         if not self.compensating:
@@ -123,7 +94,7 @@ class AdaptiveController:
         self.motion = self.limits.apply(v, self.motion)
         v = self.motion.v
         inverse.applied(v)
-        self.interval = Interval(v, y_m, u_d, f)
+        self._interval = Interval(v, y_m, u_d, f)
         return ControlStep(y_m, y, u_d, v, estimate)
 
     @property
@@ -163,12 +134,9 @@ class AdaptiveController:
     def refine(self, budget_s: float = inf) -> None:
         """Do what the command did not have to wait for, for about so many seconds at most.
 
-        Who has no time for it leaves it out: the next step learns what it has to, and a search
-        for the gap pauses.
+        Who has no time for it leaves it out: a search for the gap pauses.
         """
         started = time.perf_counter()
-        if self._pending is not None:
-            self._learn()
         self.estimator.refine(budget_s)
         if self._redesign:
             self._design_on(started + budget_s)
@@ -205,10 +173,11 @@ class AdaptiveController:
                     self._adoption = None
                 return
 
-    def _learn(self) -> None:
-        pending, self._pending = self._pending, None
-        assert pending is not None
-        y, interval, lost, applied, alternatives, commands = pending
+    def _learn(
+        self, y: float, interval: Interval, lost: int, applied: Sequence[float],
+        alternatives: Sequence[float], commands: Sequence[float],
+    ) -> None:
+        """Learn from y(k) and the samples lost before it; interval: that of the newest command."""
         serial, estimator = self._serial, self.estimator
         as_made = serial is None and not (applied or alternatives or commands)
         command, y_m, u_d, f, other = interval

@@ -33,7 +33,6 @@ class PolePlacement:
     delay: what B/A_m delays a slow reference by, rounded to samples.
     """
 
-    needs_output = True
 
     def __init__(self, blocks: FourBlocks) -> None:
         self._blocks = blocks

@@ -29,7 +29,6 @@ class Proportional:
     """
 
     delay = 0
-    needs_output = False
 
     def __init__(self) -> None:
         self._estimate: Estimate | None = None  # that v was made with

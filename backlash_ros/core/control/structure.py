@@ -66,10 +66,6 @@ class Structure(Protocol):
         """Samples by which y is meant to follow y_m."""
 
     @property
-    def needs_output(self) -> bool:
-        """Whether u_d(k) depends on y(k); else v(k) may leave before y(k) was learned from."""
-
-    @property
     def may_change(self) -> bool:
         """Whether a design for a better model may take over at this sample."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from math import isfinite, nan
-from typing import NamedTuple
 
 from backlash_ros.core.assembly import (
     build_controller,
@@ -19,7 +18,6 @@ from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.limits import Motion, at_rest, plausible
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation2.executor import Executor, InlineExecutor
-from backlash_ros.core.law import Interval
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.report_use import report_use
@@ -31,19 +29,6 @@ OF_THE_STRUCTURE = (
     'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution',
     'estimator.output_noise_std',
 )
-
-
-class _Sent(NamedTuple):
-    """A command that has left before anything else was done about its output.
-
-    ended: the interval that ended with the output. stamp_ns: when the command left. latency_ns:
-    how long after the output that was.
-    """
-
-    output: Output
-    ended: Interval | None
-    stamp_ns: int
-    latency_ns: int
 
 
 class ControlLoop:
@@ -78,8 +63,6 @@ class ControlLoop:
         self._unsent = 0  # those of them that were never published
         self._restarted = False  # whether sender or clock restarted since then
         self._begun = False  # whether the present core has taken a step
-        self._unnoted: tuple[Output, bool] | None = None  # the newest one, whether it is a sample
-        self._sent: _Sent | None = None  # the newest command, until it is noted
         self._other_ns = 0  # when another controller was last heard to command
         self.executor = executor or InlineExecutor()
         self.core = build_controller(p, estimate, self.executor)
@@ -158,27 +141,14 @@ class ControlLoop:
             self.go_on_from(self.core.command_of(reported))
         return self.knows_v
 
-    @property
-    def answers_first(self) -> bool:
-        """Whether the next command needs neither what the driver reports nor what y teaches."""
-        return self._begun and not (
-            self.silent or self.standing_down or self._lockstep or self.core.structure.needs_output
-        )
-
-    def answer(self, output: Output) -> ControlStep | None:
-        """Send v(k) for y(k); None where the message brings no command."""
-        step = self.command(output)
-        self.note()
-        return step
-
-    def command(self, output: Output, arrival: Arrival | None = None) -> ControlStep | None:
-        """The same, but what v(k) need not wait for is left to `note`, which has to follow.
+    def answer(self, output: Output, arrival: Arrival | None = None) -> ControlStep | None:
+        """Count y(k), learn from it, and send v(k); None where the message brings no command.
 
         arrival: of an output that was counted already.
         """
         if arrival is None:
             arrival = self.counter.count(output.stamp_ns, output.sequence, output.numbered)
-        return self._answer(output, arrival, self.y_m)
+        return self.step(output, arrival, self.y_m)
 
     def skip(self, arrival: Arrival) -> None:
         """Leave a sample unanswered of which this loop has no output."""
@@ -189,57 +159,41 @@ class ControlLoop:
 
     def step(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
         """Like `answer`, for a sample that was counted already, with its own reference."""
-        step = self._answer(output, arrival, y_m)
-        self.note()
+        if not self._is_usable(output, arrival, y_m):
+            return None
+        if self._missing or self._restarted or self.silent:
+            self._interrupt_if_long()
+        self.hear_reports()
+        step = self._step_core(output.y, y_m, output.stamp_ns)
+        self.send(step.v)
+        latency_s = (time.time_ns() - output.sent_ns) * 1e-9
+        self.statistics.note(output.y, step.v, self.core.inverse.limited, latency_s)
+        self.last = step
         return step
 
-    def note(self) -> None:
-        """Take in what the newest command did not have to wait for."""
-        self._note_arrival()
-        self.hear_reports()
-        sent, self._sent = self._sent, None
-        if sent is None:
-            return
-        lost, *acted = self._acted(sent.output.stamp_ns)
-        self.core.take_in(sent.output.y, sent.ended, lost, *acted)
-        self.commands.publish(self.v, sent.stamp_ns)
-        self._count(sent.output, sent.latency_ns)
-
-    def _answer(self, output: Output, arrival: Arrival, y_m: float) -> ControlStep | None:
-        self._unnoted = output, arrival.is_sample
+    def _is_usable(self, output: Output, arrival: Arrival, y_m: float) -> bool:
+        """Count a message of y; returns whether there is a command to be made of it."""
         statistics = self.statistics
+        statistics.note_arrival(output.stamp_ns, output.received_ns)
         if self.standing_down:
-            return None
+            return False
         if not arrival.is_sample:
             statistics.extra += 1
-            return None
+            return False
+        self.commands.note_transit(output.received_ns - output.sent_ns)
         if arrival.missing or arrival.restarted:
             self._note_missing(arrival)
         if not plausible(output.y):
             # A sensor that has nothing to say is as good as silent.
             statistics.note_bad_output()
             self._missing += 1
-            return None
+            return False
         self.heard_at = time.monotonic()
         if not plausible(y_m):
             statistics.without_reference += 1
             self._missing += 1
-            return None
-        if self._missing or self._restarted or self.silent:
-            self._interrupt_if_long()
-        if self.answers_first:
-            core = self.core
-            ended, step = core.interval, core.command(output.y, y_m)
-            self._put_out(step.v)
-            self._sent = _Sent(output, ended, self._now_ns(), time.time_ns() - output.sent_ns)
-        else:
-            self._note_arrival()
-            self.hear_reports()
-            step = self._step_core(output.y, y_m, output.stamp_ns)
-            self.send(step.v)
-            self._count(output, time.time_ns() - output.sent_ns)
-        self.last = step
-        return step
+            return False
+        return True
 
     def send(self, v: float) -> None:
         """Send a command and note when it left; nothing while another controller commands."""
@@ -303,20 +257,6 @@ class ControlLoop:
     def _put_out(self, v: float) -> None:
         self.v, self.knows_v = v, True
         self._send(v)
-
-    def _count(self, output: Output, latency_ns: int) -> None:
-        """Count an output that has brought the present v, so long after it was sent."""
-        self.statistics.note(output.y, self.v, self.core.inverse.limited, latency_ns * 1e-9)
-
-    def _note_arrival(self) -> None:
-        """Note what the newest message tells of its way, unless that is done."""
-        unnoted, self._unnoted = self._unnoted, None
-        if unnoted is None:
-            return
-        output, is_sample = unnoted
-        self.statistics.note_arrival(output.stamp_ns, output.received_ns)
-        if is_sample and not self.standing_down:
-            self.commands.note_transit(output.received_ns - output.sent_ns)
 
     def go_on_from(self, told: float) -> None:
         """Take this v for the one that acts."""

@@ -36,10 +36,10 @@ class JointLoops:
             ) for joint in p.joints
         }
 
-    def command(
+    def answer(
         self, outputs: JointOutputs, waiting: Container[str] = (),
     ) -> dict[str, ControlStep]:
-        """Send v(k) for y(k) of all joints that there are; `note` has to follow.
+        """Send v(k) for y(k) of all joints that there are.
 
         waiting: joints that are not to be answered. Returns the steps of those that were.
         """
@@ -47,18 +47,13 @@ class JointLoops:
         steps = {}
         for joint, loop in self.by_name.items():
             if joint in outputs.y and joint not in waiting:
-                step = loop.command(outputs.of(joint), arrival)
+                step = loop.answer(outputs.of(joint), arrival)
                 if step is not None:
                     steps[joint] = step
             else:
                 loop.skip(arrival)
         self.send()
         return steps
-
-    def note(self) -> None:
-        """Take in what the commands did not have to wait for."""
-        for loop in self.by_name.values():
-            loop.note()
 
     def take_references(self, y_m: Mapping[str, float]) -> list[str]:
         """Take in references by joint; returns the joints whose is of use."""

@@ -119,3 +119,22 @@ def test_no_report_leads_v_further_out(reported: float, high: float) -> None:
     before = driver.sent[-1]
     driver.narrow(high)
     assert -10.0 <= driver.answer(reported) <= max(before - MOVE, high)
+
+
+def test_reports_are_heard_first_where_a_gap_makes_the_loop_begin_again() -> None:
+    stamp_ns, back = 0, 40
+    loop = ControlLoop(
+        Parameters({
+            'timeout.plant_output': 0.05, 'control.min': -10.0, 'control.max': 10.0,
+            'control.rate_max': 10.0,
+        }),
+        lambda v: None, lambda: stamp_ns, None, SampleCounter(0.01), 0.0,
+        reports=lambda: [(2.5, stamp_ns - 1000)] if stamp_ns == back * PERIOD_NS else [],
+    )
+    loop.take_reference(0.0)
+    for k in (1, 2, 3, back):
+        stamp_ns = k * PERIOD_NS
+        assert abs(loop.v) <= 0.1 * k  # the driver tells of another v in the gap alone
+        loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, k))
+    assert loop.statistics.interruptions == 1
+    assert abs(loop.v - 2.5) <= 0.1 + 1e-9

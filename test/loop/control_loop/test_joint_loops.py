@@ -54,8 +54,7 @@ def run(spoil: Spoil, samples: int = SAMPLES) -> dict[str, list[float]]:
             joint: 0.5 * np.sin(0.02 * k + i) for i, joint in enumerate(JOINTS)
         })
         newest.clear()
-        loops.command(JointOutputs(spoil(k, dict(y)), now_ns, now_ns, now_ns, k, False))
-        loops.note()
+        loops.answer(JointOutputs(spoil(k, dict(y)), now_ns, now_ns, now_ns, k, False))
         for i, joint in enumerate(JOINTS):
             sent[joint].append(newest.get(joint, nan))
             v[joint] = newest.get(joint, v[joint])

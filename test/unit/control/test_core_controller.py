@@ -62,25 +62,13 @@ def test_output_is_paired_with_what_was_applied_before_it() -> None:
     ]
 
 
-class NeedsOutput(Proportional):
-    """A structure that wants y(k) learned from before it makes v(k)."""
-
-    needs_output = True
-
-
-@pytest.mark.parametrize(('structure', 'c_r'), [(NeedsOutput(), 3.1), (Proportional(), 3.0)])
-def test_command_waits_for_its_output_only_where_the_structure_needs_it(
-    structure: Proportional, c_r: float,
-) -> None:
+def test_a_command_uses_what_its_output_has_taught() -> None:
     estimator = Notebook(replace(PAPER, f=0.0), learns=0.1)
-    c = AdaptiveController(estimator, structure, BacklashInverse(), Limits())
+    c = AdaptiveController(estimator, Proportional(), BacklashInverse(), Limits())
     c.step(0.0, 1.0)
     step = c.step(0.1, 2.0)
-    assert step.estimate.c_r == pytest.approx(c_r)
-    assert step.v == pytest.approx(2.0 / 1.3 + c_r)
-    c.refine()
-    c.refine()
-    assert estimator.estimate.c_r == pytest.approx(3.1)
+    assert step.estimate.c_r == pytest.approx(3.1)
+    assert step.v == pytest.approx(2.0 / 1.3 + 3.1)
 
 
 def test_step_reports_what_went_in_and_came_out() -> None:

@@ -72,7 +72,6 @@ class Tracking:
     x_cov is only looked into when it is another array than the sample before.
     """
 
-    needs_output = True
 
     def __init__(
         self, beginning: TrackingDesign, weights: Weights, shrinkage: float, noise_std: float = 0.0,
