@@ -12,10 +12,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.sample_counter import SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
-from backlash_ros.nodes.runtime.driver_io import Output
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.replay.command import main
 from backlash_ros.tools.runs.bag import read_reports

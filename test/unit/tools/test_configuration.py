@@ -68,7 +68,8 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
     })
     write_config(parameters, config)
     assert Parameters(load_config(config)) == parameters
-    assert len(load_config(config)) == len(parameters)
+    # ROS 2 knows no empty list.
+    assert all(parameters[name] == () for name in set(parameters) - set(load_config(config)))
 
 
 def test_empty_list_is_left_out_and_so_is_what_bringup_alone_would_use(config: Path) -> None:
