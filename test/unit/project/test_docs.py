@@ -9,13 +9,17 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
 import pytest
+import yaml
 from PIL import Image
 from places import ROOT
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.nodes.driver_check.options import parse_options
 from backlash_ros.tools import batch
@@ -30,6 +34,8 @@ MADE_BY = DOCS / 'made_by'
 PAGES = sorted([ROOT / 'README.md', *DOCS.rglob('*.md')])
 README = (ROOT / 'README.md').read_text()
 BLOCK = re.compile(r'^```(\w+)\n(.*?)^```', re.MULTILINE | re.DOTALL)
+PYTHON_C = re.compile(r"python3? -c '([^']+)'")
+INSTALLED = re.compile(r'/lib/backlash_ros/(\w+)')
 LINK = re.compile(r'\]\(([^)\s]+)\)')
 CODE = re.compile(r'`([^`\n]+)`')
 DOTTED = re.compile(r'[a-z_]+(\.[a-z_0-9]+)+')
@@ -212,16 +218,47 @@ def check_tool(program: str, arguments: list[str]) -> None:
         batch.parse_sweep(sweep)
 
 
-def test_python_blocks_run() -> None:
-    blocks = [
+def blocks(*languages: str) -> list[str]:
+    """The text of each block of these languages, of all pages."""
+    return [
         text for page in PAGES for language, text in BLOCK.findall(page.read_text())
-        if language == 'python'
+        if language in languages
     ]
-    assert blocks
-    for text in blocks:
-        command = [sys.executable, '-c', text]
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-        assert done.returncode == 0, text + done.stderr
+
+
+def python_snippets() -> list[str]:
+    """Blocks of Python, and what shell blocks hand to `python -c`."""
+    return blocks('python') + [
+        snippet for text in blocks('bash', 'sh', 'ini') for snippet in PYTHON_C.findall(text)
+    ]
+
+
+@pytest.mark.parametrize('text', python_snippets())
+def test_python_of_the_pages_runs(text: str) -> None:
+    done = subprocess.run([sys.executable, '-c', text], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, text + done.stderr
+
+
+def flattened(tree: dict[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from flattened(value, f'{prefix}{key}.')
+        else:
+            yield f'{prefix}{key}', value
+
+
+def test_files_that_pages_show_are_valid() -> None:
+    for text in blocks('xml'):
+        ElementTree.fromstring(text)
+    for text in blocks('yaml'):
+        for section in yaml.safe_load(text).values():
+            Parameters(dict(flattened(section['ros__parameters'])))
+    started = [name for text in blocks('ini') for name in INSTALLED.findall(text)]
+    assert started
+    assert set(started) <= console_scripts()
+    assert not {language for page in PAGES for language, _ in BLOCK.findall(page.read_text())} - {
+        'bash', 'sh', 'ini', 'python', 'text', 'xml', 'yaml',
+    }
 
 
 def test_readme_names_every_executable_and_topic() -> None:
