@@ -18,10 +18,12 @@ from backlash_ros import shipped
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.joints import entry_of, split
 from backlash_ros.core.parameters.table import (
     BRINGUP,
     BY_NAME,
     CONTROLLER,
+    JOINTS,
     NODES,
     PARAMETERS,
     Parameter,
@@ -121,16 +123,32 @@ class Configuration:
     def parameters(self, axis: str = '') -> Parameters:
         """Return the complete set: defaults, then the file, then --set, then --seed.
 
-        axis: one of the axes, empty only if there are none; raises InputError.
+        axis: one of the axes, or of the joints, empty only if there are none; raises InputError.
         """
+        joints = self.joints
+        if joints and axis not in joints:
+            raise InputError(
+                f'{self.file.path}: holds the joints {", ".join(joints)} of one controller: choose '
+                f'one of them, like --axis {joints[0]}, or start `controller` with the file itself'
+            )
+        if joints:
+            return Parameters(self._values('')).of_joint(axis)
         check_axis(self.file, axis, self.axes)
+        return Parameters(self._values(axis))
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints of one controller, empty for a file without."""
+        return Parameters(self._values('')).get_strs(JOINTS) if not self.axes else ()
+
+    def _values(self, axis: str) -> dict[str, object]:
         values: dict[str, object] = dict(self.file.values(axis))
         for meant in ('', axis):
             values.update({s.name: s.value for s in self.settings if s.axis == meant})
         if self.seed is not None:
             values['seed'] = self.seed
         values.pop(AXES, None)
-        return Parameters(values)
+        return values
 
 
 def check_axis(file: ParameterFile, axis: str, axes: Sequence[str]) -> None:
@@ -269,10 +287,19 @@ def _read_section(name: str, content: object) -> Section:
     if not isinstance(content['ros__parameters'], dict):
         raise InputError('ros__parameters must hold "name: value" lines')
     values = dict(_flatten(content['ros__parameters']))
-    check_names(values)
-    checked = {key: check_value(BY_NAME[key], value) for key, value in values.items()}
+    # What is wrong with the values of a joint, all values together tell.
+    joints = Parameters(values).get_strs(JOINTS) if JOINTS in values else ()
+    shared, own = split(values, joints)
+    check_names(shared)
+    checked = {key: check_value(BY_NAME[key], value) for key, value in shared.items()}
+    for joint, changes in own.items():
+        checked |= {
+            f'{joint}.{key}': check_value(BY_NAME[key], value) for key, value in changes.items()
+        }
     for key, value in checked.items():
-        users = BY_NAME[key].used_by
+        entry = entry_of(key)
+        assert entry is not None
+        users = entry.used_by
         if node not in (ANY, *users):
             raise ParameterError(
                 key, value, f'is not a parameter of {node}',

@@ -46,9 +46,23 @@ def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() ->
 
 @pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.name)
 def test_shipped_file_loads_and_runs(path: Path) -> None:
-    for axis in read_configuration(path).axes or ('',):
+    configuration = read_configuration(path)
+    for axis in configuration.axes or configuration.joints or ('',):
         parameters = effective_parameters(path, axis=axis)
         assert build_closed_loop(parameters).run(50).samples == 50
+
+
+def test_of_an_arm_one_joint_is_chosen(config: Path) -> None:
+    written(config, """/**/controller: {ros__parameters: {joints: [waist, wrist],
+      control: {rate_max: 2.0}, waist: {control: {rate_max: 1.0}, plant: {denominator: [1, -0.5],
+      numerator: [0.5]}}, io: {style: joint_state_topic}}}""")
+    assert effective_parameters(config, axis='waist')['control.rate_max'] == 1.0
+    assert effective_parameters(config, axis='wrist')['control.rate_max'] == 2.0
+    with pytest.raises(InputError, match='holds the joints waist, wrist'):
+        effective_parameters(config)
+    written(config, config.read_text().replace('numerator:', 'numerators:'))
+    with pytest.raises(ParameterError, match=r'waist\.plant\.numerators is not a parameter'):
+        effective_parameters(config, axis='waist')
 
 
 def test_shipped_file_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
