@@ -99,19 +99,6 @@ def subjects(told: str, mark: str) -> list[str]:
     ]
 
 
-def test_a_good_driver_passes_and_its_record_is_saved(tmp_path: Path) -> None:
-    with bench(tmp_path, 'none') as beside:
-        code, told = beside.check('--drive', '--save', str(tmp_path / 'record.csv'))
-    wrong = set(subjects(told, '✗'))
-    assert wrong <= OF_THE_MACHINE, told
-    assert code == (1 if wrong else 0)
-    assert {'sign and units', 'G(z)', 'backlash'} <= set(subjects(told, '✓'))
-    with (tmp_path / 'record.csv').open(newline='') as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) > 50
-    assert max(abs(float(row['v'])) for row in rows) <= LIMITS.high
-
-
 # test_driver_judgement.py has what follows from the graph; here it has to be seen through ROS.
 def test_what_is_wrong_in_the_graph_is_seen_and_nothing_is_judged_of_a_mixture(
     tmp_path: Path,
@@ -173,8 +160,19 @@ def assert_within_rate(start: float, controls: list[Float64], rate: float) -> No
     assert max(abs(b - a) for a, b in pairwise(v)) <= rate * PERIOD_S * (1.0 + 1e-9)
 
 
-def test_what_cannot_be_driven_is_refused_or_ended(tmp_path: Path) -> None:
+def test_a_good_driver_passes_and_what_cannot_be_driven_is_refused_or_ended(
+    tmp_path: Path,
+) -> None:
     with bench(tmp_path, 'none') as beside:
+        code, told = beside.check('--drive', '--save', str(tmp_path / 'record.csv'))
+        wrong = set(subjects(told, '✗'))
+        assert wrong <= OF_THE_MACHINE, told
+        assert code == (1 if wrong else 0)
+        assert {'sign and units', 'G(z)', 'backlash'} <= set(subjects(told, '✓'))
+        with (tmp_path / 'record.csv').open(newline='') as file:
+            rows = list(csv.DictReader(file))
+        assert len(rows) > 50
+        assert max(abs(float(row['v'])) for row in rows) <= LIMITS.high
         code, told = beside.check('--drive', '--output-range', '-0.5', '0.5', '--duration', '30')
         assert code == 1
         assert 'left --output-range' in told

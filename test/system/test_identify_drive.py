@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 import subprocess
 import sys
 import time
@@ -109,17 +108,3 @@ def test_an_unknown_actuator_is_found(tmp_path: Path) -> None:
     assert found['c_r'] == pytest.approx(0.55, abs=0.01)
     assert found['delay_samples'] == 0
     assert sum(found['numerator']) / sum(found['denominator']) == pytest.approx(1.0, rel=0.01)
-
-
-def test_a_signal_brings_v_to_rest(tmp_path: Path) -> None:
-    with bench(tmp_path) as made:
-        process = made.start('--duration', '60')
-        made.probe.wait_until(lambda: len(made.control) > 300, 'some motion')
-        process.send_signal(signal.SIGINT)
-        code, text = made.finish(process)
-        sent = made.sent()
-    assert code == 1
-    assert 'interrupted; v was brought to rest' in text
-    assert 'Traceback' not in text
-    assert_limits_kept(sent)
-    assert sent[-1] == 0.0

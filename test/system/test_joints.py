@@ -215,12 +215,8 @@ def test_an_array_has_the_commands_of_all_joints_in_their_order(tmp_path: Path) 
         assert answer.data[2] == pytest.approx(reference(3)['gripper'], abs=1e-12)
 
 
-@pytest.mark.parametrize('together', [True, False])
-def test_an_arm_that_has_lost_a_joint_stops_as_one_or_goes_on_as_told(
-    tmp_path: Path, together: bool,
-) -> None:
-    changes = {'timeout__plant_output': 0.3, 'io__together': together}
-    with arm(tmp_path, **changes) as it:
+def test_an_arm_that_has_lost_a_joint_stops_as_one(tmp_path: Path) -> None:
+    with arm(tmp_path, timeout__plant_output=0.3, io__together=True) as it:
         it.refer({'waist': 0.5, 'elbow': 0.5, 'gripper': 0.5})
         it.answer(dict.fromkeys(JOINTS, 0.0))
         others, silence = {'waist': 0.0, 'elbow': 0.0}, 'no robot_joint_states for 0.3 s'
@@ -228,8 +224,7 @@ def test_an_arm_that_has_lost_a_joint_stops_as_one_or_goes_on_as_told(
         def lost() -> bool:
             it.send(others)
             it.probe.spin(0.02)
-            stopped = not together or it.says('waist', silence)()
-            return stopped and it.says('gripper', silence)()
+            return it.says('waist', silence)() and it.says('gripper', silence)()
 
         def back() -> bool:
             it.send(dict.fromkeys(JOINTS, 0.0))
@@ -242,21 +237,4 @@ def test_an_arm_that_has_lost_a_joint_stops_as_one_or_goes_on_as_told(
         sent = it.k - 1
         it.probe.wait_until(back, 'all joints')
         answered = sum(list(command.name) == ['waist', 'elbow'] for command in it.commands)
-        assert (answered == sent) == (not together)
-        assert answered <= sent - 5 * together
-
-
-@pytest.mark.parametrize(('changes', 'said'), [
-    ({'io.style': 'native'}, "io.style='native' has messages for one joint only"),
-    ({'joints': ['']}, 'joints'),
-    ({'elbow.plant.numerators': [1.0]}, 'elbow.plant.numerators is not a parameter'),
-])
-def test_a_mistake_ends_the_process_with_a_sentence(
-    tmp_path: Path, changes: Mapping[str, object], said: str,
-) -> None:
-    with ros_world(tmp_path) as world:
-        controller = world.start('controller', {**ARM, **changes})
-        assert controller.wait() == 2
-        assert said in controller.stderr
-
-
+        assert answered <= sent - 5

@@ -34,7 +34,34 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
         yield session
 
 
-def test_frames_hold_state_and_curves_of_every_axis(run: Session) -> None:
+def test_alone_it_waits_for_a_controller_and_ends_with_ctrl_c(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        world.forked = False
+        del world.environment['BACKLASH_ROS_EVENTS']
+        live = world.start(MODULE, None, '/pan')
+        wait_until(lambda: live.stdout.endswith('\n'), 'the address')
+
+        async def awaited() -> str:
+            async with ClientSession(timeout=DEADLINE) as session, session.get(
+                f'{live.stdout.strip()}/events'
+            ) as response:
+                async for frame in frames(response):
+                    return str(frame['awaited'])
+            return ''
+
+        assert f'of /pan in ROS_DOMAIN_ID={world.domain}' in asyncio.run(awaited())
+        port = live.stdout.strip().rpartition(':')[2]
+        taken = world.start(MODULE, None, '--port', port)
+        assert taken.wait() == 2
+        assert taken.stderr.startswith(f'live: --port={port}: Address already in use')
+        assert len(taken.stderr.splitlines()) == 1
+        assert live.stop() == 0
+        assert live.stderr == ''
+
+
+def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without_it(
+    run: Session,
+) -> None:
     async def look() -> None:
         async with ClientSession(timeout=DEADLINE) as session, session.get(
             f'{address_of(run)}/events'
@@ -61,34 +88,6 @@ def test_frames_hold_state_and_curves_of_every_axis(run: Session) -> None:
                 assert state['events']
 
     asyncio.run(look())
-
-
-def test_alone_it_waits_for_a_controller_and_ends_with_ctrl_c(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        world.forked = False
-        del world.environment['BACKLASH_ROS_EVENTS']
-        live = world.start(MODULE, None, '/pan')
-        wait_until(lambda: live.stdout.endswith('\n'), 'the address')
-
-        async def awaited() -> str:
-            async with ClientSession(timeout=DEADLINE) as session, session.get(
-                f'{live.stdout.strip()}/events'
-            ) as response:
-                async for frame in frames(response):
-                    return str(frame['awaited'])
-            return ''
-
-        assert f'of /pan in ROS_DOMAIN_ID={world.domain}' in asyncio.run(awaited())
-        port = live.stdout.strip().rpartition(':')[2]
-        taken = world.start(MODULE, None, '--port', port)
-        assert taken.wait() == 2
-        assert taken.stderr.startswith(f'live: --port={port}: Address already in use')
-        assert len(taken.stderr.splitlines()) == 1
-        assert live.stop() == 0
-        assert live.stderr == ''
-
-
-def test_a_page_is_for_this_machine_alone_and_a_run_goes_on_without_it(run: Session) -> None:
     assert listening_addresses(run.node('live.command')) == {'127.0.0.1'}
 
     async def statuses() -> list[int]:

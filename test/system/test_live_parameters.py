@@ -45,6 +45,12 @@ def test_parameters_of_reference_and_plant_change_while_they_run(tmp_path: Path)
         probe.wait_until(lambda: truth[-1].data[1:4].tolist() == [2.0, 1.0, -3.0], 'the change')
         refused = plant.change(backlash__c_l=1.5)
         assert 'backlash.c_l=1.5 must be < backlash.c_r=1.0' in refused.reason
+        assert plant.change(output_noise_std='1e-6', backlash__jump=[1, 2, 3]).successful
+        assert plant.change(backlash__rate='[1.0e-05, 0.0, 0]').successful
+        refused = plant.change(output_noise_std='little')
+        assert refused.reason == "output_noise_std='little' must be a number"
+        refused = plant.change(backlash__jump=[1, 2])
+        assert refused.reason == 'backlash.jump=[1.0, 2.0] must have 3 numbers'
         samples = [row.data[-1] for row in truth]
         assert samples == sorted(set(samples))
         assert reference.change(amplitude=2.0, bias=100.0, waveform='square').successful
@@ -105,16 +111,3 @@ def test_what_was_dumped_is_complete_and_loads_without_a_change(tmp_path: Path) 
             again = world.start(name, None, '--ros-args', '--params-file', file)
             assert dumped(probe, name) == before
             assert again.stop() == 0
-
-
-def test_values_as_command_lines_send_them_are_taken_or_refused_by_name(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        plant = world.start('plant')
-        client = Client(world.probe(), 'plant')
-        assert client.change(output_noise_std='1e-6', backlash__jump=[1, 2, 3]).successful
-        assert client.change(backlash__rate='[1.0e-05, 0.0, 0]').successful
-        refused = client.change(output_noise_std='little')
-        assert refused.reason == "output_noise_std='little' must be a number"
-        refused = client.change(backlash__jump=[1, 2])
-        assert refused.reason == 'backlash.jump=[1.0, 2.0] must have 3 numbers'
-        assert plant.stop() == 0

@@ -142,7 +142,7 @@ def test_controllers_are_shown_and_the_selected_one_obeys_the_keys(tmp_path: Pat
         assert controller.stop() == 0
 
 
-def test_ctrl_c_ends_it_while_it_waits_and_leaves_the_terminal_as_it_was(tmp_path: Path) -> None:
+def test_it_waits_until_ctrl_c_and_prints_plain_lines_without_a_terminal(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world, screen_of(world) as screen:
         awaited = f'waiting for a controller in ROS_DOMAIN_ID={world.domain}'
         probe = world.probe()
@@ -158,10 +158,6 @@ def test_ctrl_c_ends_it_while_it_waits_and_leaves_the_terminal_as_it_was(tmp_pat
         assert screen.wait() == 0
         assert screen.restored
         assert 'Traceback' not in screen.output
-
-
-def test_without_a_terminal_it_prints_plain_lines_until_a_signal(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
         monitor = world.start(MODULE)
         world.probe().wait_until(lambda: 'waiting for a controller' in monitor.stdout, 'a line')
         _, driver = controller_and_driver(world)

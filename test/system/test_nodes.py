@@ -114,9 +114,9 @@ def catches(node: NodeProcess, number: signal.Signals) -> bool:
     return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
 
 
-def test_a_signal_during_start_up_ends_the_process_with_code_0(tmp_path: Path) -> None:
+def test_signals_at_the_start_and_until_the_very_end_do_no_harm(tmp_path: Path) -> None:
     with ros_world(tmp_path) as world:
-        world.forked = False
+        world.forked = False  # start and end of the interpreter are part of it
         for i in range(4):
             node = world.start('controller')
             # Before the interpreter has come to this package, nothing can be done about it;
@@ -127,6 +127,15 @@ def test_a_signal_during_start_up_ends_the_process_with_code_0(tmp_path: Path) -
             with suppress(subprocess.TimeoutExpired):
                 node.process.wait(0.25 * i)
             assert node.stop((signal.SIGINT, signal.SIGTERM)[i % 2]) == 0, node.stderr
+        for number in (signal.SIGINT, signal.SIGTERM):
+            reference = world.start('reference')
+            reference.wait_for('ready')
+            wait_until(
+                lambda node=reference, number=number: (
+                    node.send(number) or node.process.poll() is not None
+                ), 'the end', lambda: None,
+            )
+            assert reference.process.returncode == 0
 
 
 def test_estimates_are_saved_before_a_long_ramp_and_sigterm_ends_it(tmp_path: Path) -> None:
@@ -161,20 +170,6 @@ def test_estimates_are_saved_before_a_long_ramp_and_sigterm_ends_it(tmp_path: Pa
         assert other.wait() == 2
         assert 'was learned with sample_period=0.03, which is now 0.01' in other.stderr
         assert other.stderr.count('\n') == 1
-
-
-def test_signals_that_come_until_the_very_end_do_no_harm(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        world.forked = False  # the end of the interpreter is part of it
-        for number in (signal.SIGINT, signal.SIGTERM):
-            reference = world.start('reference')
-            reference.wait_for('ready')
-            wait_until(
-                lambda node=reference, number=number: (
-                    node.send(number) or node.process.poll() is not None
-                ), 'the end', lambda: None,
-            )
-            assert reference.process.returncode == 0
 
 
 def saved_error(file: Path) -> float:

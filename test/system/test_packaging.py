@@ -62,31 +62,6 @@ def sourced(installation: Path) -> Mapping[str, str]:
     }
 
 
-def test_colcon_installs_what_ros2_run_and_the_tools_look_for(
-    installation: Path, tmp_path: Path,
-) -> None:
-    columns = run_colcon(tmp_path, 'list').split()
-    assert columns == ['backlash_ros', str(ROOT), '(ros.ament_python)']
-    share = installation / 'share'
-    marker = share / 'ament_index' / 'resource_index' / 'packages' / 'backlash_ros'
-    assert marker.is_file()
-    assert (share / 'backlash_ros' / 'package.xml').is_file()
-    installed = {path.name: path.read_bytes() for path in share.glob('backlash_ros/config/*')}
-    assert installed
-    assert installed == {path.name: path.read_bytes() for path in ROOT.glob('config/*')}
-    for folder, pattern in (
-        ('launch', '*.py'), ('examples', '*.py'), ('docs', '*.md'), ('docs/images', '*'),
-        ('docs/reference', '*.md'), ('docs/results', '*.md'), ('docs/results/images', '*'),
-    ):
-        beside = {path.name for path in (share / 'backlash_ros' / folder).glob(pattern)}
-        assert beside == {path.name for path in (ROOT / folder).glob(pattern)} != set()
-    beside_modules = {path.name for path in installation.rglob('lib/python*/**/*.[hx]*ml')}
-    assert beside_modules == {'loopback.xml', 'network.xml', 'page.html'}
-    executables = installation / 'lib' / 'backlash_ros'
-    assert {path.name for path in executables.iterdir()} == EXECUTABLES
-    assert all(os.access(path, os.X_OK) for path in executables.iterdir())
-
-
 @pytest.fixture
 def driver_context(
     sourced: Mapping[str, str], monkeypatch: pytest.MonkeyPatch
@@ -119,9 +94,29 @@ def await_command(context: Context, controller: subprocess.Popen[bytes]) -> bool
     return bool(commands)
 
 
-def test_what_is_installed_is_what_runs(
+def test_colcon_installs_what_the_tools_look_for_and_it_runs(
     installation: Path, sourced: Mapping[str, str], driver_context: Context, tmp_path: Path
 ) -> None:
+    columns = run_colcon(tmp_path, 'list').split()
+    assert columns == ['backlash_ros', str(ROOT), '(ros.ament_python)']
+    share = installation / 'share'
+    marker = share / 'ament_index' / 'resource_index' / 'packages' / 'backlash_ros'
+    assert marker.is_file()
+    assert (share / 'backlash_ros' / 'package.xml').is_file()
+    installed = {path.name: path.read_bytes() for path in share.glob('backlash_ros/config/*')}
+    assert installed
+    assert installed == {path.name: path.read_bytes() for path in ROOT.glob('config/*')}
+    for folder, pattern in (
+        ('launch', '*.py'), ('examples', '*.py'), ('docs', '*.md'), ('docs/images', '*'),
+        ('docs/reference', '*.md'), ('docs/results', '*.md'), ('docs/results/images', '*'),
+    ):
+        beside = {path.name for path in (share / 'backlash_ros' / folder).glob(pattern)}
+        assert beside == {path.name for path in (ROOT / folder).glob(pattern)} != set()
+    beside_modules = {path.name for path in installation.rglob('lib/python*/**/*.[hx]*ml')}
+    assert beside_modules == {'loopback.xml', 'network.xml', 'page.html'}
+    executables = installation / 'lib' / 'backlash_ros'
+    assert {path.name for path in executables.iterdir()} == EXECUTABLES
+    assert all(os.access(path, os.X_OK) for path in executables.iterdir())
     code = (
         'import inspect\n'
         'from importlib.metadata import distribution\n'

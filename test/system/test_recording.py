@@ -23,7 +23,6 @@ from std_msgs.msg import Float64, Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.bags.reading import BagError, BagReader, message_files
 from backlash_ros.bags.repair import damage
-from backlash_ros.bags.writer import STORAGE
 from backlash_ros.tools import report
 from backlash_ros.tools.runs.bag import read_bag
 
@@ -87,15 +86,14 @@ def recorder(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.usefixtures('undrawn')
-@pytest.mark.parametrize('storage', STORAGE)
 def test_killed_recorder_loses_at_most_the_last_second(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], storage: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:
     bag = tmp_path / 'bag'
     with ros_world(tmp_path) as world:
         probe = world.probe()
         listener = Listener(probe)
-        nodes = start_loop(world, bag, storage)
+        nodes = start_loop(world, bag, 'mcap')
         probe.wait_until(
             lambda: len(listener.before(time.monotonic() - LOST_S)) > 60, 'samples that must stay'
         )
@@ -109,10 +107,9 @@ def test_killed_recorder_loses_at_most_the_last_second(
     told = remains.notes[0]
     assert told.startswith(f'{bag} was never closed: this is what is left, ')
     assert cure in told
-    if storage == 'mcap':  # what it says depends on read_bag alone
-        assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
-        assert capsys.readouterr().err.startswith(f'report: warning: {told}\n')
-        assert cure in (tmp_path / 'out' / 'report.html').read_text()
+    assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
+    assert capsys.readouterr().err.startswith(f'report: warning: {told}\n')
+    assert cure in (tmp_path / 'out' / 'report.html').read_text()
 
     done = recorder('--repair', bag)
     assert done.returncode == 0, done.stderr
@@ -125,11 +122,10 @@ def test_killed_recorder_loses_at_most_the_last_second(
     repaired = read_bag(bag)
     assert not any('closed' in note for note in repaired.notes)
     np.testing.assert_array_equal(repaired.record.rows, remains.record.rows)
-    if storage == 'mcap':
-        with next(bag.glob('*.mcap')).open('rb') as stream:
-            reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-            found = reader.iter_decoded_messages([f'/{topics.SIGNALS}'])
-            assert {int(message.data[SAMPLE]) for *_, message in found} == kept
+    with next(bag.glob('*.mcap')).open('rb') as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        found = reader.iter_decoded_messages([f'/{topics.SIGNALS}'])
+        assert {int(message.data[SAMPLE]) for *_, message in found} == kept
 
 
 def test_a_bag_is_read_while_it_is_recorded_and_complete_after_a_signal_amid_a_flood(

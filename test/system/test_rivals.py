@@ -64,7 +64,9 @@ class Stage:
         return [message.data for message in self.driver.controls]
 
 
-def test_the_later_controller_stands_down_until_the_first_one_has_gone(tmp_path: Path) -> None:
+def test_the_later_controller_stands_down_until_the_first_one_has_gone_or_is_dead(
+    tmp_path: Path,
+) -> None:
     with ros_world(tmp_path) as world:
         stage = Stage(world)
         first = stage.start('first')
@@ -86,31 +88,22 @@ def test_the_later_controller_stands_down_until_the_first_one_has_gone(tmp_path:
         commands = stage.commands()
         assert max(abs(b - a) for a, b in pairwise(commands)) <= STEP
         assert not stage.names_as_error('second', '/first')
-        assert second.stop() == 0
-    assert 'nobody else publishes /control any more' in second.stderr
-
-
-def test_whoever_was_first_is_waited_for_until_it_is_dead(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        stage = Stage(world)
-        first = stage.start('first')
-        stage.driver.meet(first)
-        stage.run_until(lambda: len(stage.driver.controls) > 20, 'controls')
         # A process that is stopped answers to nobody's discovery.
-        first.send(signal.SIGSTOP)
-        second = stage.start('second')
+        second.send(signal.SIGSTOP)
+        third = stage.start('third')
         stage.run_until(
-            lambda: 'waiting for discovery of another controller of /control' in second.stderr,
+            lambda: 'waiting for discovery of another controller of /control' in third.stderr,
             'a word about it',
         )
-        assert stage.samples('second') == 0
-        first.send(signal.SIGCONT)
-        stage.run_until(lambda: stage.names_as_error('second', '/first'), 'the second to tell')
+        assert stage.samples('third') == 0
+        second.send(signal.SIGCONT)
+        stage.run_until(lambda: stage.names_as_error('third', '/second'), 'the third to tell')
         stage.driver.run(50)
-        assert stage.samples('second') == 0
-        first.kill()
-        stage.run_until(lambda: stage.samples('second') > 20, 'commands of the second')
-        assert second.stop() == 0
+        assert stage.samples('third') == 0
+        second.kill()
+        stage.run_until(lambda: stage.samples('third') > 20, 'commands of the third')
+        assert third.stop() == 0
+    assert 'nobody else publishes /control any more' in second.stderr
 
 
 def test_another_program_is_given_way_to_where_it_was_first_and_named_where_not(
