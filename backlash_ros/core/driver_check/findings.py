@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.limits import plausible
-from backlash_ros.core.loop.causes import SKEW
+from backlash_ros.core.loop.diagnosis import SKEW
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
 
 FLOAT64 = 'std_msgs/msg/Float64'

@@ -22,8 +22,9 @@ from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.report_use import report_use
 from backlash_ros.core.loop.sample_counter import Arrival, Output, SampleCounter
-from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters import NOISE, Parameters
 
+STILL_BAND = 6.0  # standard deviations of the noise on y within which it stands still
 # Live parameters that only a new structure takes up.
 OF_THE_STRUCTURE = (
     'tracking.input_weight', 'tracking.integral_weight', 'inverse.caution',
@@ -48,7 +49,7 @@ class ControlLoop:
         reports: Callable[[], Iterable[tuple[float, int]]] = tuple,
         executor: Executor | None = None,
     ) -> None:
-        self.statistics = LoopStatistics()
+        self.statistics = LoopStatistics(STILL_BAND * p.get_float(NOISE))
         self.counter = counter
         self.commands = CommandHistory(p.get_float('sample_period'), report_use(p))
         self.y_m = nan  # the newest one

@@ -65,7 +65,8 @@ class LoopFigures:
     else publishes it. intervals_s: those between messages of y, low, mean and high, of which a
     tenth is shorter and longer [s], nan while they are not known. period: of the driver, by its
     stamps. repeats_stamps: whether it sends some of them twice. still: newest values of y in a row
-    that are equal, and v_swing: how far v has moved meanwhile, in gaps.
+    that are equal within its noise. v_swing: how far v has moved meanwhile, and gap, nan while it
+    is not learned [unit of v]. wraps: jumps of y by a turn.
     """
 
     sample_period: float
@@ -99,6 +100,8 @@ class LoopFigures:
     dead_workers: int = 0
     still: int = 0
     v_swing: float = 0.0
+    gap: float = nan
+    wraps: int = 0
 
     @property
     def heard(self) -> int:

@@ -6,18 +6,25 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import inf, nan
+from math import inf, nan, pi
 
 import numpy as np
 
 FEWEST, MOST = 20, 50  # intervals that the rate of y is taken of
 WINDOW_S = 3.0  # what counts as lately
+# A turn [rad], by how much a jump of y may be off it, and how much further than its usual moves.
+TURN, OFF_A_TURN, BEYOND_PACE = 2.0 * pi, 0.3, 10.0
 
 
 @dataclass
 class LoopStatistics:
-    """Counters since the start. latencies [s]: the newest ones, as topics.py defines them."""
+    """Counters since the start.
 
+    still_band: by how much y may differ where it stands still. latencies [s]: the newest ones, as
+    topics.py defines them.
+    """
+
+    still_band: float = 0.0
     used: int = 0  # outputs that brought a command
     lost: int = 0  # outputs that never arrived
     unsent: int = 0  # of these, the ones that the driver never published
@@ -28,12 +35,15 @@ class LoopStatistics:
     interruptions: int = 0  # times that the driver was silent or restarted
     without_reference: int = 0  # outputs before the first y_m
     limited: int = 0  # commands that met a limit
+    wraps: int = 0  # times that y jumped by 2 pi
     still: int = 0  # newest values of y in a row that are equal
     still_swing: float = 0.0  # how far v has moved meanwhile
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
     _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MOST + 1))
     _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=MOST))
-    _y: float = nan
+    _y: float = nan  # with which the newest row of equal values began
+    _y_before: float = nan
+    _pace: float = inf  # how far y moves from sample to sample, as a rule
     _v_low: float = inf
     _v_high: float = -inf
     _still_low: float = inf
@@ -51,7 +61,13 @@ class LoopStatistics:
         self.limited += limited
         self.latencies.append(latency)
         self._v_low, self._v_high = min(v, self._v_low), max(v, self._v_high)
-        if y != self._y:
+        moved = abs(y - self._y_before)
+        if abs(moved - TURN) < OFF_A_TURN and moved > BEYOND_PACE * self._pace:
+            self.wraps += 1
+        elif moved == moved:
+            self._pace = moved if self._pace == inf else self._pace + 0.05 * (moved - self._pace)
+        self._y_before = y
+        if not abs(y - self._y) <= self.still_band:
             self._y, self.still, self._still_low, self._still_high = y, 0, v, v
         self.still += 1
         self._still_low, self._still_high = min(v, self._still_low), max(v, self._still_high)

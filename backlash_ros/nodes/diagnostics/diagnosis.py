@@ -11,8 +11,8 @@ from rclpy.qos import QoSProfile
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimates_file import was_given
-from backlash_ros.core.loop.causes import LONGEST_TEXT, findings_of
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.diagnosis import LONGEST_TEXT, findings_of
 from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD
 from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer
 from backlash_ros.core.loop.loop_statistics import Lately
@@ -64,6 +64,7 @@ class Diagnosis:
             'bad_outputs': statistics.bad_outputs,
             'bad_references': statistics.bad_references, 'limited': statistics.limited,
             'unreported': loop.commands.unreported, 'dead_workers': loop.executor.restarts,
+            'wraps': statistics.wraps,
         }, time.monotonic())
         status = None if loop.last is None else loop.last.estimate.status
         if status != Status.INCONSISTENT:
@@ -97,7 +98,8 @@ class Diagnosis:
             # Stamps of simulated time have nothing to do with the time of arrival.
             age_s=nan if p.get_bool('lockstep') or io.simulated_time else statistics.age_s(),
             still=statistics.still,
-            v_swing=statistics.still_swing / gap if gap > 0.0 else 0.0,
+            v_swing=statistics.still_swing,
+            gap=gap if loop.estimate.learned else nan,
             **lately,
         )
 

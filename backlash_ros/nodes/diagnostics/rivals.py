@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
-from backlash_ros.core.loop.causes import UNNAMED
+from backlash_ros.core.loop.diagnosis import UNNAMED
 from backlash_ros.nodes.diagnostics.presence import Presence
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.spin import ProcessNode

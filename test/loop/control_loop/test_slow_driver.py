@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.loop.causes import findings_of
 from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.diagnosis import findings_of
 from backlash_ros.core.loop.figures import LoopFigures, Peer, TopicFigures
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
