@@ -104,7 +104,7 @@ class ControllerNode(ManagedNode):
         self._reports = None if self._lockstep else Reports(self, self._io, p.joints)
         self.joints += [
             Joint(self, joint, p.of_joint(joint), self._io, self._reports,
-                  self._reference.qos_profile) for joint in p.joints
+                  self._reference.qos_profile, speaks=joint == p.joints[0]) for joint in p.joints
         ]
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)

@@ -32,6 +32,13 @@ class Finding(NamedTuple):
     lasting: bool = False
 
 
+# Kinds of findings about the messages, which are the same for all joints of a controller.
+OF_MESSAGES = frozenset((
+    'control type', 'control qos', 'rivals', 'second driver', 'second reference', 'unheard', 'rate',
+    'stamps', 'clock', 'late', 'unsent', 'lost', 'unreported', 'reference silent', 'worker',
+))
+
+
 class Peer(NamedTuple):
     """Another publisher or subscriber of a topic; unfit: why no message passes, empty if it does.
 

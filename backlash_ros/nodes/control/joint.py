@@ -12,7 +12,7 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.figures import Finding, Level
+from backlash_ros.core.loop.figures import OF_MESSAGES, Finding, Level
 from backlash_ros.core.loop.sample_counter import JointOutputs
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -31,14 +31,15 @@ class Joint:
     """What the controller has of each joint; a single one is nameless.
 
     p: its parameters. loop: None while the node is unconfigured. reference_at: when the newest y_m
-    came, on the steady clock [s].
+    came, on the steady clock [s]. speaks: whether it says in the log what is true of all joints.
     """
 
     def __init__(
         self, node: ProcessNode, name: str, p: Parameters, io: DriverIo, reports: Reports | None,
-        reference_qos: QoSProfile,
+        reference_qos: QoSProfile, speaks: bool,
     ) -> None:
         self.name, self.p = name, p
+        self._speaks = speaks
         self.loop: ControlLoop | None = None
         self.reference_at: float | None = None
         self.model = ModelPublisher(node, name)
@@ -125,7 +126,11 @@ class Joint:
             findings, details = self._diagnosis.findings(
                 loop, self.p, self.reference_at, tuple(rival.name for rival in rivals.found)
             )
-            self._diagnostics.publish(worst(findings), {**details, **values_of(loop), **claim})
+            finding = worst(findings)
+            self._diagnostics.publish(
+                finding, {**details, **values_of(loop), **claim},
+                logs=self._speaks or finding.kind not in OF_MESSAGES,
+            )
 
     def sum_up(self) -> None:
         """Say in the log what was counted."""

@@ -75,8 +75,13 @@ class DiagnosticsPublisher:
         self._message = DiagnosticArray(status=[self._status])
         self._log = LevelLog(self._write) if logs else None
 
-    def publish(self, finding: Finding, values: Mapping[str, object]) -> None:
-        """finding: what is going on, and what to do if it is wrong. values: details to it."""
+    def publish(
+        self, finding: Finding, values: Mapping[str, object], logs: bool = True,
+    ) -> None:
+        """finding: what is going on, and what to do if it is wrong. values: details to it.
+
+        logs: False for what another part of the node has to say in the log.
+        """
         self._status.level, self._status.message = bytes([finding.level]), finding.text
         self._status.values = [
             KeyValue(key=key, value=f'{value:.6g}' if isinstance(value, float) else str(value))
@@ -84,7 +89,7 @@ class DiagnosticsPublisher:
         ]
         self._message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(self._message)
-        if self._log is not None:
+        if self._log is not None and logs:
             self._log.take(finding, time.monotonic())
 
     def _write(self, level: Level, text: str) -> None:
