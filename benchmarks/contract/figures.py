@@ -17,7 +17,7 @@ RESAMPLED, SEED = 400, 1
 BEYOND = 3.0  # standard deviations of a difference that count
 LEAST_SCATTER = 0.02  # relative: a smaller difference is none, however alike the runs are
 FEWEST = 3  # runs that show a scatter
-LARGEST = 1e3  # stands for a value that is not finite, or larger
+LARGEST = 1e6  # stands for a value that is not finite, or larger
 
 
 @dataclass(frozen=True)

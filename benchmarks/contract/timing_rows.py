@@ -62,13 +62,14 @@ def run_step(job: tuple[str, int]) -> Times:
         rows.append((step, sampled.refined, timer()))
     steps, refits, filters = np.array(rows).T
     unit = float(np.median(filters))
-    return Times({
-        f'{what}, {structure}, {phase}, {name}': float(np.quantile(times[part], q)) / unit
-        for what, times in (('step', steps), ('refit', refits))
+    found = {}
+    for what, times in (('step', steps), ('refit', refits)):
         for phase, part in (('searching', slice(0, ACQUISITION)),
-                            ('steady', slice(ACQUISITION, None)))
-        for name, q in QUANTILES.items()
-    })
+                            ('steady', slice(ACQUISITION, None))):
+            of, name = times[part] / unit, f'{what}, {structure}, {phase}'
+            found |= {f'{name}, {word}': float(np.quantile(of, q)) for word, q in QUANTILES.items()}
+            found[f'{name}, mean'] = float(of.mean())
+    return Times(found)
 
 
 def latency_jobs(scale: float) -> list[tuple[str, int]]:
