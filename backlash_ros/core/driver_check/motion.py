@@ -23,7 +23,7 @@ from backlash_ros.core.driver_check.findings import (
 )
 from backlash_ros.core.estimation.whole_record.record_description import RecordFit
 from backlash_ros.core.estimation.whole_record.record_fit import fit_record
-from backlash_ros.core.identification.judgement import SHOWS
+from backlash_ros.core.identification.verdict import SHOWS
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
 from backlash_ros.core.loop.report_use import ReportUse, report_use
 from backlash_ros.core.parameters import Parameters

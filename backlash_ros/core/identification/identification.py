@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.fit.pace import drained
 from backlash_ros.core.estimation.whole_record.record_description import frequencies_of
 from backlash_ros.core.estimation.whole_record.record_samples import busiest, check_record, outliers
-from backlash_ros.core.identification import judgement, uncertainty
+from backlash_ros.core.identification import uncertainty
 from backlash_ros.core.identification.least_response import least_response
+from backlash_ros.core.identification.not_play import Observed
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
     Compared,
+    cancelled_poles,
     compare,
     effective_rows,
     equal_delays,
@@ -41,7 +43,10 @@ from backlash_ros.core.identification.output_error import (
 )
 from backlash_ros.core.identification.separable_search import Profile, profile, search
 from backlash_ros.core.identification.uncertainty import Covariance
+from backlash_ros.core.identification.verdict import APART, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
+from backlash_ros.core.records.readings import quantum
+from backlash_ros.core.records.roughness import noise_of
 
 Array = NDArray[np.float64]
 T = TypeVar('T')
@@ -50,7 +55,6 @@ GENERAL = Structure(3, 0, False)  # G with which the gap is searched first, and 
 FEWEST = 8  # samples per unknown below which nothing is fitted
 SAME = 0.005  # relative distance of two gaps that are one
 NEAR = np.linspace(0.8, 1.2, 17)  # gaps around the best one, relative
-FEW_VALUES = 0.8  # distinct values of y per sample, more of which are not quantised
 LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
 TINY = float(np.finfo(float).tiny)
 
@@ -101,8 +105,8 @@ class Identification:
     residuals beyond chance. ljung_box: probability of a white residual. response_std: relative
     deviation of G at `frequencies` [rad/sample], between which y moves. uncertainty: of G, as the
     parameter plant.uncertainty. outliers: samples of y that were left out. reasons: why it is of no
-    use, remarks: what to know, a sentence each. details: None where nothing was fitted. actuator:
-    between the command and v; None where nothing is, or it is not known.
+    use, remarks: what to know, a sentence each. details, verdict: None where nothing was fitted.
+    actuator: between the command and v; None where nothing is, or it is not known.
     """
 
     sample_period: float
@@ -129,6 +133,7 @@ class Identification:
     reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     details: Details | None = None
+    verdict: Verdict | None = None
     actuator: Actuator | None = None
 
     @property
@@ -237,7 +242,7 @@ def _named(stage: str, work: Generator[None, None, T]) -> Generator[str, None, T
 
 def _outliers(samples: Samples, found: Fit) -> NDArray[np.bool_]:
     """Readings that are none; rounding makes none."""
-    return outliers(samples.y - found.simulated, _quantum(samples.y))
+    return outliers(samples.y - found.simulated, quantum(samples.y))
 
 
 def _distinct(found: Sequence[Fit]) -> list[Fit]:
@@ -268,7 +273,7 @@ def _refined(
     rows = effective_rows(samples, best)
     rivals = sorted(
         (behind, one.point.gap) for one in minima
-        if abs(one.point.gap - best.point.gap) > judgement.APART * best.point.gap
+        if abs(one.point.gap - best.point.gap) > APART * best.point.gap
         for behind in [0.5 * rows * float(np.log(one.squares / max(best.squares, TINY)))]
     )
     gaps = np.concatenate([curve.gaps, near.gaps, [best.point.gap]])
@@ -319,31 +324,38 @@ def _described(
     correlation = max(lag_one(samples, best) - 3.0 / np.sqrt(len(samples.known)), 0.0)
     held_out = _held_out(searched, chosen, options.held_out)
     numerator = best.numerator / options.slope
-    evidence = judgement.Evidence(
-        samples, best, float(np.sqrt(gap_var)), float(np.sqrt(c_r_var)), gain_std,
-        float(spread.max()),
+    step = quantum(samples.y)
+    total = float(best.numerator.sum())
+    verdict = judge(Findings(
+        _observed(samples, best, step), best.point.gap, float(np.sqrt(gap_var)), best.c_r,
+        float(np.sqrt(c_r_var)),
+        float(np.abs(uncertainty.response(best, np.sqrt(frequencies[:1] * frequencies[-1:])))[0]),
+        total if best.structure.integrator else total / float(best.denominator.sum()),
+        gain_std, float(spread.max()),
         # Whatever the correlation: what explains nine tenths of y shows v.
         inf if best.squares < 0.01 * still
         else 0.5 * rows * float(np.log(still / max(best.squares, TINY))),
-        correlation, held_out.rms, held_out.trained, rivals,
-        float(np.abs(uncertainty.response(best, np.sqrt(frequencies[:1] * frequencies[-1:])))[0]),
-        _quantum(samples.y),
-    )
+        correlation, held_out.rms, held_out.trained, rivals, best.play.reversals, step,
+        [_text(pole) for pole in cancelled_poles(best)], best.structure.delay,
+        max(options.delays),
+    ))
+    # What no model explains moves both sides of the gap alike.
+    more = 0.25 * (verdict.gap_std**2 - gap_var)
     freedom = max(len(samples.known) - best.structure.unknowns, 1)
     return replace(
         given, m=options.slope, gap=best.point.gap, c_r=best.c_r, c_l=best.c_r - best.point.gap,
         std={
-            'm': options.slope * gain_std, 'gap': float(np.sqrt(gap_var)),
-            'c_r': float(np.sqrt(c_r_var)), 'c_l': float(np.sqrt(c_l_var)),
+            'm': options.slope * gain_std, 'gap': verdict.gap_std,
+            'c_r': float(np.sqrt(c_r_var + more)), 'c_l': float(np.sqrt(c_l_var + more)),
         },
         numerator=tuple(numerator.tolist()), denominator=tuple(best.denominator.tolist()),
         delay=best.structure.delay,
         delays=tuple(sorted({*equal_delays(compared, chosen), best.structure.delay})),
         integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
-        quantum=evidence.quantum, correlation=correlation,
+        quantum=step, correlation=correlation,
         ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
         uncertainty=_as_parameter(float(spread.max())), outliers=left_out,
-        reasons=tuple(judgement.reasons(evidence)), remarks=tuple(judgement.remarks(evidence)),
+        reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
         details=Details(
             samples, searched, searched_from, best, covariance, tuple(compared), chosen, curve,
             held_out,
@@ -362,23 +374,27 @@ def _still(samples: Samples, best: Fit) -> float:
     return max(float(left @ left), TINY)
 
 
+def _observed(samples: Samples, best: Fit, step: float) -> Observed:
+    """The signals of a fit, each where it acts on y."""
+    y = samples.y
+    noise = noise_of(samples.known.astype(float), samples.target)
+    return Observed(
+        samples.v[samples.first:samples.last], y,
+        samples.delayed(best.play.p, best.structure.delay), best.simulated,
+        max(noise, step / np.sqrt(12.0)), best.point.gap,
+    )
+
+
+def _text(root: complex) -> str:
+    return f'{root.real:.4g}' if abs(root.imag) < 1e-9 else f'{root:.4g}'
+
+
 def _held_out(samples: Samples, chosen: Compared, share: float) -> HeldOut:
     """What the structure, fitted to the first part alone, predicts of the last."""
     cut = samples.last - round(share * samples.count)
     later = samples.part(cut, samples.last)
     trained = chosen.trained
     return HeldOut(cut, predicted(trained, later), held_out_rms(trained, later), trained.rms)
-
-
-def _quantum(y: Array) -> float:
-    """Step of a quantised y (N,), 0 where it is not."""
-    values = np.unique(y[np.isfinite(y)])
-    if len(values) < 2 or len(values) > FEW_VALUES * len(y):
-        return 0.0
-    steps = np.diff(values)
-    step = float(steps[steps > 1e-9 * (values[-1] - values[0])].min())
-    whole = (values - values[0]) / step
-    return step if np.abs(whole - np.round(whole)).max() < 0.05 else 0.0
 
 
 def _as_parameter(spread: float) -> float:

@@ -20,8 +20,8 @@ from backlash_ros.core.identification.play_record import PlayRecord
 
 Array = NDArray[np.float64]
 
-LONGEST = 4000  # samples that are looked at, and rows of them that are fitted
-ROWS = 1500
+LONGEST = 4000  # samples that are looked at
+ROWS = 1500  # of them that are fitted
 BEGIN = 100  # samples at most that are left out at the begin
 TAPS, LAGS = 3, (0.7, 2.0, 6.0, 20.0, 60.0)  # of the linear family [samples]
 BEYOND_NOISE = 1.5  # times the noise: a residual as small as this leaves nothing to name
@@ -30,8 +30,8 @@ SURE = 15.0  # log-likelihood by which another nonlinearity must beat a play
 EXPLAINED = 0.9  # share of what a play leaves beyond the noise, likewise
 EVALUATIONS = 50  # of a search from one start
 WIDTHS = (0.0006, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8)  # of the swing of v
-TURNS = 3  # of a search for several plays, and what is behind them at first: one of the columns
-STARTS = (0, TAPS + 1, TAPS + 2, TAPS + 3)
+TURNS = 3  # of a search for several plays, from a system behind them that is one of these columns
+STARTS = (0, TAPS + 1, TAPS + 2, TAPS + 3)  # columns
 PLAYS, WIDEST = 12, 0.7  # in parallel, and the widest of them, in swings of v
 SEVERAL = 0.2  # of the largest weight: a play in parallel that counts
 LEAD = 0.002  # of the swing of v: a lead where v turns
@@ -102,17 +102,20 @@ def saturation(o: Observed) -> str:
     left = float(np.sqrt(np.nanmean(o.residual**2)))
     if abs(along) < ALONG or left < BADLY * (top - bottom):
         return ''
-    for end, name, way in ((top, 'largest', along), (bottom, 'smallest', -along)):
+    on: list[float] = []
+    at_end = 0
+    for end, way in ((top, along), (bottom, -along)):
         runs = [(a, b) for a, b in _stretches(np.abs(y - end) < FLAT * (top - bottom)) if b - a > 4]
-        on = np.array([float(np.max((v[a:b + 1] - v[a]) * np.sign(way))) for a, b in runs])
-        beyond = on[on > GOES_ON * np.ptp(v)]
-        long = sum(b - a for a, b in runs) > AT_END * len(y)
-        if long and len(beyond) >= 4 and len(beyond) > 0.5 * len(runs):
-            return (
-                f'y stays at its {name} value, about {end:.4g}, while v goes on by '
-                f'{np.median(beyond):.3g} and more: the sensor is at its end, or the load slides '
-                'there; move v less far'
-            )
+        of_side = [float(np.max((v[a:b + 1] - v[a]) * np.sign(way))) for a, b in runs]
+        on += of_side
+        at_end += sum(b - a for a, b in runs)
+        for beyond in (of_side, on):
+            far = [size for size in beyond if size > GOES_ON * np.ptp(v)]
+            if len(far) >= 4 and len(far) > 0.5 * len(beyond) and at_end > AT_END * len(y):
+                return (
+                    f'y stays at about {end:.4g} while v goes on by {np.median(far):.3g} and more: '
+                    'the sensor is at its end, or the load slides there; move v less far'
+                )
     return ''
 
 
@@ -265,8 +268,8 @@ def coasting(o: Observed) -> str:
     before = went[np.maximum.accumulate(np.where(went != 0.0, np.arange(len(went)), 0))]
     onwards = float(np.nanmean((o.residual * before)[within])) > 0.5 * float(
         np.nanmean(np.abs(o.residual[within])))
-    what = 'it coasts there: brake it, or move more slowly' if onwards else \
-        'it is moved there by something else'
+    what = 'it coasts there; brake it, or move more slowly' if onwards else \
+        'something else moves it there; hold it, or keep it free'
     return (
         f'while v crosses the gap the load is off by {size[0]:.3g}, and by {size[1]:.3g} while it '
         f'is pushed: {what}'

@@ -22,7 +22,8 @@ HELD_SHARE = 0.9  # of them that stand between rows without a change
 REGULAR = 0.5  # relative spread of the time from change to change, for a sensor with a period
 # Failed reads: one exact value, alone or in pairs, further from its neighbours than y moves.
 FEWEST_FAILED, FAR, FAR_SHARE, LONGEST_RUN = 3, 6.0, 0.5, 2
-TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
+# Of angles: degrees, radians, gradians, steps of encoders.
+TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))  # whole turns
 TURN_TOLERANCE = 0.02  # relative, of the jump of an angle that begins anew
 MOST_OF_TURN = 0.6  # of a turn: a jump as large as this is no motion from row to row
 

@@ -16,7 +16,7 @@ from backlash_ros.core.records.timing import Rows, on_grid, seconds
 Array = NDArray[np.float64]
 
 SAME_UNIT = 0.3  # relative distance of a step from the period in a unit
-UNITS_S = (1e-3, 1e-6, 1e-9, 60.0)
+UNITS_S = (1e-3, 1e-6, 1e-9, 60.0)  # that stamps may count, beside seconds
 
 
 def record_of(

@@ -30,7 +30,7 @@ def make_parser() -> argparse.ArgumentParser:
     """The options."""
     parser = OptionParser(
         EXECUTABLE, description=__doc__,
-        epilog='Exit codes: 0 the result is of use, 1 it is not, 2 bad input.',
+        epilog='Exit codes: 0 the backlash is known, 1 it is not, 2 bad input.',
     )
     parser.add_argument('record', type=Path, nargs='?', metavar='RECORD',
                         help='a bag, a folder of results, or a table (CSV and the like, Parquet) '
@@ -119,7 +119,7 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def _identify(args: Sequence[str] | None) -> bool:
-    """Do what the options say; returns whether the result is of use."""
+    """Do what the options say; returns whether the backlash is known."""
     parser = make_parser()
     arguments = list(sys.argv[1:] if args is None else args)
     # Names of topics are changed as for every node.

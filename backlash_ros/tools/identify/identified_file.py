@@ -51,7 +51,8 @@ def identified_parameters(
         name: value for name, value in given.items()
         if not name.startswith(SIMULATED) and not name.startswith(OF_ONE_RUN)
     }
-    scale = float(f'{max(WIDER * max(found.gap, found.c_r, -found.c_l), 1e-9):.3g}')
+    reach = max(abs(found.c_r), abs(found.c_l)) + found.std['c_r']
+    scale = float(f'{max(WIDER * max(found.gap, reach), 1e-9):.3g}')
     values.update({
         'sample_period': found.sample_period,
         'plant.numerator': found.numerator,
@@ -164,8 +165,11 @@ def _weights(found: Identification) -> dict[str, Value]:
 def _limits(found: Identification) -> dict[str, Value]:
     """Where none are given: v as far and as fast as it went in the record, and no further."""
     fastest = float(np.abs(np.diff(found.v)).max()) / found.sample_period
+    # Digits that the swing bears, wherever 0 of v is.
+    digits = 3 - int(np.floor(np.log10(np.ptp(found.v))))
     return {
-        'control.min': float(f'{found.v.min():.4g}'), 'control.max': float(f'{found.v.max():.4g}'),
+        'control.min': round(float(found.v.min()), digits),
+        'control.max': round(float(found.v.max()), digits),
         'control.rate_max': float(f'{fastest:.4g}'),
     }
 
@@ -174,7 +178,11 @@ def numbers(found: Identification) -> dict[str, Any]:
     """Content of identified.json."""
     return {
         'usable': found.usable, 'reasons': list(found.reasons), 'remarks': list(found.remarks),
+        'known': None if found.verdict is None else {
+            name: getattr(found.verdict, name)._asdict() for name in ('backlash', 'gain', 'model')
+        },
         'm': found.m, 'gap': found.gap, 'c_r': found.c_r, 'c_l': found.c_l,
+        'offset': 0.5 * (found.c_r + found.c_l),
         'std': dict(found.std) or dict.fromkeys(('m', 'gap', 'c_r', 'c_l')),
         'numerator': list(found.numerator), 'denominator': list(found.denominator),
         'delay_samples': found.delay, 'equally_good_delays': list(found.delays),

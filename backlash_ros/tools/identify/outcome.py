@@ -64,7 +64,7 @@ def write_outcome(
     found: Identification, record: Record, given: Mapping[str, Value],
     options: argparse.Namespace,
 ) -> bool:
-    """Write the files, print the outcome; returns whether it is of use."""
+    """Write the files, print the outcome; returns whether the backlash is known."""
     parameters: Parameters | None = None
     out = result_directory(options.out)
     if found.usable:
@@ -72,7 +72,7 @@ def write_outcome(
             parameters = identified_parameters(found, given, out.resolve() / ESTIMATES)
         except ParameterError as error:
             found = replace(found, reasons=(f'the controller does not take it: {error}',))
-    write_summary({**numbers(found), 'timing': record.timing}, out / JSON)
+    write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes}, out / JSON)
     write_record(record, out / 'record.csv')
     pictures = list(draw(found))
     for picture in pictures:
@@ -84,7 +84,7 @@ def write_outcome(
         save_estimate(out / ESTIMATES, as_estimate(found, parameters), parameters)
     write_atomically(out / PAGE, render(found, record.source, pictures, text))
     _tell(found, record, out)
-    return found.usable
+    return found.verdict is not None and found.verdict.backlash.known
 
 
 def write_record(record: Record, path: Path) -> None:
@@ -98,6 +98,8 @@ def write_record(record: Record, path: Path) -> None:
 
 
 def _tell(found: Identification, record: Record, out: Path) -> None:
+    if found.verdict is not None:
+        print('\n'.join(found.verdict.lines))
     if found.details is not None:
         print(format_table(('', 'found', '±'), [
             (name, f'{value:.6g}', f'{found.std[name]:.2g}')
@@ -119,6 +121,8 @@ def _tell(found: Identification, record: Record, out: Path) -> None:
     for text in (*record.notes, *found.remarks):
         print(f'note: {text}')
     for text in found.reasons:
-        print(f'not of use: {text}')
+        # That the backlash is not known stands in the first lines.
+        if found.verdict is None or found.verdict.backlash.known:
+            print(f'no {YAML}: {text}')
     print(out / (YAML if found.usable else JSON))
     print(out / PAGE)

@@ -21,13 +21,15 @@ def render(
     """The page as text. parameters: content of identified.yaml, None where there is none."""
     parts = [] if found.details is None else [_numbers(found) + _facts(found)]
     folded = None if parameters is None else ('identified.yaml', parameters)
-    warnings = (*found.reasons, *found.remarks)
+    lines = () if found.verdict is None else found.verdict.lines
+    warnings = (*lines, *found.reasons, *found.remarks)
     return page(TITLE, _headline(found, source), warnings, parts, pictures, folded)
 
 
 def _headline(found: Identification, source: str) -> str:
     about = f'{len(found.y)} samples of {found.sample_period:g} s from {escape(source)}'
-    return f'<b>{"Of use" if found.usable else "Not of use"}</b>: {about}.'
+    known = found.verdict is not None and found.verdict.backlash.known
+    return f'<b>{"The backlash is known" if known else "The backlash is not known"}</b>: {about}.'
 
 
 def _numbers(found: Identification) -> str:

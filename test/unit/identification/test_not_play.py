@@ -138,7 +138,7 @@ def test_a_y_that_is_at_its_end_is_named(side: str) -> None:
     y = np.minimum(behind(play(V, GAP), 'lag', 0.0), 0.9)
     y = np.maximum(y, -0.9 if side == 'both' else -9.0)
     o = observed(V, y + NOISE * np.random.default_rng(1).standard_normal(COUNT))
-    assert 'y stays at its largest value, about 0.9' in saturation(o)
+    assert 'while v goes on by' in saturation(o)
 
 
 def test_a_load_that_is_pushed_at_rest_is_named() -> None:

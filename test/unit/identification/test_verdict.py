@@ -1,0 +1,134 @@
+"""The verdict: three answers, each with its reason and the cure, from numbers alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_not_play import GAP, NOISE, V, behind, dead_zone, observed, play
+
+from backlash_ros.core.identification.verdict import Findings, Verdict, judge
+
+GOOD = observed(V, behind(play(V, GAP), 'lag'))
+SAW = 0.02 * np.abs(np.arange(3000) % 400 - 200.0)
+FOUND = Findings(
+    GOOD, gap=GAP, gap_std=0.01, c_r=0.3, c_r_std=0.01, gain=0.8, static=1.0, gain_std=0.01,
+    response_std=0.02, evidence=1e3, correlation=0.0, held_out=NOISE, trained=NOISE, rivals=(),
+    reversals=20, quantum=0.0, cancelled=(), delay=1, longest_delay=3,
+)
+
+
+def verdict(**changed: Any) -> Verdict:
+    return judge(FOUND._replace(**changed))
+
+
+def test_a_good_record_answers_everything() -> None:
+    found = verdict()
+    assert (found.backlash.known, found.gain.known, found.model.known) == (True, True, True)
+    assert found.backlash.reason == 'the gap is 0.6 ± 0.01'
+    assert found.reasons == ()
+    assert found.remarks == ()
+    assert found.gap_std == 0.01
+
+
+def test_a_gap_is_known_though_gain_and_middle_are_not() -> None:
+    found = verdict(gain_std=40.0, response_std=0.3)
+    assert (found.backlash.known, found.gain.known, found.model.known) == (True, False, True)
+    first, second = found.lines
+    assert first.startswith('the gap is 0.6 ± 0.01; the gain of G at rest is known not at all')
+    assert second == (
+        'G is known to 30%: good enough to start the controller with plant.uncertainty as in '
+        'identified.yaml, which learns the rest'
+    )
+    assert found.reasons == ()
+
+
+@pytest.mark.parametrize(('changed', 'said'), [
+    ({'response_std': 0.8}, 'G, where y moves, is known to 80% of itself'),
+    ({'response_std': 8.0}, 'is known to nothing'),
+    ({'c_r_std': 9.0}, 'the middle of the gap is known to ± 9 only'),
+])
+def test_what_would_mislead_a_controller_is_refused(changed: dict[str, Any], said: str) -> None:
+    found = verdict(**changed)
+    assert found.backlash.known
+    assert said in found.model.reason
+    assert found.reasons == (found.model.sentence,)
+    assert 'for a controller measure again' in found.lines[1]
+
+
+@pytest.mark.parametrize(('changed', 'said'), [
+    ({'evidence': 3.0}, 'y shows nothing of v'),
+    ({'gap': 5.7}, 'the gap is at its bound'),
+    ({'reversals': 2}, 'went past the gap and back 2 times'),
+    ({'rivals': [(0.9, 2.0)]}, 'two gaps fit alike, 0.6 and 0.9'),
+    ({'gap_std': 0.18}, 'y has a noise of 0.002, and the gap moves it by 0.48'),
+    ({'gap_std': 0.18, 'quantum': 0.5}, 'quantised in steps of 0.5'),
+    ({'gap': 0.01, 'gap_std': 0.1}, 'a gap of up to 0.31 cannot be ruled out'),
+    ({'gap': 0.01, 'gap_std': 0.01, 'gain_std': 0.5}, 'a slow lag looks like a gap'),
+])
+def test_why_the_gap_is_not_known_is_told_with_the_cure(changed: dict[str, Any], said: str) -> None:
+    found = verdict(**changed)
+    assert not found.backlash.known
+    assert said in found.backlash.reason
+    assert found.backlash.cure
+    assert found.lines == (
+        f'not known: {found.backlash.reason}', f'measure again: {found.backlash.cure}')
+    assert found.backlash.sentence in found.reasons
+
+
+@pytest.mark.parametrize('rival', [(0.9, 20.0), (0.605, 1.0), (0.63, 1.0)])
+def test_a_gap_that_falls_behind_or_is_the_same_is_no_rival(rival: tuple[float, float]) -> None:
+    assert verdict(rivals=[rival]).backlash.known
+
+
+def test_no_backlash_is_said_with_a_bound() -> None:
+    o = observed(V, behind(V, 'lag'), 0.0)
+    found = judge(FOUND._replace(observed=o, gap=0.004, gap_std=0.004, c_r=0.002))
+    assert found.backlash.known
+    assert found.backlash.reason == 'there is no backlash: the gap is below 0.016'
+
+
+def test_a_small_gap_that_is_sure_is_one() -> None:
+    # 0.3 % of the swing of v, at ten deviations.
+    assert verdict(gap=0.02, gap_std=0.002).backlash.reason == 'the gap is 0.02 ± 0.002'
+
+
+def test_what_no_model_explains_widens_the_deviations_and_then_refuses() -> None:
+    rough = observed(V, behind(play(V, GAP), 'lag', 0.05), GAP, NOISE)
+    some = judge(FOUND._replace(observed=rough, correlation=0.9))
+    assert some.backlash.known
+    assert some.gap_std > 1.5 * FOUND.gap_std
+    assert any('the deviations tell of it' in text for text in some.remarks)
+    much = judge(FOUND._replace(observed=rough, correlation=0.9, gain=0.1))
+    assert not much.backlash.known
+    assert 'something else than a backlash and a linear G moves y' in much.backlash.reason
+
+
+def test_what_is_no_play_is_named_first() -> None:
+    o = observed(V, behind(dead_zone(V), 'lag'))
+    found = judge(FOUND._replace(observed=o, evidence=1.0))
+    assert 'a dead zone' in found.backlash.reason
+    assert not found.backlash.known
+
+
+def test_a_gap_that_changes_is_told_with_its_values_and_widens_the_deviation() -> None:
+    u = np.where(np.arange(len(V)) < 1500, play(V, GAP), play(V, 0.8))
+    found = judge(FOUND._replace(observed=observed(V, behind(u, 'lag'), 0.7), gap=0.7))
+    (said,) = [text for text in found.remarks if 'changes within the record' in text]
+    first, _, last = (float(word) for word in said.partition(': ')[2].split(', '))
+    assert (first, last) == pytest.approx((0.6, 0.8), abs=0.03)
+    assert found.gap_std > 0.07
+
+
+@pytest.mark.parametrize(('changed', 'said'), [
+    ({'static': -1.0}, 'the gain of G is negative'),
+    ({'delay': 3}, 'try --delay 3-10'),
+    ({'cancelled': ['0.97']}, 'the pole 0.97 is cancelled'),
+    ({'held_out': 0.2, 'trained': 0.01, 'observed': GOOD._replace(noise=1e-4)}, '20 times worse'),
+    ({'observed': observed(SAW, behind(play(SAW, GAP), 'lag'))}, 'one speed only'),
+])
+def test_what_to_know_is_remarked(changed: dict[str, Any], said: str) -> None:
+    found = verdict(**changed)
+    assert found.backlash.known
+    assert any(said in text for text in found.remarks)
