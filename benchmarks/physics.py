@@ -18,7 +18,6 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
 from gears.gear_figures import draw_hysteresis, draw_map
-from gears.gear_map import FILE as MAP_FILE
 from gears.gear_map import HEADER as WRONG_HEADER
 from gears.gear_map import map_cells, summary, wrong_rows
 from gears.gear_processes import HEADER as PROCESS_HEADER
@@ -36,7 +35,6 @@ from gears.gear_runs import (
     inertia_ratio,
     learning,
     lost_motion,
-    oracle,
     quasi_static,
     uncompensated,
 )
@@ -51,7 +49,6 @@ DOCUMENT = ROOT / 'docs' / 'physics.md'
 IMAGES = ROOT / 'docs' / 'images'
 MARKS = r'(<!-- {}: made by benchmarks -->\n).*?(<!-- end -->)'
 REMOVED, OFF = 0.9, 0.1  # bounds: share that is removed, error of the gap under *tracking*
-LITTLE = 0.05  # share of the error without compensation that constants avoid: the rest is not play
 
 
 @dataclass(frozen=True)
@@ -77,19 +74,17 @@ class Loop:
 
 @dataclass(frozen=True)
 class Case:
-    """One motion of one preset. none, best: errors without compensation and with constants."""
+    """One motion of one preset. none: error without compensation."""
 
     preset: str
     motion: str
     lost: float
     none: float
-    best: float
     loops: tuple[Loop, Loop]  # from the command, from the motor encoder
 
     def removed(self, loop: Loop) -> float:
-        """Share of the avoidable error that is removed; nan where next to none is avoidable."""
-        avoidable = self.none - self.best
-        return (self.none - loop.error) / avoidable if avoidable > LITTLE * self.none else nan
+        """Share of the error that is removed."""
+        return (self.none - loop.error) / self.none
 
 
 def find(job: tuple[str, bool, float, float]) -> Source:
@@ -106,12 +101,11 @@ def judge(job: tuple[str, Source, Source, dict[str, Value], int]) -> Case:
     """All loops of one motion; those that learn: some parameters changed, so many periods."""
     motion, command, encoder, changes, periods = job
     gear, parameters = PRESETS[command.preset], command.identified.parameters
-    none = best = nan
+    none = nan
     if parameters is not None:
         none = uncompensated(gear, parameters, motion).error
-        best, _ = oracle(gear, parameters, motion, command.lost)
     return Case(
-        command.preset, motion, command.lost, none, best,
+        command.preset, motion, command.lost, none,
         (_loop(command, motion, changes, periods), _loop(encoder, motion, changes, periods)),
     )
 
@@ -158,7 +152,7 @@ def found_rows(sources: list[Source]) -> list[list[str]]:
     return rows
 
 
-HEADER = ('preset', 'motion', 'J\\|a\\|/τ_c', 'coasts', 'none', 'best', 'command: error', 'removed',
+HEADER = ('preset', 'motion', 'J\\|a\\|/τ_c', 'coasts', 'none', 'command: error', 'removed',
           'gap', 'states', 'encoder: error', 'removed', 'gap', 'states')
 
 
@@ -169,8 +163,7 @@ def rows_of(cases: list[Case]) -> list[list[str]]:
         gear = PRESETS[one.preset]
         ratio = inertia_ratio(gear, one.motion)
         row = [one.preset, one.motion, 'jumps' if isinf(ratio) else f'{ratio:.2g}',
-               f'{coasting_way(gear, one.motion):.2g}', f'{one.none / one.lost:.1%}',
-               f'{one.best / one.lost:.1%}']
+               f'{coasting_way(gear, one.motion):.2g}', f'{one.none / one.lost:.1%}']
         for loop in one.loops:
             row += [f'{loop.error / one.lost:.1%}', f'{one.removed(loop):.0%}', f'{loop.gap:.3f}',
                     loop.problem or loop.states]
@@ -208,7 +201,7 @@ def make_map(side: int, processes: int, into_document: bool) -> None:
     cells = map_cells(side, processes)
     rows, counts = wrong_rows(cells), summary(cells)
     print(f'{text_table(WRONG_HEADER, rows)}\n{counts}')
-    draw_map(cells, (IMAGES if into_document else MAP_FILE.parent) / 'physics_map.png')
+    draw_map(cells, (IMAGES if into_document else ROOT / 'results') / 'physics_map.png')
     if into_document:
         table = markdown_table(WRONG_HEADER, rows) + '\n' if rows else ''
         write('physics_map', f'{counts}\n\n{table}'.rstrip() + '\n')
@@ -236,8 +229,7 @@ def main() -> None:
     parser.add_argument('--parameter', action='append', default=[], metavar='KEY=VALUE',
                         help='change the identified file for the loops that learn')
     parser.add_argument('--map', type=int, metavar='CELLS', default=0,
-                        help='only the map of inertia and bandwidth, with so many cells a side; '
-                             f'what {MAP_FILE.relative_to(ROOT)} holds is not made again')
+                        help='only the map of inertia and bandwidth, with so many cells a side')
     parser.add_argument('--real', action='store_true',
                         help='only one sine a preset, as real processes in real time')
     parser.add_argument('--processes', type=int, default=processors(), metavar='N',

@@ -17,11 +17,11 @@ from cases.geared_motor import flat, motor
 from cases.held_up import HeldUpProcesses
 from cases.identification_cases import random_case
 from faults import Result, play
-from gears.gear_map import gear_of
 from gears.gear_runs import (
     PRESETS,
     Gear,
     close_loop,
+    gear_of,
     lost_motion,
     quasi_static,
     record,

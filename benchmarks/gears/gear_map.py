@@ -6,34 +6,21 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
-from math import nan, pi
-from multiprocessing import Pool
-from pathlib import Path
+from dataclasses import dataclass
+from math import nan
 
 import numpy as np
-from reporting import ROOT
-from tqdm import tqdm
+from reporting import parallel
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.identification.identification import Options
-from gears.gear_runs import PRESETS, Gear, close_loop, identified, learning
+from gears.gear_runs import close_loop, gear_of, identified, learning
 
 INERTIA, BANDWIDTH = (0.01, 30.0), (2.0, 100.0)
-HEAVY_MOTOR, DAMPED = 1000.0, 0.8  # times the load, so that friction hardly turns it back; ratio
-HEADROOM = 1.5  # of the limits over what the sine needs
-RESOLUTION = 2.0 * pi / 2**16
 OFF = 0.1  # error of the gap from which on a cell that says *tracking* is wrong
 MOSTLY = 0.5  # share of *tracking* from which on a cell is said to track
 COASTS = 'the load coasts'  # in what is said
-FILE = ROOT / 'results' / 'physics_map.jsonl'
-# A result is taken from the file only where all that it depends on is as it was.
-SOURCES = ('backlash_ros/core/**/*.py', 'backlash_ros/tools/identify/identified_file.py',
-           'benchmarks/gears/*.py', 'examples/gear_physics.py')
 
 
 @dataclass(frozen=True)
@@ -73,19 +60,6 @@ class Cell:
         return self.tracking_off > OFF
 
 
-def gear_of(inertia: float, bandwidth: float) -> Gear:
-    """A gear like the servo preset, with a motor that is heavy beside the load."""
-    base = PRESETS['servo']
-    w = 2.0 * pi * base.frequency
-    motor, servo = HEAVY_MOTOR * base.load_inertia, bandwidth * w
-    return replace(
-        base, friction=base.load_inertia * base.swing * w**2 / inertia, viscous=0.0,
-        motor_inertia=motor, stiffness=motor * servo**2, damping=2.0 * DAMPED * motor * servo,
-        torque_limit=1e6, motor_resolution=RESOLUTION, load_resolution=RESOLUTION,
-        reach=HEADROOM * base.swing, rate=HEADROOM * base.swing * w,
-    )
-
-
 def cell(job: tuple[float, float]) -> Cell:
     """Identify with the defaults, and close the loop with what was found, of use or not."""
     gear = gear_of(*job)
@@ -106,39 +80,13 @@ def cell(job: tuple[float, float]) -> Cell:
     )
 
 
-def map_cells(side: int, processes: int, file: Path = FILE) -> list[Cell]:
-    """All cells, by rows of one bandwidth; those that the file holds are not computed again."""
+def map_cells(side: int, processes: int) -> list[Cell]:
+    """All cells, by rows of one bandwidth."""
     jobs = [
         (float(inertia), float(bandwidth))
         for bandwidth in np.geomspace(*BANDWIDTH, side) for inertia in np.geomspace(*INERTIA, side)
     ]
-    version = _version()
-    known = {(one.inertia, one.bandwidth): one for one in _read(file, version)}
-    missing = [job for job in jobs if job not in known]
-    file.parent.mkdir(exist_ok=True)
-    with file.open('a') as out, Pool(processes) as pool:
-        computed = pool.imap_unordered(cell, missing)
-        for one in tqdm(computed, 'map', len(missing), unit='cell', disable=None):
-            out.write(json.dumps({'version': version, **asdict(one)}) + '\n')
-            out.flush()
-            known[one.inertia, one.bandwidth] = one
-    return [known[job] for job in jobs]
-
-
-def _read(file: Path, version: str) -> Iterator[Cell]:
-    for line in file.read_text().splitlines() if file.exists() else ():
-        values = json.loads(line)
-        if values.pop('version') == version:
-            yield Cell(**values)
-
-
-def _version() -> str:
-    """Of all code that a cell depends on."""
-    digest = hashlib.sha256()
-    for pattern in SOURCES:
-        for path in sorted(ROOT.glob(pattern)):
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
+    return parallel(cell, jobs, 'map', processes)
 
 
 def summary(cells: list[Cell]) -> str:

@@ -15,7 +15,7 @@ import sys
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import hypot, nan, pi
+from math import pi
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,6 @@ from gears.gear_runs import (
     PERIODS,
     PRESETS,
     SLOWER,
-    oracle,
     told,
 )
 
@@ -136,15 +135,6 @@ class GearProcesses:
             int(counts.get('late', 0)) / samples, int(counts.get('lost', 0)) / samples,
         )
 
-    def best(self) -> float:
-        """Error with the best constants, in one process, read with the encoder of the load."""
-        error, _ = oracle(self.gear, self.parameters, MOTION, self.gear.lost_motion)
-        return self.as_read(error)
-
-    def as_read(self, error: float) -> float:
-        """An error of y as it is, with the rounding of the encoder."""
-        return hypot(error, self.gear.scale * self.gear.load_resolution / 12**0.5)
-
     def _drive(self, seconds: float, share: float) -> None:
         rate = share * self.gear.scale * self.gear.rate
         with free_domain() as domain:
@@ -196,7 +186,7 @@ class Followed:
 
 
 HEADER = ('preset', 'sample period', 'gap identified / lost motion', 'gap at the end', 'none',
-          'best', 'error', 'removed', 'states', 'late', 'lost')
+          'error', 'removed', 'states', 'late', 'lost')
 
 
 def process_row(preset: str) -> list[str]:
@@ -213,13 +203,11 @@ def process_row(preset: str) -> list[str]:
         if not found['usable']:
             return [*row, '', '', '', '', '', f'identify: {"; ".join(found["reasons"])}', '', '']
         learned, none = processes.follow('learned'), processes.follow('none', NONE)
-        best = processes.best()
-    avoidable = none.error - best
-    removed = (none.error - learned.error) / avoidable if avoidable > 0.0 else nan
+    removed = (none.error - learned.error) / none.error
     states = sorted(learned.states.items(), key=lambda item: -item[1])
     return [
         *row, f'{learned.gap / lost:.3f}',
-        *(f'{one / lost:.1%}' for one in (none.error, best, learned.error)), f'{removed:.0%}',
+        *(f'{one / lost:.1%}' for one in (none.error, learned.error)), f'{removed:.0%}',
         ', '.join(f'{word} {share:.0%}' for word, share in states if share >= LEAST),
         f'{learned.late:.2%}', f'{learned.lost:.2%}',
     ]

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / 'examples'))
 
@@ -52,9 +51,10 @@ PERIODS, FIRST = 4, 2  # of a motion, and those of them that do not count
 CONSTANT_PERIODS, CONSTANT_FIRST = 2, 1  # ... where nothing is learned
 SWINGS = 4.0  # of the lost motion either way, in which it is measured
 QUASI_STATIC_S = 40.0  # for a period of that
-ORACLE_RUNS = 24
 JUMP = 30.0  # second derivative of a shape by its phase, that no smooth one has
-ORACLE_SPREAD = (0.02, 0.15, 0.15)  # of the first simplex: m relative, crossings in lost motions
+# Of gear_of: motor over load, so that friction hardly turns it back; damping ratio; limits over
+# what the sine needs; step of the encoders [rad].
+HEAVY_MOTOR, DAMPED, HEADROOM, RESOLUTION = 1000.0, 0.8, 1.5, 2.0 * pi / 2**16
 DOUBT = 0.5  # without compensation: the observer allows for what that gets wrong
 
 
@@ -271,30 +271,6 @@ def uncompensated(gear: Gear, parameters: Parameters, motion: str) -> Run:
     return close_loop(gear, controller, motion, False, CONSTANT_PERIODS, CONSTANT_FIRST)
 
 
-def oracle(
-    gear: Gear, parameters: Parameters, motion: str, lost: float,
-) -> tuple[float, tuple[float, float, float]]:
-    """Least error with constants, by Nelder and Mead, and these constants (m, c_r, c_l)."""
-    known = parameters.get_float('estimator.initial.m')
-    begin = np.array([1.0, 0.5, 0.5])
-
-    def error(x: Array) -> float:
-        if x.min() <= 0.0:
-            return inf
-        controller = constant(parameters, known * x[0], lost * x[1], -lost * x[2])
-        with np.errstate(all='ignore'):
-            return close_loop(
-                gear, controller, motion, False, CONSTANT_PERIODS, CONSTANT_FIRST
-            ).error
-
-    simplex = np.vstack([begin, begin + np.diag(ORACLE_SPREAD)])
-    best = minimize(error, begin, method='Nelder-Mead', options={
-        'maxfev': ORACLE_RUNS, 'initial_simplex': simplex, 'xatol': 1e-3, 'fatol': 0.0,
-    })
-    m, right, left = best.x
-    return float(best.fun), (float(known * m), float(right * lost), float(-left * lost))
-
-
 def inertia_ratio(gear: Gear, motion: str) -> float:
     """Largest J |a| / friction of the load on a motion; inf where its speed jumps."""
     shape, times = MOTIONS[motion]
@@ -315,9 +291,17 @@ def coasting_way(gear: Gear, motion: str) -> float:
     return float(0.5 * gear.total_inertia * speed**2 / gear.friction / gear.gap)
 
 
-__all__ = [
-    'MOTIONS', 'PERIODS', 'PRESETS', 'STROKES_S', 'Identified', 'Run', 'close_loop',
-    'coasting_way', 'constant',
-    'identified', 'inertia_ratio', 'learning', 'lost_motion', 'oracle', 'quasi_static', 'record',
-    'uncompensated',
-]
+def gear_of(inertia: float, bandwidth: float) -> Gear:
+    """A gear like the servo preset, with a motor that is heavy beside the load.
+
+    inertia: J |a| / friction of its sine. bandwidth: of the position loop over its frequency.
+    """
+    base = PRESETS['servo']
+    w = 2.0 * pi * base.frequency
+    motor, servo = HEAVY_MOTOR * base.load_inertia, bandwidth * w
+    return replace(
+        base, friction=base.load_inertia * base.swing * w**2 / inertia, viscous=0.0,
+        motor_inertia=motor, stiffness=motor * servo**2, damping=2.0 * DAMPED * motor * servo,
+        torque_limit=1e6, motor_resolution=RESOLUTION, load_resolution=RESOLUTION,
+        reach=HEADROOM * base.swing, rate=HEADROOM * base.swing * w,
+    )
