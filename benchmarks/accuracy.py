@@ -29,7 +29,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import ordinary_motions
-from contract import learning_rows, situation_rows, timing_rows
+from contract import following_rows, learning_rows, situation_rows, timing_rows
 from contract.figures import COMPARED_HEADER, Row, as_json, compare, from_json, show
 from reporting import ROOT, machine, markdown_table, text_table
 from tqdm import tqdm
@@ -75,6 +75,9 @@ ROWS: dict[str, Measured] = {
         learning_rows.plants_figures),
     'changes': Measured(
         learning_rows.changes_jobs, learning_rows.run_job, learning_rows.changes_figures),
+    'following': Measured(
+        following_rows.following_jobs, following_rows.run_following,
+        following_rows.following_figures),
     'late': Measured(
         situation_rows.late_jobs, situation_rows.run_late, situation_rows.late_figures),
     'faults': Measured(

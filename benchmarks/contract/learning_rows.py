@@ -173,7 +173,7 @@ PLANT_MARKS_S = (0.5, 2.0, 10.0)
 
 def plants_jobs(structure: str, scale: float) -> list[Job]:
     """Every plant with a few backlashes, and other motions and sensors with two of them."""
-    seeds = range(1, 1 + max(round(5 * scale), 1))
+    seeds = range(1, 1 + max(round(4 * scale), 1))
     cases = {
         'G off': DIFFERENT, 'G far off': FAR_OFF,
         'other motions and sensors': {
@@ -215,7 +215,7 @@ class RandomOutcome:
 
 def random_jobs(scale: float) -> list[tuple[str, int]]:
     """Kinds and seeds."""
-    counts = dict(zip(RANDOM_KINDS, (100, 40, 100), strict=True))
+    counts = dict(zip(RANDOM_KINDS, (60, 20, 60), strict=True))
     return [(kind, seed) for kind, count in counts.items()
             for seed in range(1, 1 + round(scale * count))]
 

@@ -1,0 +1,162 @@
+"""Rows of `structure: tracking`: how well y follows y_m beside loops that know, and how calm v is.
+
+Errors are those of y before the sensor, against y_m as late as the preview. Three loops are equal
+but for: adaptive, nothing known of the backlash; without backlash, gap 0 and slope known;
+uncompensated, slope known and gap taken as 0.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from math import pi
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from cases.geared_motor import motor
+from cases.random_cases import random_case
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+from backlash_ros.core import Parameters, build_closed_loop
+from backlash_ros.core.simulation.metrics import gap_crossings_per_reversal
+from contract.figures import Figure, figure, rms, share, upper
+
+Array = NDArray[np.float64]
+Changes = dict[str, Any]
+
+SETTLED_S = 2.0  # from here on a loop counts as settled
+PERIOD_S = 0.01  # of the paper's example
+NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'backlash.initial_u': 0.0}
+CANCELLED = 0.1  # share of what the backlash costs that may be left
+
+
+class Case(NamedTuple):
+    """One reference. samples: of the run; y_m: of a reference that is no waveform."""
+
+    group: str
+    changes: Changes
+    samples: int
+    y_m: tuple[float, ...] = ()
+
+
+class Followed(NamedTuple):
+    """A case. Errors, RMS from the settled time on over that of the reference: adaptive, without
+    backlash, uncompensated. crossings: of the gap for each reversal of y_m. moves: share of the
+    last quarter in which v moves. peak: largest |y| over that of the uncompensated loop.
+    """
+
+    group: str
+    adaptive: float
+    gapless: float
+    plain: float
+    crossings: float | None
+    moves: float
+    peak: float
+
+    @property
+    def over_gapless(self) -> float:
+        """1 for a loop that the backlash costs nothing."""
+        return min(self.adaptive / max(self.gapless, 1e-12), 1e3)
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether no more than a tenth of what the backlash costs is left, or it costs nothing."""
+        left, cost = self.adaptive - self.gapless, self.plain - self.gapless
+        return left <= max(CANCELLED * cost, 0.02 * self.gapless)
+
+
+def following_jobs(scale: float) -> list[Case]:
+    """The paper's plant with several references, with and without noise; and random plants."""
+    cases = []
+    t = PERIOD_S * np.arange(900)
+    for seed in range(1, 1 + max(round(5 * scale), 1)):
+        paper: Changes = {'structure': 'tracking', 'amplitude': 0.2, 'seed': seed,
+                          'output_noise_std': 1e-3 if seed > 1 else 0.0}
+        cases += [
+            *(Case('sine', {**paper, 'amplitude': a}, 800) for a in (0.2, 1.0, 10.0)),
+            Case('steps', {**paper, 'waveform': 'square', 'frequency': pi}, 1000),
+            Case('triangle', {**paper, 'waveform': 'triangle', 'frequency': 2.0 * pi}, 1000),
+            Case('chirp', {**paper, 'waveform': 'chirp', 'frequency_start': 0.2 * pi,
+                           'frequency': 6.0 * pi}, 1200),
+            Case('limits', {**paper, 'waveform': 'square', 'frequency': pi, 'control.min': -12.0,
+                            'control.max': 12.0, 'control.rate_max': 150.0}, 1200),
+            Case('rest', paper, 900, tuple(0.2 * np.sin(12.6 * np.minimum(t, 4.0)))),
+            Case('slow sine, noise on y_m', {**motor(), 'structure': 'tracking', 'seed': seed},
+                 6000, tuple(0.5 * np.sin(0.0025 * np.arange(6000))
+                             + 1e-4 * np.random.default_rng(seed).standard_normal(6000))),
+        ]
+    for seed in range(round(40 * scale)):
+        case = random_case(seed)
+        p = case.parameters
+        z = np.exp(1j * p.get_float('frequency') * p.get_float('sample_period'))
+        gain = abs(np.polyval(p.get_floats('plant.numerator'), z)
+                   / np.polyval(p.get_floats('plant.denominator'), z))
+        # A reference of the estimation for y.
+        cases.append(Case('random', {**p, 'structure': 'tracking',
+                                     'amplitude': float(gain) * p.get_float('amplitude')},
+                          p.get_int('tracking.preview') + 8 * case.samples // 3))
+    return cases
+
+
+def run_following(case: Case) -> Followed:
+    """Run the three loops."""
+    m = float(Parameters(case.changes)['backlash.m'])  # type: ignore[arg-type]
+    known = {'estimator.law': 'fixed', 'estimator.initial.m': m, 'estimator.initial.c_r': 0.0,
+             'estimator.initial.c_l': 0.0}
+    loops: list[Mapping[str, Any]] = [
+        {}, {**known, **NO_GAP, 'fixed.doubt': 0.0}, {**known, 'fixed.doubt': 0.5}]
+    runs = [_run(case, change) for change in loops]
+    if runs[0] is None or runs[1] is None or runs[2] is None:
+        return Followed(case.group, 1e3, 1.0, 1.0, None, 1.0, 1e3)
+    (adaptive, run, y), (gapless, _, _), (plain, _, y_plain) = runs
+    v = run.column('v')
+    return Followed(
+        case.group, adaptive, gapless, plain, gap_crossings_per_reversal(run, SETTLED_S),
+        float(np.mean(np.diff(v[len(v) * 3 // 4:]) != 0.0)),
+        float(np.abs(y).max() / np.abs(y_plain).max()),
+    )
+
+
+def _run(case: Case, change: Mapping[str, Any]) -> tuple[float, Any, Array] | None:
+    """Error, run, y before the sensor; None for a run that breaks off."""
+    with tempfile.TemporaryDirectory() as folder:
+        values = {**case.changes, **change}
+        if case.y_m:
+            file = Path(folder) / 'y_m.csv'
+            period = Parameters(values).get_float('sample_period')
+            rows = (f'{k * period:.6f},{value:.9g}' for k, value in enumerate(case.y_m))
+            file.write_text('\n'.join(['t,y_m', *rows]))
+            values |= {'waveform': 'file', 'file': str(file)}
+        p = Parameters(values)
+        loop = build_closed_loop(p)
+    try:
+        with np.errstate(over='ignore', invalid='ignore'):
+            run = loop.run(case.samples)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError):
+        return None
+    b, a = np.array(p.get_floats('plant.numerator')), np.array(p.get_floats('plant.denominator'))
+    y = lfilter(np.append(np.zeros(len(a) - len(b)), b), a, run.column('u'))
+    delay, begin = p.get_int('tracking.preview'), round(SETTLED_S / p.get_float('sample_period'))
+    begin = min(max(begin, delay), case.samples // 2)
+    wanted = run.column('y_m')[begin - delay:case.samples - delay]
+    return min(rms(y[begin:] - wanted) / max(rms(wanted), 1e-12), 1e3), run, np.asarray(y)
+
+
+def following_figures(found: Sequence[Followed]) -> dict[str, Figure]:
+    """Figures of every reference."""
+    figures: dict[str, Figure] = {}
+    for name in dict.fromkeys(one.group for one in found):
+        of = [one for one in found if one.group == name]
+        figures |= {f'{name}: {what}': one for what, one in {
+            'error / without backlash, median': figure([f.over_gapless for f in of]),
+            'error / without backlash, 90 %': figure([f.over_gapless for f in of], upper),
+            'a tenth of the cost left, or less': share([f.cancelled for f in of], 'more'),
+            'crossings of the gap for each reversal': figure(
+                [f.crossings for f in of if f.crossings is not None]),
+            'largest |y| / uncompensated': figure([f.peak for f in of]),
+        }.items()}
+        if name == 'rest':
+            figures['rest: share of samples in which v moves'] = share([f.moves for f in of])
+    return figures
