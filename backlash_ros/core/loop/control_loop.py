@@ -20,6 +20,7 @@ from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation2.executor import Executor, InlineExecutor
 from backlash_ros.core.loop.command_history import CommandHistory
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
+from backlash_ros.core.loop.phase import Event, Phase, after
 from backlash_ros.core.loop.report_use import report_use
 from backlash_ros.core.loop.sample_counter import Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import NOISE, Parameters
@@ -39,8 +40,7 @@ class ControlLoop:
     what was known before. counter: goes on counting where another loop has ended. v: the newest
     command, 0 as long as nobody knows (knows_v) which one acts. reports: v and stamp [ns] of what
     the driver has reported since the last call. executor: where fits are made, None for here.
-    told: G(z) as the parameters have it. silent: the driver was given up for the time being.
-    standing_down: another controller commands the actuator, so nothing is sent.
+    told: G(z) as the parameters have it. phase: see phase.py.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class ControlLoop:
         self.commands = CommandHistory(p.get_float('sample_period'), report_use(p))
         self.y_m = nan  # the newest one
         self.v, self.knows_v = v or 0.0, v is not None
-        self.silent = self.standing_down = False
+        self.phase = Phase.BEGINS
         self.adapting = self.compensating = True
         self.last: ControlStep | None = None
         self.heard_at: float | None = None  # on the steady clock [s]
@@ -63,7 +63,6 @@ class ControlLoop:
         self._missing = 0  # outputs since the newest one that was used
         self._unsent = 0  # those of them that were never published
         self._restarted = False  # whether sender or clock restarted since then
-        self._begun = False  # whether the present core has taken a step
         self._other_ns = 0  # when another controller was last heard to command
         self.executor = executor or InlineExecutor()
         self.core = build_controller(p, estimate, self.executor)
@@ -79,13 +78,9 @@ class ControlLoop:
 
         Nothing is known of the state of the plant then.
         """
-        before = self.core
-        self.core = build_controller(self._p, estimate, self.executor)
-        self.core.go_on_from(before)
-        before.close()
-        self.core.compensating = self.compensating
-        self.core.estimator.adapting = self.adapting
-        self._begun, self._missing = False, 0
+        if self.phase is Phase.RUNS:
+            self._happens(Event.INTERRUPTION)
+        self._renew_core(estimate)
 
     def reset(self) -> None:
         """Begin with the estimates of estimator.initial."""
@@ -126,7 +121,17 @@ class ControlLoop:
     @property
     def begins(self) -> bool:
         """Whether the next command is the first one, since the start or an interruption."""
-        return self.silent or not self._begun
+        return self.phase in (Phase.BEGINS, Phase.SILENT)
+
+    @property
+    def silent(self) -> bool:
+        """Whether the driver was given up for the time being."""
+        return self.phase is Phase.SILENT
+
+    @property
+    def standing_down(self) -> bool:
+        """Whether another controller commands the actuator, so that nothing is sent."""
+        return self.phase is Phase.STANDS_DOWN
 
     def learn_v(self, stamp_ns: int) -> bool:
         """Take the v that the driver reports with this output for the one that acts, if it does.
@@ -223,12 +228,14 @@ class ControlLoop:
 
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""
-        self.silent = True
-        self.renew(self.estimate)
+        before = self.phase
+        self._happens(Event.TIMEOUT)
+        if self.phase is not before:
+            self._renew_core(self.estimate)
 
     def stand_down(self) -> None:
         """Leave the actuator to another controller."""
-        self.standing_down = True
+        self._happens(Event.RIVAL)
 
     def hear_other(self, v: float) -> None:
         """Take in a command of the controller that is in charge."""
@@ -238,9 +245,9 @@ class ControlLoop:
 
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""
-        self.standing_down = self.silent = False
+        self._happens(Event.RIVAL_GONE)
         self.heard_at = None
-        self.renew(self.estimate)
+        self._renew_core(self.estimate)
 
     def take_up(self, p: Parameters) -> None:
         """Use other values of the live parameters; what was learned stays."""
@@ -254,6 +261,18 @@ class ControlLoop:
             structure = build_structure(p)
             structure.go_on_from(core.structure)
             core.structure = structure
+
+    def _happens(self, event: Event) -> None:
+        self.phase = after(self.phase, event)
+
+    def _renew_core(self, estimate: Estimate) -> None:
+        before = self.core
+        self.core = build_controller(self._p, estimate, self.executor)
+        self.core.go_on_from(before)
+        before.close()
+        self.core.compensating = self.compensating
+        self.core.estimator.adapting = self.adapting
+        self._missing = 0
 
     def _put_out(self, v: float) -> None:
         self.v, self.knows_v = v, True
@@ -269,7 +288,7 @@ class ControlLoop:
         self._unsent += arrival.unsent
         self._restarted = self._restarted or arrival.restarted
         # What came before the first sample that is used was not lost: nobody listened.
-        if self._begun and not (self.silent or arrival.restarted):
+        if self.phase is Phase.RUNS and not arrival.restarted:
             self.statistics.lost += arrival.missing
             self.statistics.unsent += arrival.unsent
 
@@ -280,16 +299,17 @@ class ControlLoop:
             not self._lockstep
             and 0.0 < timeout < self._missing * self._p.get_float('sample_period')
         )
-        if self.silent or self._restarted or (too_long and self._begun):
+        if self.silent or self._restarted or (too_long and self.phase is Phase.RUNS):
             self.statistics.interruptions += 1
-            self.renew(self.estimate)
-        self.silent = self._restarted = False
+            self._happens(Event.INTERRUPTION)
+            self._renew_core(self.estimate)
+        self._restarted = False
 
     def _step_core(self, y: float, y_m: float, stamp_ns: int) -> ControlStep:
         """Step the core over the missing outputs to y, with the v that was really applied."""
         core = self.core
-        if not self._begun:
-            self._begun = True
+        if self.phase is Phase.BEGINS:
+            self._happens(Event.ANSWER)
             self._missing = self._unsent = 0
             if not self._lockstep:
                 self.learn_v(stamp_ns)

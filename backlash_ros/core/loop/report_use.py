@@ -10,7 +10,8 @@ from backlash_ros.core.parameters import Parameters
 # without, after which they are given up. Messages that have nothing to do with the samples fit an
 # interval every other time at most: 20 times in a row by a chance of one in a million.
 CONSISTENT = 20
-AWAITED_REPORTS = 20  # outputs that stay without an answer while the driver may yet report its v
+# Outputs that stay without an answer while the driver may yet report its v, and for how long.
+AWAITED_REPORTS, AWAITED_S = 20, 0.5
 
 
 class ReportUse(Enum):
@@ -30,6 +31,11 @@ def report_use(p: Parameters) -> ReportUse:
     use = ReportUse(p.get_str('estimator.use_applied_control'))
     delayed = use is ReportUse.AUTO and p.get_int('control.delay_samples') > 0
     return ReportUse.NEVER if delayed or p.get_bool('lockstep') else use
+
+
+def awaited_reports(p: Parameters) -> int:
+    """How many outputs may stay without an answer while the driver may yet report its v."""
+    return min(AWAITED_REPORTS, max(int(AWAITED_S / p.get_float('sample_period')), 1))
 
 
 class ReportTrust:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import isfinite
 
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.report_use import AWAITED_REPORTS
+from backlash_ros.core.loop.report_use import awaited_reports
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters, missing_limits
 from backlash_ros.nodes.control.reports import Reports
@@ -46,7 +46,7 @@ class FirstCommand:
             return True
         reported = self._reports is not None and self._reports.publishers > 0
         self._unanswered += 1
-        if reported and self._unanswered <= AWAITED_REPORTS:
+        if reported and self._unanswered <= awaited_reports(p):
             return False
         if self._io.in_joint_space:
             # v and y are the same angle but for the gap: the joint holds where it stands.

@@ -13,6 +13,7 @@ from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import OF_MESSAGES, Finding, Level
+from backlash_ros.core.loop.phase import Phase
 from backlash_ros.core.loop.sample_counter import JointOutputs
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -84,7 +85,8 @@ class Joint:
     def is_overdue(self) -> bool:
         """Whether its driver has been silent for too long, and that is new."""
         loop, timeout = self.loop, self.p.get_float('timeout.plant_output')
-        return loop is not None and loop.heard_at is not None and not loop.silent \
+        return loop is not None and loop.heard_at is not None \
+            and loop.phase in (Phase.BEGINS, Phase.RUNS) \
             and 0.0 < timeout < time.monotonic() - loop.heard_at
 
     def check_change(self, p: Parameters) -> None:
