@@ -95,7 +95,7 @@ class BagReader:
 
 def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Message]:
     """Messages up to the first record that is not sound; a chunk that is not is left out."""
-    topics: dict[int, Topic] = {}
+    topics: dict[int, Topic] = {}  # the wanted ones by the number of their channel
     schemas: dict[int, Schema] = {}
     broken = 0
     with file.open('rb') as stream:
@@ -115,9 +115,9 @@ def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Message]
                 elif isinstance(record, Channel):
                     schema = schemas[record.schema_id]
                     topic = Topic(record.topic, schema.name, schema.data.decode())
-                    topics[record.id] = topic
-                    wanted(topic)
-                elif isinstance(record, McapMessage) and wanted(topics[record.channel_id]):
+                    if wanted(topic):
+                        topics[record.id] = topic
+                elif isinstance(record, McapMessage) and record.channel_id in topics:
                     yield Message(topics[record.channel_id], record.log_time, record.data)
     if broken:
         raise BagError(f'{file}: {broken} chunks are damaged')
