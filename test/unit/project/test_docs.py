@@ -213,7 +213,9 @@ def check_tool(program: str, arguments: list[str]) -> None:
         simulate.make_parser().parse_args(arguments) if program == 'simulate'
         else bringup.parse_options(arguments)
     )
-    build_controller(effective_parameters(options.config, options.settings, options.seed))
+    build_controller(effective_parameters(
+        options.config, options.settings, options.seed, getattr(options, 'axis', '')
+    ))
     for sweep in getattr(options, 'sweep', []):
         batch.parse_sweep(sweep)
 
