@@ -12,16 +12,23 @@ FEWEST = 20  # intervals
 # What the period is fitted to: the newest stamps of this time, and at most so many.
 WINDOW_NS, STAMPS = 2_000_000_000, 1000
 OTHER_PACE = 0.25  # share by which typical intervals differ from the period where they are no such
+# Share of the period by which stamps may scatter: beyond, as of a driver that is held up all the
+# time, nobody can tell from them which samples were left out.
+SCATTERED = 0.15
 # Samples for which a process that is held up is late, so that their lateness is one error.
 HELD_UP = 10.0
 
 
 class Period(NamedTuple):
-    """Mean period of the driver, its standard deviation, and the median interval [s]."""
+    """Mean period of the driver, its standard deviation, the median interval [s].
+
+    scatter: standard deviation of the stamps around their even spacing [s].
+    """
 
     mean: float = nan
     std: float = nan
     median: float = nan
+    scatter: float = nan
 
     def differs_from(self, nominal_s: float, tolerance: float) -> bool:
         """Whether it certainly is off by more than a share, and the median interval likewise."""
@@ -57,7 +64,7 @@ class DriverPeriod:
         """The period over so many intervals at most: the slope of the stamps over their samples.
 
         It is known to some 0.1 % after a second. A message that was lost, or came twice, does not
-        disturb it; unknown where most intervals are no period at all.
+        disturb it; unknown where most intervals are no period at all, or scatter widely.
         """
         stamps = list(self._stamps_ns)[-intervals - 1:]
         begin = len(stamps) - FEWEST - 1
@@ -78,7 +85,7 @@ class DriverPeriod:
             for step in steps:
                 numbers.append(numbers[-1] + round(step / found.mean))
             found = _slope(numbers, times)
-            if not found.mean > 0.0:
+            if not (found.mean > 0.0 and found.scatter < SCATTERED * self.nominal_s):
                 return UNKNOWN_PERIOD
         return found._replace(median=median(ordered))
 
@@ -92,4 +99,4 @@ def _slope(numbers: list[int], times: list[float]) -> Period:
     rest = sum(
         (t - centre - slope * (n - middle))**2 for n, t in zip(numbers, times, strict=True)
     ) / len(times)
-    return Period(slope, sqrt(HELD_UP * rest / spread))
+    return Period(slope, sqrt(HELD_UP * rest / spread), scatter=sqrt(rest))
