@@ -49,7 +49,8 @@ def png_references(html: str) -> list[bytes]:
 
 
 def test_page_needs_nothing_from_elsewhere(page: Path) -> None:
-    html = page.read_text(encoding='utf-8')
+    # What the pictures consist of may look like anything.
+    html = re.sub('base64,[^"]+', 'base64,', page.read_text(encoding='utf-8'))
     sources = re.findall(r'(?:src|href|url|srcset|action)\s*[=(]\s*["\']?([^"\'>\s)]+)', html)
     assert sources
     assert all(source.startswith('data:image/png;base64,') for source in sources)
