@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize, nnls
-from scipy.signal import lfilter
 
 from backlash_ros.core.identification.play_record import PlayRecord
+from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 

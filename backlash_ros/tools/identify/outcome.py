@@ -32,7 +32,6 @@ from backlash_ros.tools.identify.identified_file import (
 )
 from backlash_ros.tools.identify.names import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
 from backlash_ros.tools.identify.page import render
-from backlash_ros.tools.identify.pictures import draw
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
@@ -74,6 +73,8 @@ def write_outcome(
             found = replace(found, reasons=(f'the controller does not take it: {error}',))
     write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes}, out / JSON)
     write_record(record, out / 'record.csv')
+    # Matplotlib is loaded where there is something to draw.
+    from backlash_ros.tools.identify.pictures import draw
     pictures = list(draw(found))
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)

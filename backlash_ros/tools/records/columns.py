@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from backlash_ros.tools.cli import InputError
-from backlash_ros.tools.records.table import columns_of
 
 OPTION = '--columns'
 ROLES = ('t', 'v', 'y')
@@ -87,6 +86,12 @@ def choose_columns(
     said = ', '.join(f'{role} is {found[role]!r}' for role in guessed)
     return Columns(found.get('t', ''), found['v'], found['y'], found.get(COMMAND, ''),
                    f'columns: {said}; {OPTION} chooses others' if said else '')
+
+
+def columns_of(names: Sequence[str]) -> str:
+    """What columns there are, in words."""
+    shown = ', '.join(names[:14]) + (f', … ({len(names)} in all)' if len(names) > 14 else '')
+    return f'the columns are {shown}'
 
 
 def unit_of(name: str) -> float | None:

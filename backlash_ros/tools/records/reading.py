@@ -10,11 +10,10 @@ from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import record_of, record_of_samples
 from backlash_ros.tools.cli import WHOLE, InputError, Span
 from backlash_ros.tools.records.columns import choose_columns, unit_of
-from backlash_ros.tools.records.messages import read_bag_record
 from backlash_ros.tools.records.table import Table, read_table
 from backlash_ros.tools.runs.files import RECORD, SAMPLES
-from backlash_ros.tools.runs.source import find_bag, read_run
 
+NO_TABLES = ('.npz', '.mcap', '.db3', '.zstd', '.zst')  # files of results and bags
 NO_COLUMNS: Mapping[str, str] = {}
 
 
@@ -37,7 +36,17 @@ def read_record(
     return replace(record, source=str(path))
 
 
+def is_table(path: Path) -> bool:
+    """Whether a path is one of a table."""
+    return path.is_file() and path.suffix.lower() not in NO_TABLES
+
+
 def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str]) -> Record:
+    if is_table(path):
+        return _from_table(read_table(path), period, columns)
+    # What reads bags takes half a second to load.
+    from backlash_ros.tools.records.messages import read_bag_record
+    from backlash_ros.tools.runs.source import find_bag, read_run
     bag = find_bag(path)
     if bag is not None:
         return read_bag_record(bag, period, axis, columns)
@@ -46,14 +55,12 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
             f'{path}: holds no bag, no {RECORD} and no {SAMPLES}: give one of them, or a table '
             'with t, v and y'
         )
-    if path.is_dir() or path.suffix == '.npz':
-        run = read_run(path).record
-        if not run.samples:
-            raise InputError(f'{path}: holds no sample')
-        return record_of_samples(
-            run.column('t'), run.column('v'), run.column('y'), period or run.sample_period
-        )
-    return _from_table(read_table(path), period, columns)
+    run = read_run(path).record
+    if not run.samples:
+        raise InputError(f'{path}: holds no sample')
+    return record_of_samples(
+        run.column('t'), run.column('v'), run.column('y'), period or run.sample_period
+    )
 
 
 def _from_table(table: Table, period: float | None, given: Mapping[str, str]) -> Record:

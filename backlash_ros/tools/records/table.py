@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.tools.cli import InputError
+from backlash_ros.tools.records.columns import columns_of
 
 Array = NDArray[np.float64]
 
@@ -75,12 +76,6 @@ class Table:
                 f'another column with --columns; {columns_of(self.names)}'
             )
         return values
-
-
-def columns_of(names: Sequence[str]) -> str:
-    """What columns there are, in words."""
-    shown = ', '.join(names[:14]) + (f', … ({len(names)} in all)' if len(names) > 14 else '')
-    return f'the columns are {shown}'
 
 
 def number_in(cell: str, decimal_comma: bool) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from math import isfinite, isnan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,6 +22,7 @@ from backlash_ros.tools.cli import (
     run_tool,
     span_of,
 )
+from backlash_ros.tools.records.columns import parse_columns
 
 if TYPE_CHECKING:
     from backlash_ros.core.parameters import Parameters
@@ -47,7 +48,10 @@ def make_parser() -> argparse.ArgumentParser:
     """The options."""
     parser = OptionParser(EXECUTABLE, description=__doc__)
     parser.add_argument('runs', type=Path, nargs='+', metavar='RUN',
-                        help='a bag, or a folder of results; several give a table')
+                        help='a bag, a folder of results, or a log, as identify reads it, with '
+                             '--config; several give a table')
+    parser.add_argument('--columns', type=parse_columns, default={}, metavar='t=…,v=…,y=…',
+                        help='which columns of a log these are (default: told by their names)')
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameters (default: parameters.yaml beside the run)')
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
@@ -88,6 +92,10 @@ def _opened(
     path: Path, options: argparse.Namespace, span: Span,
 ) -> tuple[RunRecord, Parameters, Sequence[Sequence[float]]]:
     """The run, the parameters with which it is to be replayed, and what its driver reported."""
+    from backlash_ros.tools.records.reading import is_table
+    from backlash_ros.tools.runs.files import SAMPLES
+    if is_table(path) and path.name != SAMPLES:
+        return _logged(path, options, span)
     from backlash_ros.tools.runs.source import read_run
     source = read_run(path.resolve(), options.config, span, options.axis)
     for text in source.notes:
@@ -98,6 +106,27 @@ def _opened(
         raise InputError(f'{path}: no parameters.yaml stands beside it: give --config')
     parameters = _with_settings(source.parameters, options.settings)
     return source.record, parameters, _reports(path, source.record, parameters, options.axis)
+
+
+def _logged(
+    path: Path, options: argparse.Namespace, span: Span,
+) -> tuple[RunRecord, Parameters, Sequence[Sequence[float]]]:
+    """The same of a log: its v is what acted, in every interval."""
+    from backlash_ros.tools.config import effective_parameters
+    from backlash_ros.tools.records.reading import read_record
+    from backlash_ros.tools.replay.logged_run import logged_run
+    if options.config is None:
+        raise InputError(f'{path}: is a log: give --config, like identified.yaml of `identify`')
+    parameters = _with_settings(
+        effective_parameters(options.config, axis=options.axis), options.settings
+    ).replaced({'estimator.use_applied_control': 'true'})
+    record = read_record(
+        path, parameters.get_float('sample_period'), span, columns=options.columns
+    )
+    for text in (record.timing, *record.notes):
+        print(f'{EXECUTABLE}: {text}', file=sys.stderr)
+    run, applied = logged_run(record)
+    return run, parameters, applied
 
 
 def _reports(
@@ -159,7 +188,7 @@ def _one(job: _Job, out: Path | None) -> None:
     summary = write_report(Run(replayed, parameters), directory)
     write_atomically(directory / FIGURE, png(draw_replay(recorded, replayed)))
     print(format_table(('', 'run', 'replay', '±'), _compared(recorded, summary)))
-    print(_parted(recorded, replayed))
+    print(_states(replayed) if isnan(recorded.column('m')[-1]) else _parted(recorded, replayed))
     print(directory / FIGURE)
     print(directory / PAGE)
 
@@ -170,6 +199,18 @@ def _compared(recorded: RunRecord, summary: Mapping[str, Any]) -> list[tuple[str
          f'{summary["final_std"][name]:.2g}')
         for name in ('m', 'c_r', 'c_l')
     ]
+
+
+def _states(run: RunRecord) -> str:
+    """From when on which state held: all that a log, which has no estimates, is compared with."""
+    import numpy as np
+
+    from backlash_ros.core.estimate import Status
+    status = run.column('status')
+    begins = np.append(0, np.flatnonzero(np.diff(status)) + 1)
+    shown = [f'{Status(int(status[k])).word} from {run.column("t")[k]:.3g} s' for k in begins[:8]]
+    more = f', … ({len(begins)} in all)' if len(begins) > len(shown) else ''
+    return f'states: {", ".join(shown)}{more}'
 
 
 def _parted(recorded: RunRecord, replayed: RunRecord) -> str:

@@ -168,3 +168,26 @@ def test_bad_input_is_told_in_one_line(
     given = [str(recorded) if word == 'RUN' else word for word in arguments]
     assert main([*given, '--out', str(tmp_path)]) == 2
     assert capsys.readouterr().err.count('\n') == 1
+
+
+@pytest.mark.usefixtures('undrawn')
+@pytest.mark.parametrize('repeated', [1, 3])
+def test_a_log_tells_what_the_controller_would_have_learned_from_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], repeated: int,
+) -> None:
+    run = build_closed_loop(Parameters({'plant.uncertainty': 0.0, **NOISY})).run(300)
+    log, config = tmp_path / 'log.csv', tmp_path / 'a.yaml'
+    y = run.column('y')[repeated * (np.arange(300) // repeated)]
+    log.write_text('time_ms;command;position\n' + ''.join(
+        f'{1e3 * t!r};{v!r};{y_k!r}\n' for t, v, y_k in zip(
+            run.column('t').tolist(), run.column('v').tolist(), y.tolist(), strict=True)))
+    config.write_text('/**: {ros__parameters: {plant: {uncertainty: 0.0}}}')
+    assert main([str(log), '--out', str(tmp_path / 'out')]) == 2
+    assert 'is a log: give --config' in capsys.readouterr().err
+    assert main([str(log), '--config', str(config), '--out', str(tmp_path / 'out')]) == 0
+    said = capsys.readouterr()
+    assert 'states: acquiring from 0 s, tracking from' in said.out
+    assert ('y repeats 3 times' in said.err) is (repeated == 3)
+    final = json.loads((tmp_path / 'out' / 'summary.json').read_text())['final']
+    assert final['c_r'] == pytest.approx(3.0, rel=0.02)
+    assert final['c_l'] == pytest.approx(-3.0, rel=0.02)
