@@ -133,6 +133,8 @@ def parse_arguments() -> argparse.Namespace:
                         help='rows that it holds and that are not measured now stay in it')
     parser.add_argument('--reference', action='store_true',
                         help=f'write these rows into {REFERENCE.relative_to(ROOT)}')
+    parser.add_argument('--adopt', type=Path, metavar='FILE',
+                        help='measure nothing: the rows of these results become the reference')
     parser.add_argument('--compare', type=Path, default=REFERENCE, metavar='FILE',
                         help='another reference')
     arguments = parser.parse_args()
@@ -179,9 +181,19 @@ def write_page() -> None:
     PAGE.write_text('\n\n'.join([HEAD, *sections]) + '\n')
 
 
+def adopt(rows: dict[str, Row]) -> None:
+    """Let these rows be the reference."""
+    write_rows(REFERENCE, rows)
+    write_page()
+    print(f'wrote {", ".join(rows)} into {REFERENCE.relative_to(ROOT)}')
+
+
 def main() -> int:
     """Return 0 if nothing is worse than the reference, else 1."""
     arguments = parse_arguments()
+    if arguments.adopt is not None:
+        adopt(read_rows(arguments.adopt))
+        return 0
     before = read_rows(arguments.compare)
     rows: dict[str, Row] = {}
     for name in ROWS:
@@ -204,9 +216,7 @@ def main() -> int:
         if found:
             print(text_table(COMPARED_HEADER, found))
     if arguments.reference:
-        write_rows(REFERENCE, rows)
-        write_page()
-        print(f'wrote {REFERENCE.relative_to(ROOT)}')
+        adopt(rows)
         return 0
     return 1 if worse else 0
 
