@@ -187,7 +187,8 @@ def other_nonlinearity(o: Observed) -> str:
         centre, half = zone.at
         return (
             f'v does nothing from {centre - abs(half):.4g} to {centre + abs(half):.4g}, from '
-            'wherever it comes: a dead zone, which has no memory, and no backlash'
+            'wherever it comes: a dead zone, which has no memory, and no backlash; remove it where '
+            'it is made, it is not compensated here'
         )
     width = abs(one.at[0])
     leads = fit.best(lambda width: 2.0 * fit.v - with_play(width), widths)
@@ -202,8 +203,8 @@ def other_nonlinearity(o: Observed) -> str:
     if count >= 3 and fit.beats(several, one, o.noise):
         return (
             f'{count} plays in parallel explain it, up to {steps[weights > 0.0].max():.3g} wide: y '
-            'turns smoothly, as with friction along the way or in a piezo; no single backlash '
-            'describes it'
+            'turns smoothly, as with friction along the way or in a piezo; only a single backlash '
+            'is compensated here'
         )
     return ''
 
@@ -247,7 +248,8 @@ def creep(o: Observed) -> str:
         return ''
     return (
         f'y creeps by {by_time:.3g} over the record, {by_time / turns:.3g} for each motion to and '
-        'fro, though v returns: the way is not the same in both directions, or y drifts'
+        'fro, though v returns: the way is not the same in both directions, or y drifts; mend what '
+        'slips, or measure y without a drift'
     )
 
 

@@ -210,8 +210,9 @@ def effective_rows(samples: Samples, found: Fit) -> float:
 
 
 def lag_one(samples: Samples, found: Fit) -> float:
-    """Correlation of successive residuals, at least 0."""
-    residual = samples.y - found.simulated
-    pairs = residual[1:] * residual[:-1]
-    energy = float(np.nanmean(residual**2))
-    return min(max(float(np.nanmean(pairs)) / energy, 0.0), 0.99) if energy > 0.0 else 0.0
+    """Correlation of the residuals of successive readings, lost ones left out, at least 0."""
+    residual = samples.target - found.simulated[samples.known]
+    energy = float(np.mean(residual**2))
+    if energy == 0.0 or len(residual) < 2:
+        return 0.0
+    return min(max(float(np.mean(residual[1:] * residual[:-1])) / energy, 0.0), 0.99)

@@ -127,9 +127,11 @@ class Findings(NamedTuple):
         """Correlated part of the residual, as a motion of v."""
         # What an encoder rounds away repeats itself as well, but is explained.
         excess = self.rms**2 - ROUNDING * self.quantum**2
-        if self.correlation <= 0.0 or self.gain <= 0.0 or excess <= 0.0:
+        # Where no correlation can be told, all of it may be one.
+        correlated = self.correlation if np.isfinite(self.correlation) else 1.0
+        if correlated <= 0.0 or self.gain <= 0.0 or excess <= 0.0:
             return 0.0
-        return float(np.sqrt(excess * self.correlation) / self.gain)
+        return float(np.sqrt(excess * correlated) / self.gain)
 
 
 def judge(f: Findings) -> Verdict:
@@ -280,7 +282,7 @@ def _model(f: Findings) -> Answer:
 
 def _remarks(f: Findings) -> list[str]:
     found = []
-    if f.static < 0.0:
+    if f.static < 0.0 and f.gain_std <= PRECISE:
         found.append('y moves against v: the gain of G is negative')
     if f.delay == f.longest_delay and f.delay > 0:
         found.append(

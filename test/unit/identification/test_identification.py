@@ -106,6 +106,18 @@ def test_lost_samples_and_outliers_do_not_matter() -> None:
     assert found.denominator == pytest.approx((1.0, -1.7, 0.755), abs=0.01)
 
 
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('every', [2, 5])
+def test_a_y_that_is_read_every_few_samples_alone_is_enough(every: int) -> None:
+    v, y = record()
+    y[np.arange(len(y)) % every != 0] = np.nan
+    found = identify(v, y, PERIOD_S, QUICK)
+    assert found.verdict is not None
+    assert found.verdict.backlash.known
+    assert found.gap == pytest.approx(0.9, abs=4.0 * found.std['gap'])
+    assert found.std['gap'] < 0.02
+
+
 def test_slope_is_taken_out_of_the_gain_of_g() -> None:
     v, y = record()
     one = identify(v, y, PERIOD_S, QUICK)

@@ -105,6 +105,13 @@ def test_what_no_model_explains_widens_the_deviations_and_then_refuses() -> None
     assert 'something else than a backlash and a linear G moves y' in much.backlash.reason
 
 
+def test_a_correlation_that_is_not_known_promises_nothing() -> None:
+    found = verdict(correlation=float('nan'))
+    assert found.gap_std == pytest.approx(FOUND.gap_std, rel=0.05)
+    assert found.gap_std > FOUND.gap_std
+    assert found.backlash.reason.startswith('the gap is 0.6 ± 0.01')
+
+
 def test_what_is_no_play_is_named_first() -> None:
     o = observed(V, behind(dead_zone(V), 'lag'))
     found = judge(FOUND._replace(observed=o, evidence=1.0))
