@@ -74,9 +74,9 @@ if __name__ == '__main__':
             (copy / where).write_text(ast.unparse(tree))
             tests = tests_of('.'.join(where.with_suffix('').parts), options.rooms)
             pytest = [sys.executable, '-m', 'pytest', '-xqq', '-p', 'no:cacheprovider', *tests]
-            fails = bool(tests) and subprocess.run(pytest, cwd=copy, capture_output=True).returncode
-            caught += bool(fails)
+            done = tests and subprocess.run(pytest, cwd=copy, capture_output=True, text=True)
+            by = done.stdout.splitlines()[-1][:150] if done and done.returncode else 'nobody'
+            caught += by != 'nobody'
             shutil.copy(path, copy / where)
-            print('caught' if fails else 'MISSED', f'{where}:{node.lineno}: {before} ->',
-                  ast.unparse(node), f'({len(tests)} files)', flush=True)
+            print(f'{where}:{node.lineno}: {before} -> {ast.unparse(node)}: by', by, flush=True)
     print(f'{caught} of {options.count} caught')
