@@ -1,12 +1,9 @@
 """How many small faults, put into the package by a seed, the tests find.
 
     .venv/bin/python benchmarks/mutants.py --seed 1 --count 80 [--rooms unit loop system]
-
-A mutant has one operator, comparison, constant or call changed. It meets the test files whose
-imports lead to its module, the nearest first, until one of them fails.
+A mutant has one operator, comparison, constant or call changed. It meets the NEAREST test files of
+those whose imports lead to its module, until one of them fails.
 """
-
-from __future__ import annotations
 
 import argparse
 import ast
@@ -22,6 +19,7 @@ from reporting import ROOT
 PAIRS = [(ast.Lt, ast.LtE), (ast.Gt, ast.GtE), (ast.Eq, ast.NotEq), (ast.Is, ast.IsNot),
          (ast.Add, ast.Sub), (ast.Mult, ast.Div), (ast.And, ast.Or)]
 SWAPS = dict([*PAIRS, *((b, a) for a, b in PAIRS)])
+NEAREST = 12  # test files
 LEFT_OUT = shutil.ignore_patterns('.git', '.venv', 'results', 'build', '__pycache__', '.*_cache')
 
 
@@ -31,8 +29,8 @@ def mutations(tree: ast.Module) -> list[tuple[ast.AST, str, object]]:
     for node in ast.walk(tree):
         if isinstance(node, (ast.BinOp, ast.BoolOp)) and type(node.op) in SWAPS:
             found.append((node, 'op', SWAPS[type(node.op)]()))
-        elif isinstance(node, ast.Compare) and type(node.ops[0]) in SWAPS:
-            found.append((node, 'ops', [SWAPS[type(node.ops[0])](), *node.ops[1:]]))
+        elif isinstance(node, ast.Compare) and (other := SWAPS.get(type(node.ops[0]))):
+            found.append((node, 'ops', [other(), *node.ops[1:]]))
         elif isinstance(node, ast.Constant) and isinstance(node.value, (int, float)):
             flipped = not node.value if isinstance(node.value, bool) else 1.3 * node.value + 1
             found.append((node, 'value', type(node.value)(flipped)))
@@ -53,8 +51,8 @@ def tests_of(module: str, rooms: list[str]) -> list[str]:
     near = [module]
     for name in near:
         near += [other for other in files if other not in near and name in needs[other]]
-    found = [files[name].relative_to(ROOT) for name in near if name.startswith('test_')]
-    return [str(path) for path in found if path.parts[1] in rooms and 'project' not in path.parts]
+    found = [files[name].relative_to(ROOT).parts for name in near if name.startswith('test_')]
+    return ['/'.join(p) for p in found if p[1] in rooms and 'project' not in p][:NEAREST]
 
 
 if __name__ == '__main__':
@@ -74,9 +72,9 @@ if __name__ == '__main__':
             (copy / where).write_text(ast.unparse(tree))
             tests = tests_of('.'.join(where.with_suffix('').parts), options.rooms)
             pytest = [sys.executable, '-m', 'pytest', '-xqq', '-p', 'no:cacheprovider', *tests]
-            done = tests and subprocess.run(pytest, cwd=copy, capture_output=True, text=True)
-            by = done.stdout.splitlines()[-1][:150] if done and done.returncode else 'nobody'
-            caught += by != 'nobody'
+            out = tests and subprocess.run(pytest, cwd=copy, capture_output=True, text=True).stdout
+            by = [line[:150] for line in out and out.splitlines() if line.startswith('FAILED ')]
+            caught += bool(by)
             shutil.copy(path, copy / where)
-            print(f'{where}:{node.lineno}: {before} -> {ast.unparse(node)}: by', by, flush=True)
-    print(f'{caught} of {options.count} caught')
+            print(f'{where}:{node.lineno}: {before} -> {ast.unparse(node)}:', by or 'MISSED', flush=True)
+    print(caught, 'of', options.count, 'caught')

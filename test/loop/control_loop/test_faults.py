@@ -93,8 +93,8 @@ def test_lost_outputs_leave_the_estimates_within_5_percent(share: float, publish
     world.fault = lose
     world.run(400)
     statistics = world.loop.statistics
-    assert world.error() < 0.05
     assert statistics.lost == pytest.approx(share * 400.0, rel=0.35, abs=3.0)
+    world.learn(0.05)
     assert statistics.unsent == (0 if published else statistics.lost)
     world.check_sanity()
 
@@ -225,8 +225,10 @@ def test_a_second_driver_is_not_listened_to() -> None:
 def test_a_loop_that_ended_goes_on_from_its_last_command_and_counts_on(
     structure: str, clean_up: bool,
 ) -> None:
+    # With the amplitude of the example tracking would ask for more than the rate allows.
     world = SimulatedLoop(structure=structure, **{
         'control.rate_max': RATE_MAX, 'on_stop': 'ramp',
+        'amplitude': 0.2 if structure == 'tracking' else 10.0,
     })
     world.learn()
     index, rows = world.loop.counter.index, len(world.rows)
