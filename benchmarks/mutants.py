@@ -70,11 +70,11 @@ if __name__ == '__main__':
             before, where = ast.unparse(node), path.relative_to(ROOT)
             setattr(node, field, value)
             (copy / where).write_text(ast.unparse(tree))
-            tests = tests_of('.'.join(where.with_suffix('').parts), options.rooms)
+            tests = tests_of(str(where)[:-3].replace('/', '.'), options.rooms)
             pytest = [sys.executable, '-m', 'pytest', '-xqq', '-p', 'no:cacheprovider', *tests]
             out = tests and subprocess.run(pytest, cwd=copy, capture_output=True, text=True).stdout
             by = [line[:150] for line in out and out.splitlines() if line.startswith('FAILED ')]
             caught += bool(by)
             shutil.copy(path, copy / where)
-            print(f'{where}:{node.lineno}: {before} -> {ast.unparse(node)}:', by or 'MISSED', flush=True)
+            print(f'{where}:{node.lineno}: {before} ->', ast.unparse(node), by or 'MISSED', flush=True)
     print(caught, 'of', options.count, 'caught')
