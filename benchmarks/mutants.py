@@ -2,7 +2,7 @@
 
     .venv/bin/python benchmarks/mutants.py --seed 1 --count 80 [--rooms unit loop system]
 A mutant has one operator, comparison, constant or call changed. It meets the NEAREST test files of
-those whose imports lead to its module, until one of them fails.
+those whose imports lead to its module, until one of them fails; - says that none has.
 """
 
 import argparse
@@ -76,5 +76,5 @@ if __name__ == '__main__':
             by = [line[:150] for line in out and out.splitlines() if line.startswith('FAILED ')]
             caught += bool(by)
             shutil.copy(path, copy / where)
-            print(f'{where}:{node.lineno}: {before} ->', ast.unparse(node), by or 'MISSED', flush=True)
+            print(f'{where}:{node.lineno}: {before} ->', ast.unparse(node), by or '-', flush=True)
     print(caught, 'of', options.count, 'caught')
