@@ -14,7 +14,7 @@ from backlash_ros.core.plant.backlash import play_outputs
 Array = NDArray[np.float64]
 Sides = NDArray[np.int8]
 
-RIGHT, LEFT, NEITHER = 1, -1, 0
+RIGHT, LEFT, NEITHER = 1, -1, 0  # side of the gap that was engaged last
 
 
 def play(v: Array, gap: float, before: float) -> Array:
