@@ -19,8 +19,10 @@ class FirstCommand:
     reports: those of the driver, None in lockstep. before: v before a cleanup, None without one.
     """
 
-    def __init__(self, node: ProcessNode, io: DriverIo, reports: Reports | None) -> None:
-        self._node, self._io, self._reports = node, io, reports
+    def __init__(
+        self, node: ProcessNode, io: DriverIo, reports: Reports | None, joint: str = '',
+    ) -> None:
+        self._node, self._io, self._reports, self._joint = node, io, reports, joint
         self.before: float | None = None
         self._warned: set[str] = set()  # texts
         self._unanswered = 0  # outputs that were not answered because v was not known yet
@@ -61,4 +63,4 @@ class FirstCommand:
     def _warn_once(self, text: str) -> None:
         if text not in self._warned:
             self._warned.add(text)
-            self._node.log.warning(text)
+            self._node.log.warning(f'{self._joint}: {text}' if self._joint else text)

@@ -44,7 +44,7 @@ class Joint:
         self.loop: ControlLoop | None = None
         self.reference_at: float | None = None
         self.model = ModelPublisher(node, name)
-        self.first_command = FirstCommand(node, io, reports)
+        self.first_command = FirstCommand(node, io, reports, name)
         self.saver = EstimateSaver(p.get_str('estimates.file'))
         self._node, self._io = node, io
         self._told: Status | None = None  # the newest one that /diagnostics has
