@@ -14,8 +14,8 @@ from backlash_ros.core.control.last_command import check_last_commands
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.protocol import Structure
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
-from backlash_ros.core.control.structure import Structure
 from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate

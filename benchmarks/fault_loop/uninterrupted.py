@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from backlash_ros.core.control.controller import AdaptiveController, ControlStep
 from backlash_ros.core.control.limits import at_rest
-from backlash_ros.core.control.structure import ControlInput
+from backlash_ros.core.control.protocol import ControlInput
 
 
 class Uninterrupted:

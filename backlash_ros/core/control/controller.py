@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from math import inf
 from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
+from backlash_ros.core.control.protocol import ControlInput, Structure
 from backlash_ros.core.control.serial_plant import SerialPlant
-from backlash_ros.core.control.structure import Adoption, ControlInput, Structure
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import Interval, Law, StateSource
 from backlash_ros.core.plant.state_model import StateModel
@@ -57,8 +57,9 @@ class AdaptiveController:
         self._redesign, self._serial = redesign, serial
         self._considered: StateModel | None = None  # the proposal that was designed for last
         self._designed: StateModel | None = None  # that, with the motor in front
-        self._design: Iterator[Adoption | None] = iter(())
-        self._adoption: Adoption | None = None  # of the finished design, until it may take over
+        self.executor: Executor | None = None  # makes gains in another process, None: here
+        self._making: Future[object | None] | None = None
+        self._gains: object | None = None  # that were made, until they may take over
         self._waited = 0  # samples for which it could not
         self._interval: Interval | None = None  # that which began with the newest command
 
@@ -90,7 +91,10 @@ class AdaptiveController:
             used = replace(estimate, c_r=0.0, c_l=0.0)
         elif self._serial is not None:
             used = self._serial.for_command(estimate)
-        u_d, v, f = self.structure.control(ControlInput(y_m, y, used, self._source), inverse)
+        gap = used.c_r - used.c_l
+        crossing = max(inverse.samples_across(gap), self.limits.samples_across(gap))
+        inputs = ControlInput(y_m, y, used, self._source, crossing)
+        u_d, v, f = self.structure.control(inputs, inverse)
         self.motion = self.limits.apply(v, self.motion)
         v = self.motion.v
         inverse.applied(v)
@@ -136,42 +140,34 @@ class AdaptiveController:
 
         Who has no time for it leaves it out: a search for the gap pauses.
         """
-        started = time.perf_counter()
         self.estimator.refine(budget_s)
         if self._redesign:
-            self._design_on(started + budget_s)
+            self._make_gains()
 
-    def _design_on(self, until: float) -> None:
-        """Design the structure for the newest proposal, a piece at a time while there is time."""
-        while time.perf_counter() < until:
-            # A design that is begun is ended: a proposal a second would never be used otherwise.
-            for adoption in self._design:
-                self._adoption = adoption
-                break
-            else:
-                proposal = self.estimator.proposal
-                if proposal is not None and proposal is not self._considered:
-                    self._considered = proposal
-                    self._designed = (
-                        proposal if self._serial is None else self._serial.before(proposal)
-                    )
-                    self._design = self.structure.design(self._designed)
-                    self._adoption, self._waited = None, 0
-                    continue
-                if self._adoption is None:
-                    return
-                self._waited += 1
-                if self.structure.may_change or self._waited > LONGEST_WAIT:
-                    # At once and together: x_hat and gains of two models do not fit each other.
-                    assert self._considered is not None
-                    self.estimator.adopt(self._considered)
-                    self.adopted = self._considered
-                    if self._serial is not None:
-                        assert self._designed is not None
-                        self._serial.adopt(self._designed)
-                    self._adoption(self._source)
-                    self._adoption = None
-                return
+    def _make_gains(self) -> None:
+        """Have gains made for the newest proposal, and use them when the structure may change."""
+        proposal = self.estimator.proposal
+        if proposal is not None and proposal is not self._considered:
+            self._considered, self._waited = proposal, 0
+            self._designed = proposal if self._serial is None else self._serial.before(proposal)
+            make = self.structure.redesign(self._designed)
+            self._making = None if self.executor is None else self.executor.submit(make)
+            self._gains = make() if self.executor is None else None
+        if self._making is not None and self._making.done():
+            self._gains, self._making = self._making.result(), None
+        if self._gains is None:
+            return
+        self._waited += 1
+        if self.structure.may_change or self._waited > LONGEST_WAIT:
+            # At once and together: x_hat and gains of two models do not fit each other.
+            assert self._considered is not None
+            self.estimator.adopt(self._considered)
+            self.adopted = self._considered
+            if self._serial is not None:
+                assert self._designed is not None
+                self._serial.adopt(self._designed)
+            self.structure.adopt(self._gains, self._source)
+            self._gains = None
 
     def _learn(
         self, y: float, interval: Interval, lost: int, applied: Sequence[float],

@@ -80,6 +80,43 @@ class BacklashInverse:
             self.side, self.extreme = side, u_d
         elif not self.taking_up or self.side is GAP:
             return self.v
+        return self._approach(m, c_r, c_l)
+
+    def follow(self, side: Region, u_d: float, m: float, c_r: float, c_l: float) -> float:
+        """Return v for u_d on the line of a side; whoever calls this decides when u_d has turned.
+
+        On this line v only goes on: where u_d comes back, u is held.
+        """
+        if side is GAP:
+            return self.v
+        if self.side is GAP:
+            self._u = u_d  # nobody knows what u is
+        elif self.taking_up:
+            self._note_on_the_way()
+        else:
+            self._u = self.extreme
+        if side is not self.side:
+            self.side, self.taking_up = side, True
+        elif not self.taking_up and (u_d - self.extreme) * side <= 0.0:
+            return self.v
+        self.extreme = u_d if (u_d - self._u) * side > 0.0 else self._u
+        return self._approach(m, c_r, c_l)
+
+    def proceed(self, m: float, c_r: float, c_l: float) -> float:
+        """Return v on its way to where `aim` says; else it stays."""
+        return self._approach(m, c_r, c_l) if self.taking_up else self.v
+
+    @property
+    def held_u(self) -> float:
+        """The u that is held while v is on its way across the gap, else the newest."""
+        return self._u if self.taking_up else self.extreme
+
+    def samples_across(self, distance: float) -> float:
+        """Samples that v takes across a gap of this width."""
+        return distance / self.take_up if self.take_up < inf else 0.0
+
+    def _approach(self, m: float, c_r: float, c_l: float) -> float:
+        """Go to the line in use, no faster than the gap is crossed until v moves u."""
         crossing = c_r if self.side is RIGHT else c_l
         # Where v begins to move u, or would have stood if these parameters had been in use before.
         until = self.extreme if self._slowed else self._u
@@ -98,17 +135,21 @@ class BacklashInverse:
 
         u is held until v arrives: u_d has turned only when it lies on the other side of that.
         """
+        self._note_on_the_way()
+        if side is GAP:
+            return GAP
+        if self.side is RIGHT:
+            return LEFT if u_d < self._u - self.direction_band else RIGHT
+        return RIGHT if u_d > self._u + self.direction_band else LEFT
+
+    def _note_on_the_way(self) -> None:
+        """Note what v has made of u since it left for its line."""
         m, c_r, c_l = self._play
         low, high = m * (self.v - c_r), m * (self.v - c_l)
         if self._u < low:
             self._u = low
         elif self._u > high:
             self._u = high
-        if side is GAP:
-            return GAP
-        if self.side is RIGHT:
-            return LEFT if u_d < self._u - self.direction_band else RIGHT
-        return RIGHT if u_d > self._u + self.direction_band else LEFT
 
     def slow_down(self) -> None:
         """Let v go on to where u_d wants it like it crosses the gap, until it is there."""
@@ -128,6 +169,8 @@ class BacklashInverse:
 
     def aim(self, u_d: float, side: Region) -> None:
         """Let the next step go to u_d on the line of this side, whatever it came from."""
+        if not self.taking_up:
+            self._u = self.extreme
         self.side, self.extreme, self.taking_up = side, u_d, True
 
     def hold(self, u_d: float) -> float:

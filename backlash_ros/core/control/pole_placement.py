@@ -5,21 +5,21 @@ The filters, the gains and what they make of the loop stand in four_blocks.py.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import (
+from backlash_ros.core.control.protocol import (
     LARGEST_FEEDBACK,
     LARGEST_IN_ACQUISITION,
-    Adoption,
     Command,
     ControlInput,
     Structure,
 )
 from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.four_blocks import FourBlocks
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -52,9 +52,12 @@ class PolePlacement:
         """Nothing here changes with G."""
         return True
 
-    def design(self, model: StateModel) -> Iterator[Adoption | None]:
-        """The gains stay those of the G that was told."""
-        return iter(())
+    def redesign(self, model: StateModel) -> Callable[[], object | None]:
+        """The gains stay those of the nominal G."""
+        return nothing
+
+    def adopt(self, gains: object, source: StateSource) -> None:
+        """Nothing is ever made to adopt."""
 
     def go_on_from(self, other: Structure, state_known: bool = True) -> None:
         """Take over what the filters hold."""
@@ -87,6 +90,10 @@ class PolePlacement:
         scale = max(self._largest_asked, estimate.m * (estimate.c_r - estimate.c_l))
         share = LARGEST_FEEDBACK if estimate.status is Status.TRACKING else LARGEST_IN_ACQUISITION
         return min(max(u_d, asked - share * scale), asked + share * scale)
+
+
+def nothing() -> None:
+    """What a structure makes of a better G that does not adapt to it."""
 
 
 def _delay_of(model: TransferFunction) -> float:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from math import hypot, inf, isnan
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import Adoption, Command, ControlInput, Structure
+from backlash_ros.core.control.protocol import Command, ControlInput, Structure
 from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -43,9 +44,12 @@ class Proportional:
         """Nothing here changes with G."""
         return True
 
-    def design(self, model: StateModel) -> Iterator[Adoption | None]:
-        """Nothing here depends on G."""
-        yield lambda source: None
+    def redesign(self, model: StateModel) -> Callable[[], object | None]:
+        """Nothing here depends on G: any model will do."""
+        return object
+
+    def adopt(self, gains: object, source: StateSource) -> None:
+        """Nothing changes."""
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v that satisfy (3.2) and (2.3) together."""

@@ -25,15 +25,16 @@ from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.limits import Limits, at_rest
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.structure import (
+from backlash_ros.core.control.protocol import (
     LARGEST_FEEDBACK,
     LARGEST_IN_ACQUISITION,
     ControlInput,
     Structure,
 )
 from backlash_ros.core.control.tracking.design import Weights, design, feedback_around
+from backlash_ros.core.control.tracking.handover import FADING
 from backlash_ros.core.control.tracking.rest import TOLERANCE
-from backlash_ros.core.control.tracking.tracking import FADING, Tracking
+from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.parameters import Parameters

@@ -13,7 +13,7 @@ from places import ROOT
 
 from backlash_ros.core.assembly import ESTIMATORS, STRUCTURES, build_controller, law_fits
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
-from backlash_ros.core.control.structure import LARGEST_FEEDBACK
+from backlash_ros.core.control.protocol import LARGEST_FEEDBACK
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError

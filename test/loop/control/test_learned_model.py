@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable
+from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass
-from math import inf, pi
-from typing import TypeVar
+from math import pi
 
 import numpy as np
 import pytest
@@ -17,15 +17,14 @@ from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.structure import Adoption, Structure
+from backlash_ros.core.control.protocol import Structure
 from backlash_ros.core.control.tracking.design import (
-    Replay,
     TrackingDesign,
     Weights,
-    better_design_in_pieces,
+    better_design,
     design,
 )
-from backlash_ros.core.control.tracking.slope_tolerance import margin_in_pieces
+from backlash_ros.core.control.tracking.margin import modulus_margin
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import Interval, Law
@@ -37,7 +36,6 @@ from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
-T = TypeVar('T')
 
 PERIOD, NOISE = 0.005, 1e-4
 WEIGHTS = Weights(1e-2, 0.0, 60)
@@ -117,13 +115,15 @@ def multisine(k: int) -> float:
 
 def run(
     told: TransferFunction, true: TransferFunction, after: int, samples: int = 1600,
-    reference: Callable[[int], float] = multisine, budget_s: float = inf, doubt: float = 0.1,
+    reference: Callable[[int], float] = multisine, doubt: float = 0.1,
+    executor: Executor | None = None,
 ) -> Run:
     model, better = StateModel(told), StateModel(true)
     learner = Learner(model, better, after, doubt)
     structure = Tracking(design(model, WEIGHTS), WEIGHTS, 1.0, NOISE)
     inverse = BacklashInverse()
     controller = AdaptiveController(learner, structure, inverse, Limits(), redesign=True)
+    controller.executor = executor
     backlash = Backlash(TRUTH.m, TRUTH.c_r, TRUTH.c_l)
     rng = np.random.default_rng(1)
     plant = SimulatedPlant(true, backlash, PERIOD, rng)
@@ -131,7 +131,7 @@ def run(
     for k in range(samples):
         y_m, y = reference(k), plant.measure()
         step = controller.step(y + NOISE * float(rng.standard_normal()), y_m)
-        controller.refine(budget_s)
+        controller.refine()
         rows.append((y_m, y, step.v))
         plant.step(step.v)
     y_m_row, y, v = np.array(rows).T
@@ -178,19 +178,12 @@ def test_a_loop_that_the_told_model_makes_unstable_is_rescued() -> None:
     assert np.abs(swapped.v[1000:]).max() < 20.0
 
 
-def test_the_work_is_done_in_pieces_while_there_is_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = 0.0
-
-    def now() -> float:
-        nonlocal clock
-        clock += 1e-4  # every look at the clock finds that a piece has taken 0.1 ms
-        return clock
-
-    monkeypatch.setattr('time.perf_counter', now)
-    assert run(motor(), TRUE['faster'], 300, 400, budget_s=0.0).learner.adopted_at == -1
-    paced = run(motor(), TRUE['faster'], 300, 400, budget_s=2.5e-4)
-    # Some thirty pieces, two at a time, and then it waits for v.
-    assert 310 < paced.learner.adopted_at < 330 + LONGEST_WAIT
+def test_gains_may_be_made_in_another_process() -> None:
+    with ProcessPoolExecutor(1) as executor:
+        swapped = run(motor(), TRUE['faster'], 300, 700, executor=executor)
+    assert 300 < swapped.learner.adopted_at < 700
+    here = run(motor(), TRUE['faster'], 300, 700)
+    assert swapped.v[-1] == pytest.approx(here.v[-1], rel=1e-3)
 
 
 def test_replay_is_what_the_structure_would_have_done() -> None:
@@ -204,26 +197,15 @@ def test_replay_is_what_the_structure_would_have_done() -> None:
             u = -gains.state @ x - gains.integral * q - gains.preview @ r[k:k + 13]
             q += r[k] - model.c * x[0]
             x = model.a @ x + model.b * u
-        replayed, q_replayed = Replay(chosen, 200).state(r)
+        replayed, q_replayed = chosen.replayed(r, 200)
         assert replayed == pytest.approx(x.tolist(), rel=1e-9)
         assert q_replayed == pytest.approx(q, rel=1e-9, abs=1e-9)
-
-
-def finished(pieces: Generator[None, None, T]) -> T:
-    while True:
-        try:
-            next(pieces)
-        except StopIteration as done:
-            result: T = done.value
-            return result
 
 
 def redesigned(
     told: TransferFunction, better: TransferFunction, weights: Weights,
 ) -> TrackingDesign | None:
-    return finished(better_design_in_pieces(
-        StateModel(better), weights, design(StateModel(told), weights)
-    ))
+    return better_design(StateModel(better), weights, design(StateModel(told), weights))
 
 
 def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> None:
@@ -236,10 +218,10 @@ def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> 
     softer = redesigned(motor(), motor(0.5), weights)
     assert softer is not None
     nominal = design(softer.model, weights)
-    had = min(finished(margin_in_pieces(plant, present.feedback))
+    had = min(modulus_margin(plant, present.feedback)
               for plant in (present.model, softer.model))
-    assert finished(margin_in_pieces(softer.model, nominal.feedback)) < had
-    assert finished(margin_in_pieces(softer.model, softer.feedback)) >= had
+    assert modulus_margin(softer.model, nominal.feedback) < had
+    assert modulus_margin(softer.model, softer.feedback) >= had
     # The trajectory is not slower for it.
     assert softer.gains.preview == pytest.approx(nominal.gains.preview)
 
@@ -251,7 +233,7 @@ def test_feedback_does_not_fade_from_one_redesign_to_the_next() -> None:
     for k in range(20):
         model = StateModel(motor(0.5 * (1.0 + 1e-3 * (-1) ** k)))
         assert chosen is not None
-        chosen = finished(better_design_in_pieces(model, weights, chosen))
+        chosen = better_design(model, weights, chosen)
     assert first is not None
     assert chosen is not None
     assert np.linalg.norm(chosen.feedback.gain) > 0.95 * np.linalg.norm(first.feedback.gain)
@@ -263,15 +245,11 @@ def test_a_model_without_gains_is_refused() -> None:
     assert redesigned(motor(), unmoved, WEIGHTS) is None
 
 
-def adoptions(structure: Structure) -> Iterator[Adoption | None]:
-    return (a for a in structure.design(StateModel(motor(1.2))) if a is not None)
-
-
 def test_only_structures_that_depend_on_a_model_refuse_one() -> None:
-    assert len(list(adoptions(Proportional()))) == 1
-    told = motor()
+    model = StateModel(motor(1.2))
+    assert Proportional().redesign(model)() is not None
     closed = np.poly([0.5, 0.5])
-    assert not list(adoptions(PolePlacement(place_poles(told, closed, 0.2))))
+    assert PolePlacement(place_poles(motor(), closed, 0.2)).redesign(model)() is None
 
 
 def test_weights_follow_the_model() -> None:

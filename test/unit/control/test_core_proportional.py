@@ -12,7 +12,7 @@ from strategies import NO_STATE, Play, signals, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M, Proportional
-from backlash_ros.core.control.structure import Command, ControlInput
+from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.estimate import Estimate
 
 LARGEST_SHARE = 0.8  # of m that f may have

@@ -12,7 +12,7 @@ from strategies import NO_STATE, KnownInput, Play, eighths, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.structure import Command, ControlInput
+from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.printed_law import (

@@ -1,8 +1,7 @@
-"""From G to the gains of the tracking structure, in pieces that fit between two samples."""
+"""From G to the gains of the tracking structure: a pure function, fit for another process."""
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from dataclasses import dataclass
 from functools import lru_cache
 from math import sqrt
@@ -11,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_gains
-from backlash_ros.core.control.tracking.slope_tolerance import Feedback, margin_in_pieces, tolerates
+from backlash_ros.core.control.tracking.margin import Feedback, modulus_margin, tolerates
+from backlash_ros.core.control.tracking.reference_window import averages
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -30,6 +30,8 @@ HALVINGS = 6  # of the ratio between the last weight that was not safe and the f
 WRONG_SLOPE = 1.35
 REST_BANDWIDTH = 1.0 / 80.0  # rad per sample, up to which y is corrected while the reference rests
 REST_HORIZON = 300  # samples within which a wrong u at rest must matter to be worth a step
+LOOK_AHEAD = 20  # samples, at most, for which u* is known ahead
+RESPONSE = 300  # samples within which u* answers to a reference
 SAFE_MARGIN = 0.5  # modulus margin that is safe in any case: no sensitivity above 2
 
 
@@ -54,7 +56,9 @@ class TrackingDesign:
     feedback would cycle between them, and while the estimate is new.
     acquisition: gain (n,) while the backlash is unknown; None where no feedback is better.
     gentle: gain (n,) that leads y back while the reference rests. push: |x| after REST_HORIZON
-    samples of u = 1.
+    samples of u = 1; push_ahead: |y| after LOOK_AHEAD. plan_states (L, n + 1), plan_references
+    (L, N + 1): u* of the next L samples of [x*; q*] and the references. noise_gains: see
+    ReferenceWindow.
     """
 
     model: StateModel
@@ -64,37 +68,54 @@ class TrackingDesign:
     acquisition: Array | None
     gentle: Array
     push: float
+    push_ahead: float
+    plan_states: Array
+    plan_references: Array
+    noise_gains: Array
+
+    def replayed(self, references: Array, history: int) -> tuple[list[float], float]:
+        """x* and q* at the sample of the newest window, from rest at the oldest reference.
+
+        With z = [x*; q*] and u_p = -sum f_j r(k+j) it is z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r.
+        history: for how many samples at most.
+        """
+        n, closed, inputs = self.model.order, _closed(self.model, self.gains), np.zeros(
+            (self.model.order + 1, 2))
+        inputs[:n, 0], inputs[n, 1] = self.model.b, 1.0
+        by_preview = -np.convolve(references, self.gains.preview[::-1], 'valid')
+        steps = len(by_preview) - 1  # the newest one makes the next state
+        start = np.append(self.model.equilibrium * references[0], 0.0)
+        z = np.linalg.matrix_power(closed, steps) @ start
+        pairs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
+        responses = powers(closed, inputs, max(history, steps))
+        z = z + np.einsum('kij,kj->i', responses[:steps], pairs)
+        return z[:n].tolist(), float(z[n])
 
 
-def design_in_pieces(
-    model: StateModel, weights: Weights, weight_factor: float = 1.0,
-) -> Generator[None, None, TrackingDesign]:
-    """Return the design; stops after each Riccati equation.
+def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> TrackingDesign:
+    """The gains for a model of G.
 
     weight_factor: see `feedback_around`. Raises ParameterError where no gains exist.
     """
     rho = input_weight(model, weights)
     gains = lq_gains(model, rho, weights.integral_weight, weights.preview)
-    yield
-    feedback = feedback_around(model, weights, weight_factor)
-    yield
-    schedule = []
-    for more in SCHEDULE:
-        schedule.append(lq_gains(model, max(more, weight_factor) * rho).state)
-        yield
-    bears_wrong_slope = _bears_wrong_slope(model, SCHEDULE[-1] * rho)
-    yield
+    schedule = tuple(
+        lq_gains(model, max(more, weight_factor) * rho).state for more in SCHEDULE
+    )
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
     gentle = lq_gains(model, power_gain(model.transfer_function, REST_BANDWIDTH)).state
-    yield
-    push = float(np.linalg.norm(powers(model.a, model.b, REST_HORIZON).sum(axis=0)))
-    acquisition = schedule[-1] if bears_wrong_slope else None
-    return TrackingDesign(model, gains, feedback, tuple(schedule), acquisition, gentle, push)
+    return TrackingDesign(
+        model, gains, feedback_around(model, weights, weight_factor), schedule,
+        schedule[-1] if _bears_wrong_slope(model, SCHEDULE[-1] * rho) else None, gentle,
+        float(np.linalg.norm(_step(model, REST_HORIZON))),
+        model.c * abs(float(_step(model, LOOK_AHEAD)[0])),
+        *_plan(model, gains), _noise_gains(model, gains),
+    )
 
 
-def better_design_in_pieces(
+def better_design(
     model: StateModel, weights: Weights, present: TrackingDesign,
-) -> Generator[None, None, TrackingDesign | None]:
+) -> TrackingDesign | None:
     """Return the design for a better model of G, None where it is no safe replacement.
 
     It replaces the present one where its loop around the better G keeps a modulus margin that is
@@ -103,83 +124,80 @@ def better_design_in_pieces(
     that is unstable around the better G is replaced by any stable one; an unstable one replaces
     none.
     """
-    needed = SAFE_MARGIN
-    compared = False
-    unsafe = 0.0
-    for weight_factor in SAFER:
-        try:
-            margin = yield from _margin_with(model, weights, weight_factor)
-        except ParameterError:
-            return None
-        if margin < needed and not compared:
-            compared = True
-            for plant in (present.model, model):
-                theirs = yield from margin_in_pieces(plant, present.feedback)
-                needed = min(needed, theirs)
-        if margin > 0.0 and margin >= needed:
-            break
-        unsafe = weight_factor
-    else:
-        return None
-    # What is weaker than it has to be is the measure for the next G, and so lost for good.
-    for _ in range(HALVINGS if unsafe > 0.0 else 0):
-        between = sqrt(unsafe * weight_factor)
-        margin = yield from _margin_with(model, weights, between)
-        if margin > 0.0 and margin >= needed:
-            weight_factor = between
+    def margin(weight_factor: float) -> float:
+        return modulus_margin(model, feedback_around(model, weights, weight_factor))
+
+    needed, unsafe = SAFE_MARGIN, 0.0
+    try:
+        for weight_factor in SAFER:
+            reached = margin(weight_factor)
+            if reached < needed and unsafe == 0.0:
+                needed = min(needed, *(
+                    modulus_margin(plant, present.feedback) for plant in (present.model, model)
+                ))
+            if 0.0 < reached >= needed:
+                break
+            unsafe = weight_factor
         else:
-            unsafe = between
-    return (yield from design_in_pieces(model, weights, weight_factor))
+            return None
+        # What is weaker than it has to be is the measure for the next G, and so lost for good.
+        for _ in range(HALVINGS if unsafe > 0.0 else 0):
+            between = sqrt(unsafe * weight_factor)
+            if 0.0 < margin(between) >= needed:
+                weight_factor = between
+            else:
+                unsafe = between
+        return design(model, weights, weight_factor)
+    except ParameterError:
+        return None
 
 
-def _margin_with(
-    model: StateModel, weights: Weights, weight_factor: float,
-) -> Generator[None, None, float]:
-    """Modulus margin of the loop around G with this weight; raises ParameterError."""
-    feedback = feedback_around(model, weights, weight_factor)
-    yield
-    return (yield from margin_in_pieces(model, feedback))
+def _step(model: StateModel, samples: int) -> Array:
+    """x after so many samples of u = 1, shape (n,)."""
+    return np.asarray(powers(model.a, model.b, samples).sum(axis=0))
 
 
-def design(model: StateModel, weights: Weights) -> TrackingDesign:
-    """The same at once."""
-    pieces = design_in_pieces(model, weights)
-    while True:
-        try:
-            next(pieces)
-        except StopIteration as done:
-            finished: TrackingDesign = done.value
-            return finished
+def _closed(model: StateModel, gains: PreviewGains) -> Array:
+    """Transition of [x*; q*], shape (n + 1, n + 1)."""
+    n = model.order
+    closed = np.eye(n + 1)
+    closed[:n, :n] = model.a - np.outer(model.b, gains.state)
+    closed[:n, n] = -gains.integral * model.b
+    closed[n, 0] = -model.c
+    return closed
 
 
-class Replay:
-    """The trajectory of a design for references that have passed.
+def _plan(model: StateModel, gains: PreviewGains) -> tuple[Array, Array]:
+    """u* of the next samples, of [x*; q*] and of the references, which stay at their last one."""
+    n, last = model.order, len(gains.preview) - 1
+    length = min(LOOK_AHEAD, last // 3) + 1
+    closed = _closed(model, gains)
+    k = np.append(gains.state, gains.integral)
+    by_state: Array = np.eye(n + 1)  # what makes [x*; q*]
+    by_reference: Array = np.zeros((n + 1, last + 1))
+    states, references = np.empty((length, n + 1)), np.empty((length, last + 1))
+    for j in range(length):
+        preview = np.zeros(last + 1)
+        preview[j:] = gains.preview[:last + 1 - j]
+        preview[last] += gains.preview[last + 1 - j:].sum()
+        states[j] = -k @ by_state
+        references[j] = -k @ by_reference - preview
+        by_reference = np.asarray(closed @ by_reference)
+        by_reference[:n] -= np.outer(model.b, preview)
+        by_reference[n, min(j, last)] += 1.0
+        by_state = closed @ by_state
+    return states, references
 
-    With z = [x*; q*] and u_p = -sum f_j r(k+j) it is z(k+1) = F z(k) + [B; 0] u_p(k) + [0; 1] r(k).
-    history: for how many samples at most.
-    """
 
-    def __init__(self, design: TrackingDesign, history: int) -> None:
-        self._design = design
-        model, gains, n = design.model, design.gains, design.model.order
-        self._transition = np.eye(n + 1)
-        self._transition[:n, :n] = model.a - np.outer(model.b, gains.state)
-        self._transition[:n, n] = -gains.integral * model.b
-        self._transition[n, 0] = -model.c
-        inputs = np.zeros((n + 1, 2))
-        inputs[:n, 0], inputs[n, 1] = model.b, 1.0
-        self._responses = powers(self._transition, inputs, history)
-
-    def state(self, references: Array) -> tuple[list[float], float]:
-        """x* and q* at the sample of the newest window, from rest at the oldest reference."""
-        design, n = self._design, self._design.model.order
-        by_preview = -np.convolve(references, design.gains.preview[::-1], 'valid')
-        steps = len(by_preview) - 1  # the newest one makes the next state
-        start = np.append(design.model.equilibrium * references[0], 0.0)
-        z = np.linalg.matrix_power(self._transition, steps) @ start
-        inputs = np.column_stack([by_preview[:steps], references[:steps]])[::-1]
-        z = z + np.einsum('kij,kj->i', self._responses[:steps], inputs)
-        return z[:n].tolist(), float(z[n])
+def _noise_gains(model: StateModel, gains: PreviewGains) -> Array:
+    """Standard deviation of u* for noise of 1 on the references, for each of their averages."""
+    closed = model.a - np.outer(model.b, gains.state)
+    response = np.append(1.0, -powers(closed, model.b, RESPONSE) @ gains.state)
+    to_u = np.convolve(gains.preview[::-1], response)
+    return np.array([
+        np.linalg.norm(np.convolve(kernel, to_u))
+        for kernel in averages(len(gains.preview) - 1)
+    ])
 
 
 def powers(a: Array, b: Array, count: int) -> Array:

@@ -1,25 +1,73 @@
-"""The last references side by side in memory, so that a window of them is a view."""
+"""The references that are to come, those that were, and the noise that they carry."""
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.control.tracking.noise_level import NoiseLevel
+
 Array = NDArray[np.float64]
+
+SMOOTHED_SHARE = 3  # of the preview window, by which references are averaged to either side
+WIDTHS = (3, 8, 20)  # samples to either side, of the averages to choose from
+# Mean square of what is left of the references beside a parabola, in those of the noise, up to
+# which they are taken for one, and from which on they are not: at a step, or a sharp turn.
+PARABOLA, NO_PARABOLA = 1.8, 3.0
+
+
+@lru_cache(maxsize=16)
+def parabolas(preview: int) -> tuple[Array, ...]:
+    """For each width w, what a parabola takes from 2 w + 1 references: (2 w + 1, 2 w + 1).
+
+    The fit is weighted by a Hann window. The middle row says what an average changes.
+    """
+    found = []
+    for w in WIDTHS:
+        if SMOOTHED_SHARE * w <= preview:
+            powers = np.arange(-w, w + 1.0)[:, None] ** np.arange(3)
+            weighted = powers * np.hanning(2 * w + 3)[1:-1, None]
+            fit = powers @ np.linalg.solve(weighted.T @ powers, weighted.T)
+            found.append(np.eye(2 * w + 1) - fit)
+    return tuple(found)
+
+
+def averages(preview: int) -> Array:
+    """Weights of no average and of that of each width, shape (widths + 1, 2 H + 1)."""
+    fits = parabolas(preview)
+    half = len(fits[-1]) // 2 if fits else 0
+    kernels = np.zeros((len(fits) + 1, 2 * half + 1))
+    kernels[:, half] = 1.0
+    for kernel, fit in zip(kernels[1:], fits, strict=True):
+        w = len(fit) // 2
+        kernel[half - w:half + w + 1] -= fit[w]
+    return kernels
 
 
 class ReferenceWindow:
-    """r(k) .. r(k + N), and what came before.
+    """r(k) .. r(k + N) without the noise of y_m, and what came before.
 
-    preview: N. history: how many references before r(k) are kept.
+    Each reference is replaced by the middle of a parabola through those around it, as many as are
+    one but for the noise: steps and turns stay what they are, and without noise nothing changes.
+    The newest N / 3 stay as they came.
+
+    preview: N. history: how many references before r(k) are kept. noise_gains: standard deviation
+    of u* for noise of 1 that was averaged so, shape (widths,).
     """
 
-    def __init__(self, preview: int, history: int) -> None:
+    def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
         self.history = history
+        self.noise_gains = noise_gains
         self._preview, self._kept = preview, history + preview + 1
-        # Written from the left to the right; when it is full its end moves to the front.
-        self._values: Array = np.zeros(2 * self._kept)
+        self._parabolas = parabolas(preview)
+        self._half = len(self._parabolas[-1]) // 2 if self._parabolas else 0
+        # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
+        # left to the right; when they are full their end moves to the front.
+        self._rows: Array = np.zeros((3, 2 * self._kept))
         self._start = self._end = 0
+        self._noise = NoiseLevel()
 
     @property
     def empty(self) -> bool:
@@ -29,7 +77,8 @@ class ReferenceWindow:
     def fill(self, value: float) -> None:
         """Let the window begin with this value everywhere."""
         self._start, self._end = 0, self._preview + 1
-        self._values[:self._end] = value
+        self._rows[:2, :self._end] = value
+        self._rows[2, :self._end] = 0.0
 
     def lead_to(self, value: float) -> None:
         """Bend the window so that it leads to a value that is not what would have come next.
@@ -39,24 +88,55 @@ class ReferenceWindow:
         window = self.window
         jump = value - float(window[-1])
         if self._preview and abs(jump) > float(np.abs(np.diff(window)).max()):
-            window += np.linspace(0.0, jump, len(window))
+            self._rows[:2, self._end - len(window):self._end] += np.linspace(0.0, jump, len(window))
 
     def append(self, value: float) -> Array:
         """Take in r(k + N) and return r(k) .. r(k + N), shape (N + 1,)."""
         end = self._end
-        if end == len(self._values):
+        if end == self._rows.shape[1]:
             kept = self._kept - 1
-            self._values[:kept] = self._values[end - kept:]
+            self._rows[:, :kept] = self._rows[:, end - kept:]
             self._start, end = 0, kept
-        self._values[end] = value
+        self._rows[:2, end] = value
+        self._rows[2, end] = self.noise_gains[0]
         self._end = end + 1
+        self._noise.take(value)
+        if self._half and self._end - self._start > 2 * self._half:
+            self._average(self._end - 1 - self._half)
         return self.window
 
     @property
     def window(self) -> Array:
         """r(k) .. r(k + N) once more, shape (N + 1,)."""
-        return self._values[self._end - self._preview - 1:self._end]
+        return self._rows[1, self._end - self._preview - 1:self._end]
 
     def all(self) -> Array:
         """Everything that is kept, the newest last, shape (up to history + N + 1,)."""
-        return self._values[max(self._start, self._end - self._kept):self._end]
+        return self._rows[1, max(self._start, self._end - self._kept):self._end]
+
+    @property
+    def u_noise_std(self) -> float:
+        """Standard deviation of what is left of the noise in u*, at most within the window."""
+        noise = self._noise.std
+        if noise == 0.0:
+            return 0.0
+        first = self._end - self._preview - 1
+        return noise * float(self._rows[2, first:max(self._end - self._half, first + 1)].max())
+
+    def _average(self, at: int) -> None:
+        """Average one reference, now that as many after it are known."""
+        noise = self._noise.std
+        if noise == 0.0:
+            return
+        came = self._rows[0]
+        value, gain = came.item(at), float(self.noise_gains[0])
+        for i, fit in enumerate(self._parabolas):
+            w = len(fit) // 2
+            rest = fit @ came[at - w:at + w + 1]
+            mean_square = float(rest @ rest) / ((2 * w - 2) * noise * noise)
+            share = (NO_PARABOLA - mean_square) / (NO_PARABOLA - PARABOLA)
+            if share > 0.0:
+                share = min(share, 1.0)
+                value += share * (came.item(at) - rest.item(w) - value)
+                gain += share * (float(self.noise_gains[i + 1]) - gain)
+        self._rows[1, at], self._rows[2, at] = value, gain

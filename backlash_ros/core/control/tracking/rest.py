@@ -12,6 +12,7 @@ is within a tolerance of the trajectory, and otherwise moves in single steps:
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from math import dist, hypot, inf
 
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.structure import dot
+from backlash_ros.core.control.protocol import dot
 from backlash_ros.core.control.tracking.design import TrackingDesign
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
@@ -56,6 +57,28 @@ class Mode(Enum):
     LEAD_BACK = auto()  # u is to bring y back
 
 
+@dataclass
+class RestState:
+    """How v rests.
+
+    u_d: where v rests. shrinkage: standard deviations by which the crossings are shrunk for it.
+    largest: |x*| so far. limit: tolerance in use. rested: samples for which the trajectory has.
+    turns, side: of v since then, and the newest line. near: samples since y was last away. pull:
+    u - u* with which leading back began.
+    """
+
+    mode: Mode = Mode.HOLD
+    u_d: float = 0.0
+    side: Region = Region.GAP
+    shrinkage: float = 0.0
+    largest: float = 0.0
+    limit: float = 0.0
+    rested: int = 0
+    turns: int = 0
+    near: int = 0
+    pull: float = 0.0
+
+
 class Rest:
     """Decides whether v rests, and steps it there.
 
@@ -63,19 +86,10 @@ class Rest:
     """
 
     def __init__(self, design: TrackingDesign, noise_std: float) -> None:
-        self.mode = Mode.HOLD
-        self.u_d = 0.0  # where v rests
-        self.shrinkage = 0.0  # standard deviations by which the crossings are shrunk for it
+        self.state = RestState()
         self._noise_std = noise_std
-        self.use(design)
-        self._largest = 0.0  # of |x*| so far
-        self._limit = 0.0  # tolerance in use
-        self._rested = 0  # samples for which the trajectory has rested
-        self._turns, self._side = 0, Region.GAP  # since x* rests; line in use the sample before
-        self._near = 0  # samples since y was last away
-        self._pull = 0.0  # u - u* with which leading back began
         self._most = inf  # largest u - u*
-        self._low, self._high = inf, -inf  # of the window, where it was still the sample before
+        self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
         """Rest as this design says."""
@@ -84,11 +98,7 @@ class Rest:
 
     def go_on_from(self, other: Rest) -> None:
         """Take over where another one of the same model rests."""
-        self.mode, self.u_d, self.shrinkage = other.mode, other.u_d, other.shrinkage
-        self._largest, self._limit = other._largest, other._limit
-        self._pull = other._pull
-        self._rested, self._near = other._rested, other._near
-        self._turns, self._side = other._turns, other._side
+        self.state = replace(other.state)
 
     def decide(
         self, y: float, window: Array, x: Sequence[float], onward: Sequence[float],
@@ -100,89 +110,78 @@ class Rest:
         x_std: standard deviation of x_hat, None where it is unknown. side: line in use. most: u may
         be no further than that from u*, whatever x_hat says.
         """
-        self._most = most
-        self._largest = max(self._largest, hypot(*x))
-        least = SHARE * self._largest
+        state, self._most = self.state, most
+        state.largest = max(state.largest, hypot(*x))
+        least = SHARE * state.largest
         tolerance = max(TOLERANCE * self._noise_std, least)
-        if dist(x, onward) > STEADY * tolerance:
-            self._low, self._high = inf, -inf
-            self._moves_on()
-        elif not self._is_still(window):
-            self._moves_on()
+        if dist(x, onward) > STEADY * tolerance or float(np.ptp(window)) > self._noise_std:
+            state.mode, state.rested, state.turns = Mode.FOLLOW, 0, 0
         elif x_std is None:
             off = abs(y - window.item(0)) > OFF * self._noise_std
-            self.mode = Mode.FOLLOW if off else Mode.HOLD
+            state.mode = Mode.FOLLOW if off else Mode.HOLD
         else:
-            self._rested += 1
-            if self._rested < SETTLING:
+            state.rested += 1
+            if state.rested < SETTLING:
                 tolerance = max(CLOSE * self._noise_std, least)
-            self._limit = max(tolerance, UNCERTAIN * x_std)
-            if self.mode is Mode.FOLLOW and side is not self._side:
-                self._turns += 1
-            self.mode = self._mode_for(deviation)
-        self._side = side
-        return self.mode
-
-    def _moves_on(self) -> None:
-        self.mode, self._rested, self._turns = Mode.FOLLOW, 0, 0
-
-    def _is_still(self, window: Array) -> bool:
-        newest = window.item(-1)
-        if self._low <= newest <= self._high:
-            return True  # it has lost one value and won one between the others
-        low, high = float(window.min()), float(window.max())
-        still = high - low <= self._noise_std
-        self._low, self._high = (low, high) if still else (inf, -inf)
-        return still
+            state.limit = max(tolerance, UNCERTAIN * x_std)
+            if state.mode is Mode.FOLLOW and side is not state.side:
+                state.turns += 1
+            state.mode = self._mode_for(deviation)
+        state.side = side
+        return state.mode
 
     def _mode_for(self, deviation: Sequence[float]) -> Mode:
-        size = hypot(*deviation)
+        state, size = self.state, hypot(*deviation)
         # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
         # it is due again when y has stayed where it belongs for a while, and is pushed away.
-        self._near = self._near + 1 if size <= self._limit else 0
-        if self._near >= SETTLING:
-            self._turns = 0
-        follows = self._turns < TURNS
-        if size > ASTRAY * self._limit and follows:
+        state.near = state.near + 1 if size <= state.limit else 0
+        if state.near >= SETTLING:
+            state.turns = 0
+        follows = state.turns < TURNS
+        if size > ASTRAY * state.limit and follows:
             return Mode.FOLLOW
-        if self.mode is Mode.FOLLOW and follows:
-            return Mode.HOLD if size <= ARRIVED * self._limit else Mode.FOLLOW
+        if state.mode is Mode.FOLLOW and follows:
+            return Mode.HOLD if size <= ARRIVED * state.limit else Mode.FOLLOW
         pull = self._pull_back(deviation)
-        if self.mode is Mode.LEAD_BACK:
-            if pull * self._pull > LED_BACK * self._pull**2:
+        if state.mode is Mode.LEAD_BACK:
+            # As long as it pulls the same way, and hard, or y is not yet near.
+            least = LED_BACK if size <= ARRIVED * state.limit else 0.0
+            if pull * state.pull > least * state.pull**2:
                 return Mode.LEAD_BACK
             return Mode.HOLD
-        if size <= self._limit:
+        if size <= state.limit:
             return Mode.HOLD
-        self._pull = pull
+        state.pull = pull
         return Mode.LEAD_BACK
 
-    def stay(self, u_d: float) -> None:
-        """Rest at this u."""
-        self.u_d, self.shrinkage = u_d, 0.0
+    def stay(self, inverse: BacklashInverse) -> None:
+        """Rest where v is."""
+        self.state.u_d = inverse.extreme
+        self.state.shrinkage = 0.0
 
     def step(
         self, estimate: Estimate, ideal: float, deviation: Sequence[float],
         inverse: BacklashInverse, begins: bool,
     ) -> None:
-        """Aim the inverse at the u that is wanted, where that is better than to stay.
+        """Say where v is to rest, where that is better than to stay.
 
         ideal: u*. begins: whether the mode has changed with this sample.
         """
+        state = self.state
         if begins:
-            self.stay(inverse.extreme)
-        if inverse.taking_up:
-            return  # still on its way
+            self.stay(inverse)
+        if inverse.taking_up or inverse.side is Region.GAP:
+            return  # still on its way, or nobody knows what u is
         engaged = estimate.c_l if inverse.side == Region.LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
-        if self.mode is Mode.LEAD_BACK:
+        if state.mode is Mode.LEAD_BACK:
             pull = self._pull_back(deviation)
             if begins or (u - ideal) * pull < TOO_WEAK * pull * pull:
                 self._aim(ideal + pull, u, 0.0, inverse)
             return
         side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
         away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
-        if away * self._push > MATTERS * self._limit and away > GAIN * uncertain:
+        if away * self._push > MATTERS * state.limit and away > GAIN * uncertain:
             self._aim(ideal, u, SHORT, inverse)
 
     def _pull_back(self, deviation: Sequence[float]) -> float:
@@ -190,5 +189,5 @@ class Rest:
         return min(max(pull, -self._most), self._most) if pull == pull else 0.0
 
     def _aim(self, u_d: float, u: float, shrinkage: float, inverse: BacklashInverse) -> None:
-        self.u_d, self.shrinkage = u_d, shrinkage
+        self.state.u_d, self.state.shrinkage = u_d, shrinkage
         inverse.aim(u_d, Region.RIGHT if u_d > u else Region.LEFT)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from operator import mul
 from typing import NamedTuple, Protocol
 
@@ -21,12 +21,16 @@ LARGEST_IN_ACQUISITION, LARGEST_FEEDBACK = 10.0, 100.0
 
 
 class ControlInput(NamedTuple):
-    """What is known at a sample: reference, output, estimate, and who knows the state of G."""
+    """What is known at a sample: reference, output, estimate, and who knows the state of G.
+
+    crossing: samples that v takes across the gap, by its limits.
+    """
 
     y_m: float
     y: float
     estimate: Estimate
     source: StateSource
+    crossing: float = 0.0
 
     @property
     def x_hat(self) -> Sequence[float]:
@@ -54,10 +58,6 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
     return product
 
 
-# Makes a structure use what it has designed, given who knows the state of the better model.
-Adoption = Callable[[StateSource], None]
-
-
 class Structure(Protocol):
     """Makes u_d from the reference and drives the inverse with it."""
 
@@ -67,17 +67,23 @@ class Structure(Protocol):
 
     @property
     def may_change(self) -> bool:
-        """Whether a design for a better model may take over at this sample."""
+        """Whether gains for a better model may take over at this sample."""
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""
 
-    def design(self, model: StateModel) -> Iterator[Adoption | None]:
-        """Prepare for a better model of G, a piece of some 0.3 ms each time it is asked on.
+    def redesign(self, model: StateModel) -> Callable[[], object | None]:
+        """What makes the gains for a better model of G, for `adopt`: it may be called elsewhere.
 
-        Yields None as long as there is more to do, and last what makes the structure use the
-        result at once and without a jump, when it `may_change`. Where the result would be less
-        safe than what is in use, or the structure does not adapt to G, it ends without that.
+        It depends on nothing but what it holds, and can be sent to another process. It returns
+        None where the result would be less safe than what is in use, or the structure does not
+        adapt to G.
+        """
+
+    def adopt(self, gains: object, source: StateSource) -> None:
+        """Use such gains from the next sample on, without a jump of v.
+
+        source: who knows the state of the better model.
         """
 
     def go_on_from(self, other: Structure, state_known: bool = True) -> None:

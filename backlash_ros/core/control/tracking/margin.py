@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
 from dataclasses import dataclass
 from functools import lru_cache
 from math import inf
@@ -44,21 +43,16 @@ def tolerates(model: StateModel, gain: Array, factor: float) -> bool:
     return all(_is_stable(model, feedback, trust, factor) for trust in CONFIDENCES)
 
 
-def margin_in_pieces(plant: StateModel, feedback: Feedback) -> Generator[None, None, float]:
-    """Return the modulus margin of the loop; stops after each part of the work.
+def modulus_margin(plant: StateModel, feedback: Feedback) -> float:
+    """Distance of the open loop L from -1, min |1 + L| over all frequencies.
 
-    That is the distance of the open loop L from -1, min |1 + L| over all frequencies, for the
-    worst of the observers; 0 where the loop is unstable with one of them.
+    For the worst of the observers; 0 where the loop is unstable with one of them.
     """
     margin = inf
     for confidence in CONFIDENCES:
-        _correction(feedback.model, confidence)
-        yield
         if not _is_stable(plant, feedback, confidence):
             return 0.0
-        yield
         margin = min(margin, _distance(plant, feedback, confidence))
-        yield
     return margin
 
 

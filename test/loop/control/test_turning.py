@@ -1,0 +1,91 @@
+"""How often v crosses the gap in `tracking`: once per turn of what is asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import signal
+
+from backlash_ros.core.assembly import build_model
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.metrics import turns
+
+Array = NDArray[np.float64]
+PERIOD, GAP = 0.005, 0.9
+KNOWN = {'m': 0.098, 'c_r': 0.55, 'c_l': -0.35}
+GEAR: dict[str, object] = {
+    'sample_period': PERIOD, 'plant.numerator': [0.15678154198771987, 0.12688103331610767],
+    'plant.denominator': [1.0, -1.2498255157872757, 0.5334880910911033],
+    'structure': 'tracking', 'estimator.law': 'fixed', 'estimator.output_noise_std': 1.1e-4,
+    'output_quantum': 3.834951969714103e-4, 'inverse.take_up_rate': 100.0,
+    'control.min': -12.6, 'control.max': 12.6, 'control.rate_max': 300.0,
+    **{f'estimator.initial.{name}': value for name, value in KNOWN.items()},
+    **{f'backlash.{name}': value for name, value in KNOWN.items()},
+}
+
+
+def moved(asked: Array, noise: float = 0.0, **changes: object) -> tuple[Array, float]:
+    """v, and the RMS of y before the sensor against what is asked for without noise."""
+    p = Parameters({**GEAR, **{name.replace('__', '.'): v for name, v in changes.items()}})
+    heard = asked + noise * np.random.default_rng(1).standard_normal(len(asked))
+    loop = build_closed_loop(p)
+    loop.reference = ReferenceSignal('file', sample_period=PERIOD, samples=tuple(heard.tolist()))
+    run, delay = loop.run(len(asked)), loop.controller.structure.delay
+    model = build_model(p)
+    y = signal.lfilter(model.numerator, model.denominator, run.column('u'))
+    return run.column('v'), float(np.sqrt(np.mean((y[delay:] - asked[:-delay])[200:]**2)))
+
+
+def slow(seconds: float) -> Array:
+    return 0.5 * np.sin(0.5 * np.arange(0.0, seconds, PERIOD))
+
+
+@pytest.mark.parametrize('band', [0.0, 1e-3, 1e-2])
+@pytest.mark.parametrize('noise', [0.0, 1e-4, 1e-3, 0.1 * GAP * KNOWN['m']])
+def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band: float) -> None:
+    asked = slow(30.0)
+    v, error = moved(asked, noise, inverse__direction_band=band)
+    assert turns(v, 0.5 * GAP) <= turns(asked, 0.1) + 3
+    # Without a gap y would follow half of the noise.
+    assert error < 0.5 * noise + 1e-6
+
+
+@pytest.mark.parametrize('initial_u', [-0.05, 0.0, 0.03])
+@pytest.mark.parametrize('band', [0.0, 1e-3])
+def test_v_engages_once_where_the_engaged_side_is_unknown(initial_u: float, band: float) -> None:
+    v, _ = moved(slow(1.0), inverse__direction_band=band, backlash__initial_u=initial_u)
+    assert turns(v, 0.5 * GAP) <= 1
+
+
+def test_noise_of_y_does_not_make_v_cross_the_gap() -> None:
+    asked, noise = slow(30.0), 1e-3
+    v, error = moved(asked, output_noise_std=noise, estimator__output_noise_std=noise,
+                     fixed__doubt=0.1)
+    assert turns(v, 0.5 * GAP) <= turns(asked, 0.1) + 3
+    assert error < 0.2 * noise
+
+
+def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
+    rng = np.random.default_rng(3)
+    asked = [np.zeros(200)]
+    for _ in range(9):
+        begin, end = float(asked[-1][-1]), float(rng.uniform(-0.5, 0.5))
+        s = np.linspace(0.0, 1.0, int(rng.integers(60, 200)))
+        asked += [begin + (end - begin) * s * s * (3.0 - 2.0 * s), np.full(400, end)]
+    reference = np.concatenate(asked)
+    v, error = moved(reference)
+    assert turns(v, 0.5 * GAP) <= turns(reference, 1e-3) + 3
+    assert error < 1e-4
+
+
+@pytest.mark.parametrize('take_up', [20.0, 100.0])
+def test_a_slow_crossing_begins_before_the_turn_and_ends_behind_it(take_up: float) -> None:
+    asked = 0.5 * np.sin(3.0 * np.arange(0.0, 10.0, PERIOD))
+    _, at_once = moved(asked, inverse__take_up_rate=np.inf)
+    _, slowly = moved(asked, inverse__take_up_rate=take_up)
+    samples = GAP / (take_up * PERIOD)
+    # A parabola at the turn: what it does within half of the crossing, a few times per period.
+    assert slowly < at_once + 0.5 * 0.5 * (3.0 * PERIOD * samples) ** 2
