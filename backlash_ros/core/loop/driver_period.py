@@ -14,7 +14,9 @@ WINDOW_NS, STAMPS = 2_000_000_000, 1000
 OTHER_PACE = 0.25  # share by which typical intervals differ from the period where they are no such
 # Share of the period by which stamps may scatter: beyond, as of a driver that is held up all the
 # time, nobody can tell from them which samples were left out.
-SCATTERED = 0.15
+SCATTERED = 0.2
+# Shares of the period: by which a stamp may come early, and by which its phase follows a late one.
+EARLY, SLACK = 0.3, 0.01
 # Samples for which a process that is held up is late, so that their lateness is one error.
 HELD_UP = 10.0
 
@@ -79,15 +81,26 @@ class DriverPeriod:
         typical = mean(ordered[quarter:-quarter])
         if not abs(typical / self.nominal_s - 1.0) < OTHER_PACE:
             return UNKNOWN_PERIOD
-        found = Period(self.nominal_s)
-        for _ in range(2):  # after a long gap the nominal period may miscount
-            numbers = [0]
-            for step in steps:
-                numbers.append(numbers[-1] + round(step / found.mean))
-            found = _slope(numbers, times)
-            if not (found.mean > 0.0 and found.scatter < SCATTERED * self.nominal_s):
-                return UNKNOWN_PERIOD
+        numbers = [0]
+        for step in steps:
+            numbers.append(numbers[-1] + round(step / self.nominal_s))
+        found = _slope(numbers, times)
+        if found.mean > 0.0:
+            found = _slope(_numbered(times, found.mean), times)
+        if not (found.mean > 0.0 and found.scatter < SCATTERED * self.nominal_s):
+            return UNKNOWN_PERIOD
         return found._replace(median=median(ordered))
+
+
+def _numbered(times: list[float], period_s: float) -> list[int]:
+    """The number of each sample: stamps come late, by less than a period, but hardly early."""
+    numbers, due = [0], times[0]
+    for time in times[1:]:
+        passed = max(int((time - due) / period_s + EARLY), 0)
+        numbers.append(numbers[-1] + passed)
+        late = time - due - passed * period_s
+        due += passed * period_s + min(late, SLACK * period_s)
+    return numbers
 
 
 def _slope(numbers: list[int], times: list[float]) -> Period:

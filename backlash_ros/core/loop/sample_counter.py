@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from itertools import islice
+from math import isfinite
 from typing import NamedTuple
 
 from backlash_ros.core.loop.driver_period import DriverPeriod
@@ -180,9 +181,13 @@ class SampleCounter:
         if self._since_learned < LEARN_PERIOD_AFTER:
             return
         self._since_learned = 0
-        nominal_s, period = self.sender.nominal_s, self.sender.newest(LEARN_PERIOD_OF)
-        is_other = period.differs_from(nominal_s, OTHER_PERIOD)
-        self._period_ns = 1e9 * (period.mean if is_other else nominal_s)
+        nominal_s, found = self.sender.nominal_s, self.sender.newest(LEARN_PERIOD_OF)
+        if found.differs_from(nominal_s, OTHER_PERIOD):
+            self._period_ns = 1e9 * found.mean
+        elif self._period_ns != 1e9 * nominal_s and isfinite(found.mean):
+            # Once it was certain, what is likely suffices.
+            off = abs(found.mean - nominal_s) > OTHER_PERIOD * nominal_s
+            self._period_ns = 1e9 * (found.mean if off else nominal_s)
 
     def _follow_phase(self, stamp_ns: int, missing: int) -> None:
         """Go on to the sample with this stamp, before which so many are missing."""

@@ -415,3 +415,22 @@ def test_of_two_senders_one_is_used_from_the_start(
                 used.append(sender)
     assert len(used) <= 202
     assert len(set(used[10:])) == 1
+
+
+@pytest.mark.parametrize('rate_hz', [50, 100, 200, 500])
+@pytest.mark.parametrize('share', [0.0, 0.03, 0.059, 0.09])
+def test_a_minute_of_a_slow_sender_with_stalls_blames_nobody_else(
+    rate_hz: int, share: float,
+) -> None:
+    period_ns = 1e9 / rate_hz
+    rng = np.random.default_rng(rate_hz)
+    counter, commands = SampleCounter(1.0 / rate_hz), CommandHistory(1.0 / rate_hz)
+    for k in range(60 * rate_hz):
+        late = min(0.05 * float(rng.exponential()), 0.6)  # of a period
+        stamp_ns = START_NS + round((k * (1.0 + share) + late) * period_ns)
+        assert counter.count(stamp_ns, k + 1) == Arrival(is_sample=True)
+        if k:
+            commands.over(1, stamp_ns, counter.due_ns)
+        commands.publish(0.0, stamp_ns + round(0.2 * period_ns))
+    assert commands.late == 0
+    assert counter.sender.newest().differs_from(1.0 / rate_hz, 0.005) == (share > 0.005)
