@@ -20,9 +20,8 @@ from backlash_ros.core.control.tracking.design import Weights, design, lq_gains,
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import MovingHorizon
-from backlash_ros.core.estimation2.estimator import fitted
-from backlash_ros.core.estimation2.executor import Executor, InlineExecutor
+from backlash_ros.core.estimation.estimator import MovingHorizon, fitted
+from backlash_ros.core.estimation.executor import Executor, InlineExecutor
 from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator
@@ -212,7 +211,7 @@ def _moving_horizon(p: Parameters, initial: Estimate, executor: Executor) -> Law
     return MovingHorizon(
         initial, _bounds(p), build_state_model(p), p.get_float('estimator.output_noise_std'),
         p.get_float('estimator.input_noise_std'), p.get_triple('estimator.drift_std'),
-        p.get_float('sample_period'), p.get_float('plant.uncertainty'), observer,
+        p.get_float('sample_period'), p.get_float('plant.uncertainty'), observer, executor,
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.constants import OUTLIERS
+from backlash_ros.core.estimation.settings import OUTLIERS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.actuator import Actuator, Motor

@@ -21,8 +21,7 @@ from backlash_ros.core.driver_check.findings import (
     Message,
     Timing,
 )
-from backlash_ros.core.estimation.whole_record.record_description import RecordFit
-from backlash_ros.core.estimation.whole_record.record_fit import fit_record
+from backlash_ros.core.driver_check.record_fit import RecordFit, fit_record
 from backlash_ros.core.identification.verdict import SHOWS
 from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
 from backlash_ros.core.loop.report_use import ReportUse, report_use
@@ -211,8 +210,8 @@ def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None
     later = Record(record.v[MORE_DELAY:], record.y[MORE_DELAY:], record.lag)
     others: list[tuple[float, float]] = []
     for ratio in OTHER_PERIODS:
-        denominator = np.real(np.poly(fit.told.poles.astype(complex) ** ratio)).tolist()
-        other = TransferFunction(fit.told.numerator.tolist(), denominator)
+        denominator = np.real(np.poly(fit.nominal.poles.astype(complex) ** ratio)).tolist()
+        other = TransferFunction(fit.nominal.numerator.tolist(), denominator)
         # The same samples of y as in the fit, whose evidence is compared.
         refit = _fit(other, later, p, more_delay=0)
         # The zeros are still those of the other period: G may be off by more, if it explains more.
@@ -260,7 +259,7 @@ def _sign(fit: RecordFit, p: Parameters) -> Finding:
 def _model(fit: RecordFit, p: Parameters) -> Finding:
     """Say how far G is off where it was learned to be another one: the loop learns it too."""
     found = f'predicts {fit.predicted:.1%} of the motion of y'
-    if fit.model is not fit.told:
+    if fit.model is not fit.nominal:
         period = p.get_float('sample_period')
         errors = ', '.join(
             f'{error:.1%} at {frequency / (2.0 * pi * period):.2g} Hz'

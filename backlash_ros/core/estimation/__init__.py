@@ -1,1 +1,1 @@
-"""How m, c_r, c_l are learned from v and y: the default law."""
+"""The default law: one fit of all unknowns to a record, and one comparison of its explanations."""

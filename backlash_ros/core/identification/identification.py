@@ -14,9 +14,6 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit.pace import drained
-from backlash_ros.core.estimation.whole_record.record_description import frequencies_of
-from backlash_ros.core.estimation.whole_record.record_samples import busiest, check_record, outliers
 from backlash_ros.core.identification import uncertainty
 from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.not_play import Observed
@@ -47,6 +44,7 @@ from backlash_ros.core.identification.verdict import APART, Findings, Verdict, j
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.roughness import noise_of
+from backlash_ros.core.records.samples import busiest, check_record, frequencies_of, outliers
 
 Array = NDArray[np.float64]
 T = TypeVar('T')
@@ -148,7 +146,13 @@ def identify(v: Array, y: Array, sample_period: float, options: Options | None =
 
     Raises ValueError for arrays that do not fit together or hold what is no number.
     """
-    return drained(identifying(v, y, sample_period, options or Options()))
+    work = identifying(v, y, sample_period, options or Options())
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            found: Identification = done.value
+            return found
 
 
 def identifying(

@@ -8,7 +8,7 @@ import pytest
 from known_gear import KNOWN, answers, estimator_knowing, learn
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import Law
+from backlash_ros.core.law import Law
 from backlash_ros.core.plant.backlash import clamp
 
 AMPLITUDE, FREQUENCY = 3.0, 2.0 * pi / 200.0  # of v, in gaps, and per sample

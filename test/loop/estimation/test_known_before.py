@@ -10,7 +10,7 @@ from known_gear import KNOWN, answers, estimator_knowing, learn
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation.moving_horizon.moving_horizon import Law
+from backlash_ros.core.law import Law
 from backlash_ros.core.plant.backlash import play_outputs
 
 Array = NDArray[np.float64]

@@ -11,9 +11,6 @@ from places import ROOT
 from scipy.signal import cont2discrete, lfilter
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.estimation.constants import BLOCK
-from backlash_ros.core.estimation.fit.relabelling import searched
-from backlash_ros.core.estimation.moving_horizon import acquisition
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -104,21 +101,3 @@ def test_load_that_coasts_is_not_tracked_with_more_error_than_stated(seed: int) 
     found = run_job(Job('', gear, 10.0, {'damping': 0.5})).judged
     assert found is not None
     assert found.wrong <= 0.1
-
-
-def test_what_was_found_twice_is_not_searched_again_before_v_has_turned(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    searches: list[int] = []  # samples of each
-
-    def counted(v: np.ndarray, *others: object) -> object:
-        searches.append(len(v))
-        return searched(v, *others)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(acquisition, 'searched', counted)
-    p = load_config(SHIPPED / 'geared_motor.yaml')
-    record = build_closed_loop(Parameters({**p, 'structure': 'tracking'})).run(300)
-    [first, *_] = np.flatnonzero(record.column('status') == Status.TRACKING)
-    # It is not late for that: whether v has turned was looked at meanwhile.
-    assert searches[-1] <= first <= searches[-1] + 2
-    assert np.diff(searches)[-1] > 2 * BLOCK[0]

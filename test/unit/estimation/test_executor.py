@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.estimation2.executor import (
+from backlash_ros.core.estimation.executor import (
     BLOCK,
     Failure,
     InlineExecutor,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.regression.play import play
+from backlash_ros.core.estimation.play import play
 from backlash_ros.core.identification.identification import (
     Identification,
     Options,
@@ -133,7 +133,7 @@ def test_play_output_of_a_record_is_that_of_the_operator(
     values: list[float], gap: float, start: float,
 ) -> None:
     v = np.array(values)
-    expected, _ = play(v, gap, start)
+    expected = play(v, gap, start)
     assert PlayRecord(v).output(gap, start).p.tolist() == expected.tolist()
 
 

@@ -1,0 +1,219 @@
+"""What explains a record best: a backlash found from nothing, and whether it counts as known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from backlash_ros.core.estimate import Bounds
+from backlash_ros.core.estimation.fit import FIRST_STEPS, Fit, Prior, Problem
+from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.search import search
+from backlash_ros.core.estimation.settings import (
+    CHANCE,
+    ENGAGED,
+    GATE,
+    NO_GAP,
+    OUTLIER_SHARE,
+    OUTLIERS,
+    REVERSALS,
+    STD_GAP,
+    STD_SLOPE,
+    SYSTEMATIC,
+    UNEXPLAINED,
+)
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+CANDIDATES = 3  # best gaps of a search that are fitted
+APART = 0.02  # relative difference of two gaps that are two candidates
+FAR_BEHIND = 30.0  # log-likelihood by which a candidate is given up after a few steps
+BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
+# --- guards
+FIRST_NOISE = 0.05  # noise of a first step, over the deviation of y
+BOUND_ROUNDING = 1e-9  # relative distance from a bound that is none
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What is known before the first sample.
+
+    noise_std: of y, nominal. widest: gap that is considered. guess: gap of the first guess.
+    walk_std: of u, drift: of m, c_r, c_l (3,), both per square root of a sample.
+    """
+
+    family: PlantFamily
+    noise_std: float
+    bounds: Bounds
+    widest: float
+    guess: float
+    walk_std: float
+    drift: Array
+
+
+class Record(NamedTuple):
+    """Samples from number `first` on: v that acted, y after it (nan: lost), v that may have acted
+    instead (nan: none), all (N,)."""
+
+    first: int
+    v: Array
+    y: Array
+    other: Array
+
+    @property
+    def end(self) -> int:
+        """Number of the sample after the last one."""
+        return self.first + len(self.v)
+
+    def since(self, first: int) -> Record:
+        """The samples from this number on."""
+        at = max(first - self.first, 0)
+        return Record(self.first + at, self.v[at:], self.y[at:], self.other[at:])
+
+    def until(self, end: int) -> Record:
+        """The samples before this number."""
+        count = max(end - self.first, 0)
+        return Record(self.first, self.v[:count], self.y[:count], self.other[:count])
+
+
+def with_swapped(record: Record, numbers: frozenset[int]) -> Record:
+    """The record where the other command acted over the intervals of these samples."""
+    places = [k - record.first for k in numbers if record.first <= k < record.end]
+    if not places:
+        return record
+    v, other = record.v.copy(), record.other.copy()
+    v[places], other[places] = record.other[places], record.v[places]
+    return record._replace(v=v, other=other)
+
+
+def problem_of(
+    setup: Setup, record: Record, older: Prior | None = None, walk_std: float = 0.0,
+    most_scale: float = np.inf,
+) -> Problem:
+    """The fit of a record by this setup."""
+    return Problem(setup.family, record.v, record.y, setup.noise_std, older, None, most_scale,
+                   walk_std)
+
+
+def afresh(
+    setup: Setup, record: Record, of_xi: Prior | None = None, xi: Array | None = None,
+    most_scale: float = np.inf, also: Fit | None = None,
+) -> Fit | None:
+    """The best fit from nothing, mixed with other gaps that fit about as well; None for none.
+
+    of_xi: rows on theta that are known, around xi (K,). also: where to begin as well. A fit with
+    m < 0 says that y goes the other way.
+    """
+    family = setup.family
+    if np.isfinite(record.y).sum() < 15 + 2 * family.count or np.ptp(record.v) == 0.0:
+        return None
+    found, null = search(family, record.v, record.y, setup.noise_std, setup.widest)
+    if not found or found[0].evidence < null + ENGAGED:
+        return None
+    p = problem_of(setup, record, of_xi, most_scale=most_scale)
+    noise = max(setup.noise_std, FIRST_NOISE * float(np.nanstd(record.y)))
+    fits: list[Fit] = []
+    gaps: list[float] = []
+    begin = np.zeros(family.count) if xi is None else xi
+    sign = 1.0 if found[0].m > 0.0 else -1.0
+    for _, gap, p0, m in found:
+        if len(gaps) == CANDIDATES:
+            break
+        if m * sign > 0.0 and all(abs(gap - other) > APART * other for other in gaps):
+            gaps.append(gap)
+            theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], begin])
+            start = Fit(np.zeros(1), p0, theta, noise)
+            fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
+    if also is not None and also.m > 0.0:
+        begins = replace(also, step=0.0, noise_std=also.noise, x=np.zeros(1))
+        fits.append(p.finished(p.fitted(begins, FIRST_STEPS)))
+    fits = [f for f in fits if np.isfinite(f.evidence)]
+    if not fits:
+        return None
+    top = max(f.evidence for f in fits)
+    fits = [p.finished(p.fitted(f)) if f.evidence > top - FAR_BEHIND else f for f in fits]
+    best = max(fits, key=lambda f: f.evidence)
+    if best.m < 0.0:
+        return best
+    return replace(p.with_intervals(best), spread=spread(best, fits))
+
+
+def spread(best: Fit, fits: list[Fit]) -> Array:
+    """What the other fits add to the covariance of m, c_r, c_l around the best: their mixture."""
+    valid = [f for f in fits if f.valid]
+    share = np.exp([f.evidence - best.evidence for f in valid])
+    share /= max(float(share.sum()), 1e-300)
+    out = np.zeros((3, 3))
+    for each, f in zip(share, valid, strict=True):
+        apart = f.crossings - best.crossings
+        out += each * np.outer(apart, apart)
+    return out
+
+
+def is_known(setup: Setup, f: Fit, turns: int) -> bool:
+    """Whether m and the gap are known well enough to be published.
+
+    turns: reversals of the engaged side that speak for it. While residuals are correlated the
+    deviations must be smaller: what causes that does not average out. A gap is also known where
+    its upper end is small beside the first guess: there is none.
+    """
+    if not f.valid or turns < (REVERSALS if setup.family.count else 1):
+        return False
+    if any(outside_bounds(setup.bounds, f)):
+        return False
+    systematic = f.count * f.correlation > 1.0
+    if systematic and f.unexplained > UNEXPLAINED and setup.family.count:
+        return False
+    factor = 1.0 / SYSTEMATIC if systematic else 1.0
+    std_gap = f.gap_std
+    no_gap = f.gap < BY_CHANCE * std_gap and f.gap + BY_CHANCE * std_gap < NO_GAP * setup.guess
+    slope_known = sqrt(float(f.crossings_cov[0, 0])) < factor * STD_SLOPE * f.m
+    return slope_known and (std_gap < factor * STD_GAP * f.gap or no_gap)
+
+
+def outside_bounds(bounds: Bounds, f: Fit) -> list[bool]:
+    """Whether m, c_r, c_l lie outside of their bounds by more than chance."""
+    values = f.crossings
+    std = np.sqrt(np.maximum(np.diag(f.crossings_cov), 0.0))
+    near = np.array(bounds.project(*values.tolist()))
+    out: list[bool] = (
+        np.abs(values - near) > BY_CHANCE * std + BOUND_ROUNDING * np.abs(values)
+    ).tolist()
+    return out
+
+
+def agree(one: Array, other: Array, cov: Array) -> bool:
+    """Whether two vectors (n,) differ by chance; cov: of their difference (n, n)."""
+    apart = one - other
+    squares = float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
+    return squares < float(chdtri(len(one), CHANCE))
+
+
+def outliers(z: Array) -> Flags:
+    """Which normalized residuals (N,) are outliers: few, and not many in a row; nan: lost."""
+    wild = np.abs(z) > GATE
+    if not wild.any():
+        return wild
+    if wild.sum() > OUTLIER_SHARE * np.isfinite(z).sum():
+        return np.zeros_like(wild)
+    known = np.flatnonzero(np.isfinite(z))
+    rows = np.flatnonzero(np.diff(np.concatenate([[0], wild[known].astype(int), [0]])))
+    for begin, end in zip(rows[::2], rows[1::2], strict=True):
+        if end - begin >= OUTLIERS:
+            wild[known[begin:end]] = False
+    return wild
+
+
+def of_xi(f: Fit, count: int) -> Prior | None:
+    """What a fit knows of xi alone, as rows on theta; count: K."""
+    if not count:
+        return None
+    cov = f.cov[3:, 3:] * f.inflation + 1e-12 * np.eye(count)
+    root = np.linalg.inv(np.linalg.cholesky(cov))
+    return Prior(np.hstack([np.zeros((count, 3)), root]), root @ f.theta[3:])

@@ -1,0 +1,498 @@
+"""The fit of all unknowns to a record: Gauss-Newton steps with exact derivatives.
+
+    y = G(z; xi) [m p(v; g, p0) - o + d] + X / A(z; xi) + e,   o = m c_r,   xi ~ N(0, s^2)
+
+Unknowns are the state X before the record, the knots of a disturbance d that walks, where the play
+began (p0), the slope m, the offset o, the gap g, and xi (plant_family.py). A step solves the
+linearized least squares by QR; the scale s and the noise are integrated out in closed form
+(Normal-Gamma) over a grid of s, whose prior is log-normal around 1: G is about as wrong as told.
+A leak has a prior of its own. The derivatives by g and p0 are those of the play: 1 where the left
+side was engaged last, and where none was. What older samples say is rows (R, d) on theta = (m, o,
+g, xi).
+
+Residuals that are correlated do not average out: with rho of theirs, N count as
+N / (1 - rho + N rho) independent ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from math import isfinite, log, sqrt
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, play, reversals
+from backlash_ros.core.estimation.reading import independence, step_of, told
+from backlash_ros.core.plant.filtering import lfilter
+
+Array = NDArray[np.float64]
+
+SCALES: Array = np.append(0.0, np.geomspace(1e-3, 10.0, 13))  # of the error of G that are weighed
+LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
+KNOTS = 12  # of a walk over a record
+STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
+FAR_STEPS = 4  # the first of them, over which G is no further off than told
+# --- guards
+LEAST_MOVE = 0.02  # deviations of the gap that a step may still move it by at the end
+LEAST_GAIN = 1.0  # log-likelihood that a step may still gain at the end
+SHORTEST_STEP = 0.05  # share of a Gauss-Newton step that is tried
+LONGEST_STEP = 2.0  # prior deviations by which G moves at once
+TIGHT = 1e6  # weight of a beginning that is known
+VAGUE = 100.0  # prior deviation of the state before a record, over the largest reading
+
+
+class Prior(NamedTuple):
+    """What older samples say: R theta = d + noise of deviation 1, shapes (r, 3 + K), (r,)."""
+
+    rows: Array
+    values: Array
+
+
+class Start(NamedTuple):
+    """Where the play rests before a record: v at the last engagement, and on which side."""
+
+    v: float
+    left: bool
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Values of all unknowns with their posterior; compared, sent and printed like a number.
+
+    x: state before the record. knots: of the walk (W,). p0: p before the record. theta: m, o, g,
+    xi. noise_std: beside a step. step: of the readings where they are taken for intervals, else 0.
+    scale: s, the likeliest. cov: of theta, as if residuals were white. prior: what the samples
+    say of theta, without the prior of xi. evidence: log-likelihood with unknowns integrated out.
+    correlation: rho. inflation: of cov, see above. count: of independent readings. rms: of the
+    residuals. turns: reversals of the engaged side.
+    """
+
+    x: Array
+    p0: float
+    theta: Array
+    noise_std: float
+    knots: Array = field(default_factory=lambda: np.zeros(0))
+    step: float = 0.0
+    scale: float = 1.0
+    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    prior: Prior | None = None
+    volume: float = 0.0  # log of the posterior's volume: evidence minus likelihood
+    evidence: float = -np.inf
+    correlation: float = 0.0
+    inflation: float = 1.0
+    count: float = 0.0
+    rms: float = np.inf
+    turns: int = 0
+    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of other gaps that fit alike
+
+    @property
+    def m(self) -> float:
+        """Slope."""
+        return float(self.theta[0])
+
+    @property
+    def gap(self) -> float:
+        """c_r - c_l."""
+        return float(self.theta[2])
+
+    @property
+    def xi(self) -> list[float]:
+        """Error of G, K values."""
+        out: list[float] = self.theta[3:].tolist()
+        return out
+
+    @property
+    def crossings(self) -> Array:
+        """m, c_r, c_l, shape (3,)."""
+        m, o, g = self.theta[:3].tolist()
+        return np.array([m, o / m, o / m - g])
+
+    @property
+    def crossings_cov(self) -> Array:
+        """Covariance of m, c_r, c_l, shape (3, 3)."""
+        m, o, _ = self.theta[:3].tolist()
+        by = np.array([[1.0, 0.0, 0.0], [-o / m**2, 1.0 / m, 0.0], [-o / m**2, 1.0 / m, -1.0]])
+        return np.asarray(by @ self.cov[:3, :3] @ by.T * self.inflation + self.spread)
+
+    @property
+    def gap_std(self) -> float:
+        """Standard deviation of the gap."""
+        cov = self.crossings_cov
+        return sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a reading, rounding included."""
+        return sqrt(self.noise_std**2 + self.step**2 / 12.0)
+
+    @property
+    def unexplained(self) -> float:
+        """Correlated residual motion over m times the gap."""
+        return sqrt(self.correlation) * self.rms / (abs(self.m) * max(self.gap, 1e-12))
+
+    @property
+    def valid(self) -> bool:
+        """Whether it is a backlash with finite deviations."""
+        return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
+
+
+class Problem:
+    """A record v, y (N,), y nan where lost, with what is known beside it.
+
+    noise_std: nominal, a weak prior. older: what samples before the record say. start: where the
+    play rests, None where unknown. most_scale: of the error of G. walk_std: of u per square root
+    of a sample, 0 for none.
+    """
+
+    def __init__(
+        self, family: PlantFamily, v: Array, y: Array, noise_std: float,
+        older: Prior | None = None, start: Start | None = None, most_scale: float = np.inf,
+        walk_std: float = 0.0,
+    ) -> None:
+        self.family, self.v, self.nominal = family, v, noise_std
+        self.older, self.start, self.most_scale = older, start, most_scale
+        self.known = np.isfinite(y)
+        self.y = np.where(self.known, y, 0.0)
+        self.step_of_readings = step_of(y)
+        self.walk_std = walk_std
+        self._hats = _hats(len(v)) if walk_std else np.zeros((0, len(v)))
+
+    # --- the model -----------------------------------------------------------------------------
+
+    def input(self, f: Fit) -> tuple[Array, Array]:
+        """p and u = m p - o + d over the record, both (N,)."""
+        p = play(self.v, max(f.gap, 0.0), f.p0)
+        u = f.m * p - f.theta[1]
+        if len(f.knots) and len(self._hats):
+            u += f.knots @ self._hats
+        return p, u
+
+    def output(self, f: Fit) -> Array:
+        """y that is expected (N,)."""
+        b, a = self.family.at(f.xi)
+        return filtered(b, a, self.input(f)[1], f.x)[0]
+
+    def end(self, f: Fit) -> tuple[list[float], list[float], list[float], float, float]:
+        """b, a, the filter's state, p and d after the record."""
+        b, a = self.family.at(f.xi)
+        p, u = self.input(f)
+        d = float(f.knots[-1]) if len(f.knots) else 0.0
+        return b, a, filtered(b, a, u, f.x)[1].tolist(), float(p[-1]), d
+
+    def residual(self, f: Fit) -> Array:
+        """y minus what is expected (N,), nan where it was lost."""
+        return np.where(self.known, self.y - self.output(f), np.nan)
+
+    def weights(self, output: Array) -> Array:
+        """How much of an independent reading each one is where this output is expected (N,)."""
+        return independence(self.y, self.known, output, self.step_of_readings)
+
+    def log_posterior(self, f: Fit, w: Array | None = None) -> float:
+        """Of these values but for constants; -inf where it is no number.
+
+        w: weights of the readings (N,), the same for all that are compared; None: those of f.
+        """
+        with np.errstate(all='ignore'):
+            y = self.output(f)
+            r = self.y - y
+            w = self.weights(y) if w is None else w
+            if f.step:
+                value = float((told(r, f.noise_std, f.step).likelihood * w)[self.known].sum())
+            else:
+                squares, count = float((w * r) @ r), float(w.sum()) + 1.0
+                value = -0.5 * count * log((squares + self.nominal**2) / count) \
+                    if isfinite(squares) else -np.inf
+            if self.older is not None:
+                value -= 0.5 * float(np.sum((self.older.rows @ f.theta - self.older.values) ** 2))
+            leaks, scale = self.family.leaks, max(f.scale, LEAST_SCALE)
+            leak, xi = f.theta[3:3 + leaks], f.theta[3 + leaks:]
+            value -= 0.5 * float(xi @ xi) / scale**2 + len(xi) * log(scale) + 0.5 * log(scale) ** 2
+            value -= 0.5 * float(leak @ leak)
+        return value if isfinite(value) else -np.inf
+
+    # --- a Gauss-Newton step --------------------------------------------------------------------
+
+    def step(self, f: Fit, most_scale: float = np.inf) -> Fit:
+        """The values that the linearization around f makes likeliest, with their posterior.
+
+        Raises LinAlgError where the numbers get too large.
+        """
+        x, y = self._around(f)
+        weights = self.weights(y)
+        _, score, information = told(self.y - y, f.noise_std, f.step)
+        jacobian = self.jacobian(f, y)
+        beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
+        root = np.sqrt(information * weights)
+        target = (jacobian @ beta + score / information) * root
+        rows = np.empty((len(self.v), len(beta) + 1), order='F')
+        np.multiply(jacobian, root[:, None], out=rows[:, :-1])
+        rows[:, -1] = target
+        stack = np.concatenate([rows, *self._beside(replace(f, x=x), len(beta))])
+        scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
+        scale[-1] = 1.0
+        r = lapack.dgeqrf(np.asfortranarray(stack / scale))[0][:len(beta) + 1]
+        return self._solved(
+            f, np.triu(r) * scale, len(x), float(weights.sum()),
+            min(most_scale, self.most_scale)
+        )
+
+    def _around(self, f: Fit) -> tuple[Array, Array]:
+        """State before the record, as long as that of G is now, and y (N,) at f."""
+        b, a = self.family.at(f.xi)
+        x = np.zeros(len(a) - 1)
+        x[:min(len(x), len(f.x))] = f.x[:len(x)]
+        return x, filtered(b, a, self.input(f)[1], x)[0]
+
+    def _knots_of(self, f: Fit) -> Array:
+        return f.knots if len(f.knots) == len(self._hats) else np.zeros(len(self._hats))
+
+    def jacobian(self, f: Fit, y: Array) -> Array:
+        """Derivatives of y (N,), which is that of f, by X, knots, p0, m, o, g, xi: (N, P)."""
+        b, a = self.family.at(f.xi)
+        p, u = self.input(f)
+        side = engaged(self.v, p, max(f.gap, 0.0))
+        # A side that has not moved p yet leaves it where it began.
+        side[:int(np.argmax(np.append(p != f.p0, True)))] = NEITHER
+        count, order, walks = len(self.v), len(a) - 1, len(self._hats)
+        impulse = np.zeros(count)
+        impulse[0] = 1.0
+        columns = np.array([f.m * (side == NEITHER), p, -np.ones(count), f.m * (side == LEFT),
+                            *self._hats])
+        once = lfilter([1.0], a, np.concatenate([columns, [u, y, impulse]]), axis=1)
+        out = np.empty((count, order + walks + 4 + self.family.count), order='F')
+        for i in range(order):
+            out[:i, i], out[i:, i] = 0.0, once[-1, :count - i]
+        forced = lfilter(b, [1.0], once[:-3], axis=1)
+        out[:, order:order + walks] = forced[4:].T
+        out[:, order + walks:order + walks + 4] = forced[:4].T
+        db, da = self.family.slopes(f.xi)
+        for j in range(self.family.count):
+            out[:, order + walks + 4 + j] = (
+                lfilter(db[j], [1.0], once[-3]) - lfilter(da[j], [1.0], once[-2])
+            )
+        return out
+
+    def _beside(self, f: Fit, size: int) -> list[Array]:
+        """Rows of what is known beside the samples."""
+        first = size - 3 - self.family.count  # place of m
+        rows: list[Array] = []
+        if self.older is not None:
+            older = np.zeros((len(self.older.rows), size + 1))
+            older[:, first:-1], older[:, -1] = self.older.rows, self.older.values
+            rows.append(older)
+        wide = np.zeros((1, size + 1))
+        wide[0, first + 2] = 1.0 / max(float(np.ptp(self.v)), 1e-300)  # the gap is within the swing
+        begin = np.zeros((1, size + 1))
+        begin[0, first - 1] = 1.0
+        if self.start is None:  # anywhere within the gap of now
+            begin[0, -1] = self.v[0] + 0.5 * f.gap
+            begin *= sqrt(12.0) / max(f.gap, 1e-9)
+        else:
+            begin[0, first + 2], begin[0, -1] = -float(self.start.left), self.start.v
+            begin *= TIGHT
+        leak = np.eye(self.family.leaks, size + 1, first + 3)
+        # What no reading tells, as where the first ones were lost, would grow without bounds.
+        state = np.eye(len(f.x), size + 1) / (VAGUE * max(float(np.abs(self.y).max()), 1e-300))
+        rows += [wide, begin, leak, state]
+        if len(self._hats):
+            walks = np.zeros((len(self._hats), size + 1))
+            at = first - 1 - len(self._hats)
+            walks[:, at:first - 1] = np.eye(len(self._hats)) - np.eye(len(self._hats), k=-1)
+            rows.append(walks / (self.walk_std * sqrt(len(self.v) / len(self._hats))))
+        return rows
+
+    def _solved(self, f: Fit, r: Array, order: int, count: float, most_scale: float) -> Fit:
+        """Means and covariance from the triangle r (P+1, P+1), the target in its last column."""
+        size = r.shape[1] - 1
+        k = self.family.count - self.family.leaks
+        n, at = size - k, size - self.family.count - 3  # the leak is one of the first; place of m
+        diagonal = np.abs(np.diag(r))[:n]
+        if not np.isfinite(r).all():
+            raise np.linalg.LinAlgError('the samples leave no finite posterior')
+        regular = diagonal.min() > 0.0
+        inverse = lapack.dtrtri(r[:n, :n])[0] if regular else np.linalg.pinv(r[:n, :n])
+        by = inverse @ r[:n, n:]
+        freedom = max(count - n, 0.0) + 1.0
+        squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
+        xi, cov_xi, scale, volume, noise = self._error_of_plant(
+            f, r[n:, n:], squares, freedom, most_scale
+        )
+        cov = np.empty((size, size))
+        cov[:n, :n] = noise * inverse @ inverse.T + by[:, :-1] @ cov_xi @ by[:, :-1].T
+        cov[:n, n:] = -by[:, :-1] @ cov_xi
+        cov[n:, :n], cov[n:, n:] = cov[:n, n:].T, cov_xi
+        beta = np.concatenate([by[:, -1] - by[:, :-1] @ xi, xi])
+        volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
+        if len(self._hats):
+            volume -= len(self._hats) * log(self.walk_std * sqrt(len(self.v) / len(self._hats)))
+        return replace(
+            f, x=beta[:order], knots=beta[order:at - 1], p0=float(beta[at - 1]), theta=beta[at:],
+            scale=scale, cov=cov[at:, at:], volume=volume,
+            prior=Prior(r[at:size, at:size], r[at:size, size]),
+        )
+
+    def _error_of_plant(
+        self, f: Fit, r: Array, squares: float, freedom: float, most_scale: float,
+    ) -> tuple[Array, Array, float, float, float]:
+        """xi (K,), its covariance, its scale, what it adds to the evidence, variance of the noise.
+
+        r: triangle of xi (K + 1, K + 1). The variance is over that of f; with intervals it is 1.
+        """
+        k = len(r) - 1
+        if not k:
+            return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, 1.0 if f.step else squares / freedom
+        u, singular, vt = np.linalg.svd(r[:k, :k])
+        z = u.T @ r[:k, k]
+        scales = SCALES[most_scale >= SCALES][:, None]
+        noise = np.full((len(scales), 1), 1.0 if f.step else squares / freedom)
+        for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
+            shrink = 1.0 / (1.0 + (scales * singular) ** 2 / noise)
+            left = squares + (shrink * z**2).sum(axis=1, keepdims=True)
+            noise = noise if f.step else left / freedom
+        fits = -0.5 * left[:, 0] if f.step else -0.5 * freedom * np.log(left[:, 0])
+        of_scale = 0.5 * np.log(np.maximum(scales[:, 0], LEAST_SCALE)) ** 2
+        each = fits + 0.5 * np.log(shrink).sum(axis=1) - of_scale
+        share = np.exp(each - each.max())
+        share[1:] *= 0.3  # what a place of the grid stands for beside none at all
+        share /= share.sum()
+        means = scales**2 / noise * singular * shrink * z
+        mean = share @ means
+        spread = np.diag(share @ (scales**2 * shrink))
+        spread += (means - mean).T @ ((means - mean) * share[:, None])
+        best = int(each.argmax())
+        volume = 0.5 * float(np.log(shrink[best]).sum()) - float(of_scale[best])
+        return (vt.T @ mean, vt.T @ spread @ vt, float(scales[best, 0]), volume,
+                float(share @ noise[:, 0]))
+
+    # --- the fit --------------------------------------------------------------------------------
+
+    def fitted(self, f: Fit, steps: int = STEPS) -> Fit:
+        """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
+        for k in range(steps):
+            weights = self.weights(self.output(f))
+            best = self.log_posterior(f, weights)
+            # Far from the optimum the error of the linearization passes for one of G.
+            new = self.step(f, 1.0 if k < FAR_STEPS < steps else np.inf)
+            new.theta[2] = min(max(new.theta[2], 0.0), 2.0 * float(np.ptp(self.v)))
+            if self.start is None:
+                first = float(self.v[0])
+                new = replace(new, p0=min(max(new.p0, first), first + new.gap))
+            furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
+            length = min(LONGEST_STEP / furthest, 1.0) if furthest else 1.0
+            there = _between(f, new, length)
+            value = self.log_posterior(there, weights)
+            while not value > best - 0.5 and length > SHORTEST_STEP:
+                length *= 0.3
+                there = _between(f, new, length)
+                value = self.log_posterior(there, weights)
+            if not value > best - 50.0:  # f stands: only its posterior is new
+                return replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
+            moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
+            f = there
+            if not f.step:
+                f = replace(f, noise_std=self._noise_of(f))
+            if moved < LEAST_MOVE * (1 if steps > FEW_STEPS else 10) and value - best < LEAST_GAIN:
+                break
+        return f
+
+    def _noise_of(self, f: Fit) -> float:
+        y = self.output(f)
+        r = np.where(self.known, self.y - y, 0.0)
+        w = self.weights(y)
+        free = max(float(w.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
+        return sqrt((float((w * r) @ r) + self.nominal**2) / (free + 1.0))
+
+    def finished(self, f: Fit) -> Fit:
+        """The same with its evidence and the correlation of what is left."""
+        p, _ = self.input(f)
+        y = self.output(f)
+        r = np.where(self.known, self.y - y, 0.0)
+        w = self.weights(y)
+        likelihood, score, information = told(r, f.noise_std, f.step)
+        known = self.known
+        count = float(w.sum())
+        whole = score / sqrt(float(information.mean())) if f.step else r / f.noise_std
+        e = whole * np.sqrt(w)
+        squares = max(float(e @ e), 1e-300)
+        lags = (1, 2, 4, 8) if f.step else (1,)
+        rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in lags if lag < len(e))
+        rho = max(0.0, rho - 3.0 / sqrt(max(count, 1.0)))
+        rho *= min(1.0, squares / max(count, 1.0))  # below the noise there may be anything
+        return replace(
+            f, evidence=float((likelihood * w)[known].sum()) + f.volume, correlation=rho,
+            inflation=1.0 - rho + count * rho, count=count,
+            rms=sqrt(float(r @ r) / max(int(known.sum()), 1)),
+            turns=len(reversals(engaged(self.v, p, max(f.gap, 0.0)))),
+        )
+
+    def with_intervals(self, f: Fit) -> Fit:
+        """The finished fit, by intervals where readings have a step that the noise does not hide.
+
+        With less and less noise beside the rounding while that is likelier.
+        """
+        step = self.step_of_readings
+        if not step or (not f.step and f.noise_std > 0.75 * step) or f.m <= 0.0:
+            return self.finished(f)
+        if f.step:
+            levels = [f.noise_std * q for q in (1.0, 0.5, 2.0)]
+            levels = [level for level in levels if step / 40.0 < level < step / 3.9]
+        else:
+            levels = (step * 0.25 ** np.arange(1.0, 3.5, 0.5)).tolist()
+        found: Fit | None = None
+        for level in levels:
+            begin = replace(found or f, step=step, noise_std=float(level))
+            g = self.finished(self.fitted(begin, FEW_STEPS))
+            if found is None or g.evidence > found.evidence:
+                found = g
+            elif not f.step:
+                break
+        if found is not None and found.rms < 1.5 * f.noise:
+            return found
+        return self.finished(self.fitted(replace(f, step=0.0, noise_std=f.noise)))
+
+    def state(self, f: Fit) -> Array:
+        """The state before the record that explains it best, everything else held."""
+        b, a = self.family.at(f.xi)
+        order = len(a) - 1
+        columns = state_columns(a, len(self.v))[self.known]
+        r = (self.y - filtered(b, a, self.input(f)[1], np.zeros(order))[0])[self.known]
+        return np.asarray(np.linalg.lstsq(columns, r, rcond=1e-12)[0])
+
+
+def filtered(b: list[float], a: list[float], u: Array, x: Array) -> tuple[Array, Array]:
+    """Output of the filter b / a from the state x before u (N,), and its state after it."""
+    state = np.zeros(len(a) - 1)
+    length = min(len(state), len(x))
+    state[:length] = x[:length]
+    return lfilter(b, a, u, zi=state)
+
+
+def state_columns(a: list[float], count: int) -> Array:
+    """How outputs depend on the state before them, shape (count, order)."""
+    impulse = np.zeros(count)
+    impulse[0] = 1.0
+    once = lfilter([1.0], a, impulse)
+    return np.column_stack([
+        np.concatenate([np.zeros(i), once[:count - i]]) for i in range(len(a) - 1)
+    ])
+
+
+def _hats(count: int) -> Array:
+    """Piecewise linear functions of a walk that begins at 0, shape (KNOTS, count)."""
+    at = np.linspace(0.0, count - 1.0, KNOTS + 1)
+    return np.array([np.interp(np.arange(count), at, row) for row in np.eye(KNOTS + 1)[1:]])
+
+
+def _between(f: Fit, new: Fit, length: float) -> Fit:
+    """The values this share of the way from f to new, with the posterior of new."""
+    order = max(len(f.x), len(new.x))
+    old, x = (np.pad(each.x, (0, order - len(each.x))) for each in (f, new))
+    knots = f.knots if len(f.knots) == len(new.knots) else np.zeros(len(new.knots))
+    return replace(
+        new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
+        p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta),
+    )

@@ -1,1 +1,0 @@
-"""The fit, and the G of low order, by the intervals that rounded readings tell."""

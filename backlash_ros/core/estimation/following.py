@@ -1,0 +1,206 @@
+"""Between two fits: u_hat from the play operator, the state of G from an observer.
+
+    p(k) = min(max(p(k-1), v), v + gap),   u_hat = m (p - c_r)
+    x_hat(k+1) = A x_hat + B u_hat + k e
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from math import nan
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimation.explanations import Record
+from backlash_ros.core.estimation.fit import Fit, state_columns
+from backlash_ros.core.estimation.observer import Gains, Observer
+from backlash_ros.core.estimation.play import play
+from backlash_ros.core.estimation.settings import GATE, OUTLIERS
+from backlash_ros.core.law import Interval
+from backlash_ros.core.laws.fixed import FixedBacklash
+from backlash_ros.core.plant.backlash import clamp
+from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+
+REMEMBERED = 1500  # samples from which the state of a G is found, at most
+
+
+class Place(NamedTuple):
+    """Where play and G stand after sample `end`.
+
+    p: of the play operator. d: disturbance of u. u, y: over the newest samples (M,). x: state of
+    `model` in the observer form.
+    """
+
+    end: int
+    p: float
+    d: float
+    u: Array
+    y: Array
+    x: Array
+    model: TransferFunction
+
+
+def place_of(fit: Fit, record: Record, model: TransferFunction, memory: int) -> Place:
+    """Where this fit of the record says that play and this G stand after it.
+
+    memory: of G [samples].
+    """
+    p = play(record.v, max(fit.gap, 0.0), fit.p0)
+    d = float(fit.knots[-1]) if len(fit.knots) else 0.0
+    count = min(len(p), 4 * memory, REMEMBERED)
+    u, y = fit.m * p[-count:] - fit.theta[1] + d, record.y[-count:]
+    return Place(record.end, float(p[-1]), d, u, y, state_after(model, u, y), model)
+
+
+def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
+    """The state of this G (observer form) that explains y (M,), nan where lost, after u (M,)."""
+    a = model.denominator.tolist()
+    b = np.append(model.numerator[1:], 0.0)
+    forced = lfilter(b, a, u)
+    known = np.isfinite(y)
+    columns = state_columns(a, len(u))[known]
+    before = np.linalg.lstsq(columns, (y - forced)[known], rcond=1e-12)[0]
+    output, after = lfilter(b, a, u, zi=before)
+    # From the transposed direct form to the observer form, whose first state is y.
+    return np.append(output[-1], after[:-1] + model.denominator[1:-1] * output[-1])
+
+
+class Following:
+    """Follows play operator and state of G from sample to sample.
+
+    model: G of the structure that asks for x_hat. before: gives it until a backlash is known. u:
+    before the newest y; nan before a backlash is known. innovation: of the newest y.
+    since_motion: samples since p, or v before a backlash is known, moved. outliers: readings that
+    did not move the state. surprised: whether so many in a row were beyond the gate that they
+    are none.
+    """
+
+    def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
+        self.model = model
+        self.u = self.innovation = nan
+        self.since_motion = self.outliers = 0
+        self.surprised = False
+        self._before = before
+        self._observer: Observer | None = None
+        self._p = self._v = nan
+        self._d = 0.0
+        self._beyond = 0  # readings in a row beyond the gate
+        self._gains: Gains | None = None  # of `model`, where they are known already
+        self._u: deque[float] = deque(maxlen=REMEMBERED)  # over the newest samples
+        self._y: deque[float] = deque(maxlen=REMEMBERED)
+
+    @property
+    def begun(self) -> bool:
+        """Whether a backlash is known by which to follow."""
+        return self._observer is not None
+
+    @property
+    def x_hat(self) -> list[float]:
+        """State of G in the coordinates of `model`, n values."""
+        if self._observer is not None:
+            return self._observer.state
+        if self._before is not None:
+            state: list[float] = self._before.x_hat.tolist()
+            return state
+        return [0.0] * self.model.order
+
+    @property
+    def x_cov(self) -> Array | None:
+        """Covariance of x_hat, shape (n, n); None before a backlash is known."""
+        return self._observer.cov if self._observer is not None else None
+
+    def change_model(self, model: StateModel, gains: Gains | None) -> None:
+        """Give x_hat for this G from now on; gains: of its observer."""
+        self.model, self._gains = model, gains
+        if self._before is not None:
+            self._before = self._before.with_model(model)
+        if self._observer is not None:
+            before = self._observer
+            self._observer = Observer(model, before.noise_std, before, gains)
+            y = np.array(self._y)
+            if np.isfinite(y).sum() > model.order:
+                x = state_after(model.transfer_function, np.array(self._u), y)
+                self._observer.place(x, True)
+
+    def settle(self, noise_std: float) -> None:
+        """Let the gain of the observer adapt where no fit says where the state is."""
+        if self._observer is not None:
+            self._observer.settle(noise_std)
+
+    def step(self, y: float | None, interval: Interval, estimate: Estimate) -> None:
+        """Take in y(k), None if it was lost, and v of the interval before it."""
+        v, observer = interval.v, self._observer
+        if observer is None:
+            self.since_motion = self.since_motion + 1 if v == self._v else 0
+            self._v = v
+            if self._before is not None:
+                self._before.update(y, interval)
+            return
+        p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
+        self.since_motion = self.since_motion + 1 if p == self._p else 0
+        self._p = p
+        self.u = u = estimate.m * (p - estimate.c_r) + self._d
+        self._u.append(u)
+        self._y.append(nan if y is None else y)
+        self._correct(observer, y, observer.predict(u))
+
+    def _correct(self, observer: Observer, y: float | None, expected: float) -> None:
+        self.surprised = False
+        if y is None:
+            self.innovation = nan
+            return
+        self.innovation = innovation = y - expected
+        if innovation * innovation <= GATE**2 * observer.variance:
+            self._beyond = 0
+            observer.correct(innovation)
+            return
+        self._beyond += 1
+        if self._beyond < OUTLIERS:
+            self.outliers += 1
+            return
+        # So many in a row are none: the state goes on with them.
+        self.surprised = self._beyond == OUTLIERS
+        observer.correct(innovation)
+
+    def go_on_from(
+        self, place: Place, newer: Sequence[tuple[float, float]], estimate: Estimate,
+        noise_std: float, known: bool,
+    ) -> None:
+        """Let play and observer stand where a fit says that they stood, and step to now.
+
+        newer: v and y of the samples since then. known: whether the fit explains all of its
+        samples, so that it knows the state better than the newest of them do.
+        """
+        observer = self._observer
+        if observer is None:
+            observer = self._observer = Observer(self.model, noise_std, None, self._gains)
+        else:
+            observer.settle(noise_std)
+        gap = estimate.c_r - estimate.c_l
+        p, self._d = place.p, place.d
+        self._u.clear()
+        self._y.clear()
+        self._u.extend(place.u.tolist())
+        self._y.extend(place.y.tolist())
+        follows = place.model is self.model.transfer_function \
+            or np.array_equal(place.model.denominator, self.model.transfer_function.denominator)
+        if follows:
+            observer.place(place.x, known)
+        for v, y in newer:
+            p = clamp(p, v, v + gap)
+            u = estimate.m * (p - estimate.c_r) + place.d
+            self._u.append(u)
+            self._y.append(y)
+            if follows:
+                innovation = y - observer.predict(u)
+                if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
+                    observer.correct(innovation)
+        self._p, self.u = p, estimate.m * (p - estimate.c_r) + place.d

@@ -1,0 +1,85 @@
+"""Which of two commands acted over an interval, where the time of arrival leaves that open.
+
+Where the other one acted, u was another one until the play output is the same again, and y moves by
+what G makes of that. With s of that in the residuals r of the fit, the other command is
+
+    (s.r - s.s / 2) / sigma^2
+
+more likely, less the log-odds against it. The likeliest is believed first, and the rest compared
+again, until none is likely.
+
+Reference: A. S. Willsky, H. L. Jones, A generalized likelihood ratio approach to the detection and
+estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1976) 108-112.
+"""
+
+from __future__ import annotations
+
+from math import log
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.explanations import Record, with_swapped
+from backlash_ros.core.estimation.fit import Fit, Problem
+from backlash_ros.core.estimation.play import play
+from backlash_ros.core.estimation.settings import COMMAND_ODDS
+from backlash_ros.core.plant.filtering import lfilter
+
+Array = NDArray[np.float64]
+
+MOST = 200  # swaps of one look
+
+
+def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozenset[int],
+            ) -> frozenset[int]:
+    """Numbers of the samples from `since` on over which the other command acted.
+
+    problem: of the record. back: of the samples over which the other one acts already, so that its
+    odds are the reverse.
+    """
+    open_ = np.flatnonzero(np.isfinite(record.other))
+    open_ = open_[open_ >= since - record.first]
+    if not len(open_) or fit.m <= 0.0:
+        return frozenset()
+    b, a = problem.family.at(fit.xi)
+    reach = problem.family.memory
+    chosen: set[int] = set()
+    residual = np.nan_to_num(problem.residual(fit))
+    v, other = record.v.copy(), record.other.copy()
+    p = play(v, fit.gap, fit.p0)
+    odds = log(COMMAND_ODDS)
+    for _ in range(MOST):
+        best, place, change = 0.0, -1, residual[:0]
+        for k in open_.tolist():
+            moved = _change(v, other, p, k, reach, fit)
+            if not moved.any():
+                continue
+            s = lfilter(b, a, fit.m * moved)
+            end = k + len(s)
+            seen = s * problem.known[k:end]
+            gain = float(seen @ residual[k:end] - 0.5 * seen @ seen) / fit.noise**2
+            gain -= odds if (record.first + k in back) == (k in chosen) else -odds
+            if gain > best:
+                best, place, change = gain, k, s
+        if place < 0:
+            break
+        v[place], other[place] = other[place], v[place]
+        chosen ^= {place}
+        residual[place:place + len(change)] -= change
+        p = play(v, fit.gap, fit.p0)
+    return frozenset(record.first + k for k in chosen)
+
+
+def _change(v: Array, other: Array, p: Array, k: int, reach: int, fit: Fit) -> Array:
+    """By how much p would be another one from sample k on, were the other command to act there."""
+    end = min(k + reach, len(v))
+    acting = v[k:end].copy()
+    acting[0] = other[k]
+    return play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:end]
+
+
+def likelier(problem: Problem, fit: Fit, record: Record, since: int, back: frozenset[int],
+             ) -> tuple[Record, frozenset[int]]:
+    """The record as it is likelier, and the numbers of all samples over which others acted."""
+    found = swapped(problem, fit, record, since, back)
+    return with_swapped(record, found), back ^ found

@@ -1,1 +1,0 @@
-"""What happens at every sample: u and the state of G, outliers, which command acted."""

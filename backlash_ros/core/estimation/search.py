@@ -1,0 +1,161 @@
+"""Where to begin a fit: gaps and beginnings, by the evidence of all else in closed form.
+
+For a gap g and a beginning p0, y is linear in the state, o, m and m xi (to first order in xi): one
+QR for each of some 300 hypotheses. Rows are averaged to some 1,500, as densely as v moves.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.estimation.fit import state_columns
+from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.play import plays
+from backlash_ros.core.estimation.settings import ROWS
+from backlash_ros.core.plant.filtering import lfilter
+
+Array = NDArray[np.float64]
+
+GAPS, STARTS = 32, 5  # that are compared, and beginnings within each
+SMALLEST = 0.01  # gap that is compared, over the swing of v
+# Gaps of the second look, over the best of the first.
+ZOOM: Array = np.array([0.8 + 0.025 * k for k in range(17)])
+SCALES = (0.03, 0.3, 1.0)  # of the error of G that are weighed
+AT_ONCE = 2_000_000  # numbers that are held at once
+# --- guards
+NONE = 1e-9  # gap that counts as none, over the swing of v
+
+
+class Hypothesis(NamedTuple):
+    """A gap and a beginning, the slope that goes with them, and their evidence."""
+
+    evidence: float
+    gap: float
+    p0: float
+    m: float
+
+
+def search(
+    family: PlantFamily, v: Array, y: Array, noise_std: float, widest: float,
+) -> tuple[list[Hypothesis], float]:
+    """Hypotheses, the likeliest first, and the evidence of a u that never moves.
+
+    v, y: (N,), y nan where lost. widest: gap that is considered.
+    """
+    compared = _Comparison(family, v, y, noise_std)
+    swing = float(np.ptp(v))
+    top = min(swing, widest)
+    gaps: Array = np.append(NONE * swing, np.geomspace(SMALLEST * min(swing, top), top, GAPS))
+    starts: Array = np.arange(STARTS) / (STARTS - 1.0)
+    found = compared.evidence(gaps, starts)
+    best = max(found).gap
+    between = 0.5 * (starts[1:] + starts[:-1])
+    found += compared.evidence(best * ZOOM, np.append(starts, between))
+    return sorted((h for h in found if isfinite(h.evidence)), reverse=True), compared.null
+
+
+class _Comparison:
+    """Gaps compared by one record. null: evidence of a u that never moves."""
+
+    def __init__(self, family: PlantFamily, v: Array, y: Array, noise_std: float) -> None:
+        self._family, self._v = family, v
+        zero = [0.0] * family.count
+        self._b, self._a = family.at(zero)
+        self._slopes = family.slopes(zero)
+        self._known = np.isfinite(y)
+        self._begins, self._weights = _bins(v, self._known)
+        common = np.column_stack([
+            state_columns(self._a, len(v)), lfilter(self._b, self._a, np.ones(len(v)))
+        ])
+        self._q = np.linalg.qr(self._averaged(common.T).T)[0]
+        self._y = self._without_common(self._averaged(np.where(self._known, y, 0.0)))
+        self._nominal = noise_std
+        self._rows = len(self._y)
+        self._freedom = max(self._rows - self._q.shape[1], 1)
+        squares = float(self._y @ self._y) + noise_std**2
+        self.null = -0.5 * self._freedom * float(np.log(squares / self._rows))
+
+    def _averaged(self, columns: Array) -> Array:
+        """Columns (..., N) summed over bins and divided by the root of the readings in each."""
+        known = columns * self._known
+        return np.asarray(np.add.reduceat(known, self._begins, axis=-1) * self._weights)
+
+    def _without_common(self, columns: Array) -> Array:
+        """Columns (..., R) without what state and o explain."""
+        return np.asarray(columns - (columns @ self._q) @ self._q.T)
+
+    def evidence(self, gaps: Array, shares: Array) -> list[Hypothesis]:
+        """The best beginning of each gap; shares: places of it within the gap."""
+        out = []
+        each = max(AT_ONCE // (len(shares) * len(self._v)), 1)
+        for first in range(0, len(gaps), each):
+            out += self._evidence(gaps[first:first + each], shares)
+        return out
+
+    def _evidence(self, gaps: Array, shares: Array) -> list[Hypothesis]:
+        g = np.repeat(gaps, len(shares))
+        begins = self._v[0] + np.tile(shares, len(gaps)) * g
+        p = plays(self._v, g, begins)
+        once = lfilter([1.0], self._a, p, axis=1)
+        of_y = lfilter(self._b, [1.0], once, axis=1)
+        columns = [self._averaged(of_y)]
+        if self._family.count:
+            # xi changes no constant part of u: that keeps to o.
+            move = lfilter([1.0], self._a, p - p[:, :1], axis=1)
+            y_over_a = lfilter([1.0], self._a, lfilter(self._b, [1.0], move, axis=1), axis=1)
+            for db, da in zip(*self._slopes, strict=True):
+                column = lfilter(db, [1.0], move, axis=1) - lfilter(da, [1.0], y_over_a, axis=1)
+                columns.append(self._averaged(column))
+        stack = self._without_common(np.stack(columns, axis=1))
+        y = np.broadcast_to(self._y, (len(g), 1, self._rows))
+        r = _triangles(np.concatenate([stack, y], axis=1).transpose(0, 2, 1))
+        m = r[:, 0, -1] / r[:, 0, 0]
+        best = self._weighed(r, np.abs(m)).reshape(len(gaps), -1)
+        at = best.argmax(axis=1) + np.arange(len(gaps)) * len(shares)
+        return [
+            Hypothesis(float(best.ravel()[i]), float(g[i]), float(begins[i]), float(m[i]))
+            for i in at
+        ]
+
+    def _weighed(self, r: Array, m: Array) -> Array:
+        """Evidence (H,) from triangles (H, K + 2, K + 2), at the best scale of the error of G."""
+        k, freedom = self._family.count, self._freedom
+        noise = np.sqrt((r[:, -1, -1] ** 2 + self._nominal**2) / freedom)
+        if not k:
+            return -0.5 * freedom * np.log(noise**2 * freedom / self._rows)
+        best = np.full(len(r), -np.inf)
+        i = np.arange(k)
+        for scale in SCALES:
+            weight = noise / (scale * m + 1e-30)
+            prior = np.zeros((len(r), k, k + 2))
+            prior[:, i, i + 1] = weight[:, None]
+            s = _triangles(np.concatenate([r, prior], axis=1))
+            value = -0.5 * freedom * np.log((s[:, -1, -1] ** 2 + self._nominal**2) / self._rows)
+            value += k * np.log(weight) - 0.5 * scale**2
+            value -= np.log(np.abs(s[:, i + 1, i + 1]) + 1e-300).sum(axis=1)
+            best = np.maximum(best, value)
+        return best
+
+
+def _triangles(stacks: Array) -> Array:
+    """R of each matrix (H, n, p), shape (H, p, p)."""
+    return np.asarray(np.linalg.qr(stacks, mode='r'))
+
+
+def _bins(v: Array, known: NDArray[np.bool_]) -> tuple[NDArray[np.intp], Array]:
+    """Where some 1,500 bins begin, and 1 / sqrt(readings) of each; every sample for short records.
+
+    Half of the bins are spread evenly over the time and half over the motion of v.
+    """
+    count = len(v)
+    begins: NDArray[np.intp] = np.arange(count)
+    if count > ROWS:
+        move = np.abs(np.diff(v, prepend=v[0]))
+        clock = np.cumsum(0.5 / count + 0.5 * move / max(float(move.sum()), 1e-300))
+        begins = np.flatnonzero(np.diff(np.floor(clock * ROWS), prepend=-1.0) > 0)
+    readings = np.add.reduceat(known.astype(np.float64), begins)
+    return begins, np.where(readings > 0.0, 1.0 / np.sqrt(np.maximum(readings, 1.0)), 0.0)

@@ -1,1 +1,0 @@
-"""The same fit as one function of a record."""

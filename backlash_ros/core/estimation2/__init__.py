@@ -1,1 +1,0 @@
-"""The default law: one fit of all unknowns to a record, and one comparison of its explanations."""

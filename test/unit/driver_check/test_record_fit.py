@@ -1,0 +1,223 @@
+"""A whole record as one function: backlash, G, noise, delay and sign."""
+
+from __future__ import annotations
+
+from math import isnan, nan
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from records import PERIOD_S, Truth, output, resonance, swing
+from scipy.special import chdtri
+
+from backlash_ros.core.driver_check.record_fit import RecordFit, fit_record
+from backlash_ros.core.estimate import Bounds
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.records.samples import SEARCHED_AT_MOST, frequencies_of
+
+NOISE = 1e-3
+TRUTH = Truth()
+MODEL = resonance()
+
+
+def record(
+    count: int, truth: Truth = TRUTH, model: TransferFunction = MODEL, noise: float = NOISE,
+    seed: int = 0, delay: int = 0, size: float = 3.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """v from k to k+1 and y at k; v comes into effect `delay` samples late."""
+    v = swing(count + delay, size, seed)
+    y = np.append(nan, output(model, v, truth, noise, seed))
+    return v[delay:], y[:count]
+
+
+def of(v: np.ndarray, y: np.ndarray, uncertainty: float = 0.2, **options: object) -> RecordFit:
+    """The fit with the exact G, unless told otherwise."""
+    known = {'model': MODEL, 'noise_std': NOISE, **options}
+    return fit_record(v, y, uncertainty=uncertainty, **known)
+
+
+def assert_is(fit: RecordFit, truth: Truth) -> None:
+    """All within their deviations, and these are small."""
+    assert fit.usable, fit.reasons
+    for value, std, true in (
+        (fit.m, fit.std_m, truth.m), (fit.c_r, fit.std_c_r, truth.c_r),
+        (fit.c_l, fit.std_c_l, truth.c_l), (fit.gap, fit.std_gap, truth.gap),
+    ):
+        assert abs(value - true) <= 5.5 * std
+        assert std <= 0.02 * abs(true)
+
+
+@settings(max_examples=10)
+@given(
+    m=st.floats(0.2, 5.0), c_r=st.floats(0.2, 1.0), c_l=st.floats(-1.0, -0.2),
+    share=st.floats(0.0, 1.0), seed=st.integers(0, 1000),
+    uncertainty=st.sampled_from([0.0, 0.2]),
+)
+def test_backlash_and_noise_are_found(
+    m: float, c_r: float, c_l: float, share: float, seed: int, uncertainty: float,
+) -> None:
+    truth = Truth(m, c_r, c_l, share)
+    fit = of(*record(500, truth, seed=seed), uncertainty)
+    assert_is(fit, truth)
+    assert fit.noise_std == pytest.approx(NOISE, rel=0.25)
+    assert fit.rms == pytest.approx(NOISE, rel=0.25)
+    assert fit.predicted > 0.9
+    assert fit.evidence > 100.0
+    assert fit.correlation == 0.0
+    assert fit.delay == 0
+    assert fit.outliers == 0
+
+
+@pytest.mark.parametrize(('delay', 'm', 'gap'), [(0, 2.0, 0.5), (3, -0.1, 2.0)])
+def test_without_noise_the_fit_is_exact(delay: int, m: float, gap: float) -> None:
+    truth = Truth(abs(m), 0.4 * gap, -0.6 * gap)
+    v, y = record(400, truth, noise=0.0, delay=delay)
+    y = np.copysign(1.0, m) * y
+    y[::17] = nan
+    fit = of(v, y, 0.0, noise_std=1e-9, delays=range(6))
+    assert fit.delay == delay
+    assert (fit.m, fit.c_r, fit.c_l) == pytest.approx((m, 0.4 * gap, -0.6 * gap), rel=1e-4)
+
+
+@pytest.mark.parametrize('delay', [0, 2, 5])
+def test_delay_of_v_is_found_by_evidence(delay: int) -> None:
+    fit = of(*record(500, delay=delay), delays=range(8))
+    assert fit.delay == delay
+    assert fit.margins[delay] == 0.0
+    assert min(margin for other, margin in fit.margins.items() if other != delay) > 10.0
+    assert_is(fit, TRUTH)
+
+
+def test_a_wrong_sign_is_a_finding_and_not_usable() -> None:
+    v, y = record(500)
+    right, wrong = of(v, y), of(v, -y)
+    assert wrong.m == pytest.approx(-right.m, rel=1e-6)
+    assert (wrong.c_r, wrong.c_l) == pytest.approx((right.c_r, right.c_l), rel=1e-6)
+    assert wrong.std_gap == pytest.approx(right.std_gap, rel=1e-3)
+    assert not wrong.usable
+    assert any('against v' in reason for reason in wrong.reasons)
+    assert wrong.doubts == ()
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('ratio', [0.8, 1.2])
+def test_a_model_that_is_off_is_learned_with_its_sign(ratio: float, sign: float) -> None:
+    true = resonance(5.0 * ratio)
+    v, y = record(800, model=true)
+    fit = of(v, sign * y)
+    assert fit.model is not fit.nominal
+    frequencies = 2.0 * np.pi * PERIOD_S * np.array([0.7, 1.9, 3.7])
+    z = np.exp(1j * frequencies)
+    assert fit.model.response(z) == pytest.approx(true.response(z), rel=5e-3)
+    seen = np.abs(true.response(z) / MODEL.response(z) - 1.0)
+    assert fit.error_of_model(frequencies) == pytest.approx(seen, rel=0.05)
+    assert 0.2 < fit.error_scale < 5.0
+    assert abs(fit.m) == pytest.approx(TRUTH.m, rel=0.01)
+    assert fit.gap == pytest.approx(TRUTH.gap, rel=0.01)
+
+
+def test_an_exact_model_stays_the_one_that_was_told() -> None:
+    fit = of(*record(500), model=StateModel(MODEL))
+    assert fit.model is MODEL
+    assert fit.error_of_model([0.1, 0.2]) == pytest.approx([0.0, 0.0])
+    assert fit.error_scale < 0.05
+
+
+@pytest.mark.parametrize('uncertainty', [0.0, 0.2])
+def test_deviations_are_honest(uncertainty: float) -> None:
+    errors = []
+    for seed in range(12):
+        fit = of(*record(500, seed=seed), uncertainty)
+        errors.append([(fit.m - 1.3) / fit.std_m, (fit.c_r - 1.0) / fit.std_c_r,
+                       (fit.gap - 1.8) / fit.std_gap])
+    squares = np.mean(np.square(errors), axis=0)
+    assert squares.max() <= chdtri(len(errors), 1e-4) / len(errors)
+
+
+def test_a_long_record_is_fitted_as_a_whole() -> None:
+    count = SEARCHED_AT_MOST + 2000
+    v, y = record(count)
+    v[:1500] = v[1500]  # still at first: the search looks where v moves
+    y = np.append(nan, output(MODEL, v, TRUTH, NOISE))[:count]
+    fit = of(v, y, 0.0)
+    assert_is(fit, TRUTH)
+    short = of(v[:SEARCHED_AT_MOST - 2000], y[:SEARCHED_AT_MOST - 2000], 0.0)
+    assert fit.std_gap < short.std_gap
+
+
+def test_outliers_are_left_out_and_counted() -> None:
+    v, y = record(500)
+    y[50::60] += 0.5
+    fit = of(v, y)
+    assert fit.outliers == len(y[50::60])
+    assert_is(fit, TRUTH)
+    assert fit.noise_std == pytest.approx(NOISE, rel=0.25)
+
+
+def test_unexplained_motion_is_told_and_widens_the_deviations() -> None:
+    v, y = record(800)
+    calm = of(v, y)
+    y = y + 0.02 * np.cumsum(np.random.default_rng(0).standard_normal(800))
+    rough = of(v, y)
+    assert calm.unexplained == 0.0
+    assert rough.unexplained > 0.02
+    assert rough.correlation > 0.3
+    assert rough.std_gap > 10.0 * calm.std_gap
+    assert abs(rough.gap - 1.8) <= 5.0 * rough.std_gap
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_one_side_alone_does_not_identify_the_gap(seed: int) -> None:
+    v = np.linspace(0.0, 5.0, 400)
+    v[0] = v[1] + 1e-5  # a dip that moves the play output by less than anybody can tell
+    y = np.append(nan, output(MODEL, v, TRUTH, NOISE, seed))[:400]
+    fit = of(v, y, 0.0)
+    assert not fit.usable
+    assert any('crossed the gap 0 times' in reason for reason in fit.reasons)
+    assert fit.m == pytest.approx(1.3, rel=0.05)
+
+
+@pytest.mark.parametrize(('v', 'reason'), [
+    (np.zeros(400), 'stood still'), (swing(20), 'too few samples'), (0.05 * swing(400), 'nothing'),
+], ids=['still', 'short', 'within the gap'])
+def test_why_there_is_no_fit_is_said(v: np.ndarray, reason: str) -> None:
+    y = np.append(nan, output(MODEL, v, TRUTH, NOISE))[:len(v)]
+    fit = of(v, y)
+    assert not fit.usable
+    assert reason in fit.reasons[0]
+    assert isnan(fit.m)
+    assert isnan(fit.frequencies[0])
+
+
+def test_bounds_limit_what_is_usable() -> None:
+    v, y = record(500)
+    assert of(v, y, bounds=Bounds(m=(0.1, 2.0))).usable
+    fit = of(v, y, bounds=Bounds(m=(0.1, 1.0)))
+    assert any('m would be 1.3, outside' in reason for reason in fit.reasons)
+    narrow = of(v, y, bounds=Bounds(c_r=(0.0, 0.3), c_l=(-0.3, 0.0)))
+    assert not narrow.usable
+
+
+def test_frequencies_are_those_of_the_motion() -> None:
+    t = np.arange(2000.0)
+    y = np.sin(0.05 * t) + 0.3 * np.sin(0.4 * t)
+    y[::9] = nan
+    low, high = frequencies_of(y)
+    assert low == pytest.approx(0.05, abs=0.01)
+    assert high == pytest.approx(0.4, abs=0.01)
+
+
+@pytest.mark.parametrize(('v', 'y', 'delays', 'message'), [
+    (np.zeros(5), np.zeros(4), (0,), 'one length'),
+    (np.array([0.0, nan, 1.0]), np.zeros(3), (0,), 'v must be finite'),
+    (np.zeros(3), np.array([0.0, np.inf, 1.0]), (0,), 'y must be finite'),
+    (np.zeros(3), np.zeros(3), (), 'at least one'),
+    (np.zeros(3), np.zeros(3), (-1,), 'negative'),
+])
+def test_arrays_that_make_no_record_are_refused(
+    v: np.ndarray, y: np.ndarray, delays: tuple[int, ...], message: str,
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        of(v, y, delays=delays)
