@@ -441,8 +441,11 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
     joined = known.crossings + gain @ (fit.crossings - known.crossings)
     systematic = fit.count * fit.correlation > 1.0 and setup.family.count > 0
     wrong = systematic and fit.unexplained > 0.1
+    left = prior - gain @ prior
+    if np.trace(left[1:, 1:]) > np.trace(known.cov[1:, 1:]):
+        joined, left = known.crossings, known.cov  # agreement makes nothing less certain
     return replace(
-        belief, published=joined, cov=prior - gain @ prior,
+        belief, published=joined, cov=left,
         reason=Status.INCONSISTENT if wrong else Status.TRACKING,
     )
 
