@@ -129,25 +129,6 @@ def draw_loop() -> Figure:
     return draw_hysteresis(run.record, end)
 
 
-def draw_convergence() -> Figure:
-    """Estimates with two standard deviations under noise, zooming in with time."""
-    run = simulate(6.0, {'output_noise_std': '1e-3'}).record
-    figure = new_figure(6.6)
-    t = run.column('t')
-    for axes, name in zip(figure.subplots(3, 1, sharex=True), NAMES, strict=True):
-        truth, estimate = run.column(f'true_{name}'), run.column(name)
-        error, std = estimate - truth, run.column(f'std_{name}')
-        band(axes, t, -2 * std, 2 * std, COLOURS[name], '±2 published standard deviations')
-        curve(axes, t, error, COLOURS[name], f'${ESTIMATES[name]} - {name}$')
-        zero_line(axes)
-        reach = 6.0 * float(np.nanmedian(std))
-        axes.set_ylim(-reach, reach)
-        label(axes, f'{name}, true value {truth[0]:g}', f'[{UNITS[name]}]')
-        legend_above(axes)
-    label(axes, x=TIME)
-    return figure
-
-
 def draw_uncertain_plant() -> Figure:
     """Errors of the crossings where the true plant is not G: G believed, and the default."""
     figure = new_figure(6.4)
@@ -225,8 +206,8 @@ def draw_tracking() -> Figure:
 
 FIGURES: dict[str, Callable[[], Figure]] = {
     'result': draw_result, 'figure_4': draw_figure_4, 'figure_5': draw_figure_5,
-    'hysteresis': draw_loop, 'convergence': draw_convergence, 'recovery': draw_recovery,
-    'tracking': draw_tracking, 'uncertain_plant': draw_uncertain_plant,
+    'hysteresis': draw_loop, 'recovery': draw_recovery, 'tracking': draw_tracking,
+    'uncertain_plant': draw_uncertain_plant,
 }
 
 

@@ -11,15 +11,15 @@ from typing import NamedTuple
 
 DOCS = Path(__file__).resolve().parents[1]
 PACKAGE = DOCS.parent / 'backlash_ros'
-# These stand in estimation.md, with what they are part of.
-ELSEWHERE = PACKAGE / 'core' / 'estimation'
+# This stands in estimation.md.
+ELSEWHERE = PACKAGE / 'core' / 'estimation' / 'settings.py'
 CONSTANT = re.compile(r'[A-Z][A-Z0-9_]*')
 NUMBERS = (ast.Constant, ast.UnaryOp, ast.BinOp, ast.Tuple)
 BEGIN = """# Constants
 
-Numbers that are no parameters, as nobody has to choose them: tolerances, deadlines, sizes. Those of
-the estimator stand in [estimation.md](../estimation.md#constants). Made from the code and the
-comments beside them by `make docs`.
+Numbers that are no parameters, as nobody has to choose them: tolerances, deadlines, sizes. Those
+that shape the default estimator stand in [estimation.md](../estimation.md#constants). Made from the
+code and the comments beside them by `make docs`.
 """
 
 
@@ -49,7 +49,7 @@ def constants_page() -> str:
 
 def numbers_of_the_package() -> list[Constant]:
     """All of them, those of one folder beside each other."""
-    paths = [path for path in PACKAGE.rglob('*.py') if not path.is_relative_to(ELSEWHERE)]
+    paths = [path for path in PACKAGE.rglob('*.py') if path != ELSEWHERE]
     paths.sort(key=lambda path: (path.parent, path.name))
     return [found for path in paths for found in numbers_of(path)]
 
@@ -81,7 +81,8 @@ def _meaning(lines: list[str], node: ast.Assign) -> str:
     if '#' in behind:
         return behind.partition('#')[2].strip()
     first = node.lineno - 1
-    while first > 0 and lines[first - 1].startswith('# '):
+    while first > 0 and lines[first - 1].startswith('# ') \
+            and not lines[first - 1].startswith('# ---'):
         first -= 1
     return ' '.join(line.removeprefix('# ') for line in lines[first:node.lineno - 1])
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 
 import combinations_of_laws
 import numpy as np
+from generate_constants import numbers_of
 from printed_law import (
     Reading,
     error_growth,
@@ -29,14 +29,11 @@ NAMES = ('m', 'c_r', 'c_l')
 SECONDS = 10.0
 DISTURBANCE = 2.0
 ROOT = Path(__file__).resolve().parents[2]
-ESTIMATION = ROOT / 'backlash_ros' / 'core' / 'estimation'
-CONSTANTS = ESTIMATION / 'constants.py'
-CONSTANT = re.compile(r'([A-Z][A-Z0-9_]*(?:, [A-Z][A-Z0-9_]*)*) = (.*?)(?:  # (.*))?')
-KIND = re.compile(r'# --- (\w+)')
+SETTINGS = ROOT / 'backlash_ros' / 'core' / 'estimation' / 'settings.py'
 MOTOR = 'geared_motor.yaml'
 # True plants that differ from the G(z) of MOTOR, by what is set.
 TRUE_PLANTS: dict[str, dict[str, str]] = {
-    'as told': {},
+    'nominal': {},
     'natural frequency × 0.98': {'truth.scale_frequency': '0.98'},
     'natural frequency × 0.8': {'truth.scale_frequency': '0.8'},
     'natural frequency × 1.2': {'truth.scale_frequency': '1.2'},
@@ -46,13 +43,6 @@ TRUE_PLANTS: dict[str, dict[str, str]] = {
     '20 ms of lag': {'truth.extra_lag': '0.02'},
 }
 RESPONSE_HZ = (2.5, 10.0)  # frequencies at which G is compared
-# Motions and noise for which a G that is not certain costs accuracy: file, what is set.
-MOTIONS: dict[str, tuple[str | None, dict[str, str]]] = {
-    'geared motor, multisine': (MOTOR, {}),
-    'geared motor, one sine': (MOTOR, {'waveform': 'sine'}),
-    'geared motor, triangle: one speed': (MOTOR, {'waveform': 'triangle'}),
-    'paper, one sine, noise 1e-3': (None, {'output_noise_std': '1e-3'}),
-}
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -168,7 +158,7 @@ def uncertain_plants() -> str:
     at = ' and '.join(f'{f:g}' for f in RESPONSE_HZ)
     return markdown((
         'true plant', 'c_r, c_l with `plant.uncertainty: 0`', 'c_r, c_l with 0.2',
-        f'G as told, at {at} Hz', 'G as learned',
+        f'nominal G, at {at} Hz', 'G as learned',
     ), rows)
 
 
@@ -193,65 +183,13 @@ def _percent(share: complex) -> str:
     return f'{percent:.0f} %' if percent >= 10.0 or percent < 1e-9 else f'{percent:.2g} %'
 
 
-def freedom() -> str:
-    """What it costs, where G is right, that it might be wrong: deviations at 6 s."""
-    rows = []
-    for name, (config, change) in MOTIONS.items():
-        cells = []
-        for uncertainty in ('0.0', '0.2'):
-            run = simulate(6.0, {**change, 'plant.uncertainty': uncertainty}, config).record
-            cells.append(', '.join(
-                _percent(run.column(f'std_{n}')[-1] / run.column(f'true_{n}')[-1]) for n in NAMES
-            ))
-        rows.append((name, *cells))
-    return markdown(
-        ('G as told, motion', 'deviations of m, c_r, c_l with `plant.uncertainty: 0`', 'with 0.2'),
-        rows,
-    )
-
-
 def estimator_constants() -> str:
     """What the method is tuned by, with the comments beside it, as it stands in the code."""
-    rows = [(kind, f'`{name}`', value, what) for kind, name, value, what in constants_of(CONSTANTS)]
-    return markdown(('for', 'constant', 'value', 'meaning'), rows)
-
-
-def estimator_details() -> str:
-    """The guards and the structure of single computations of the method."""
-    rows: list[tuple[str, str, str, str, str]] = []
-    for path in sorted(ESTIMATION.rglob('*.py'), key=lambda path: path.name):
-        if path != CONSTANTS:
-            link = f'[{path.name}](../{path.relative_to(ROOT)})'
-            rows += [
-                (kind, f'`{name}`', value, what, link)
-                for kind, name, value, what in constants_of(path)
-            ]
-    rows.sort(key=lambda row: row[0], reverse=True)
-    return markdown(('part of', 'constant', 'value', 'meaning', 'file'), rows)
-
-
-def constants_of(path: Path) -> list[tuple[str, str, str, str]]:
-    """Kind, name, value and meaning of the constants of a file: those with a comment.
-
-    The kind is what a line `# --- kind` above them says, the structure where there is none.
-    """
-    lines = path.read_text().splitlines()
-    found, kind = [], 'structure'
-    for k, line in enumerate(lines):
-        if (heading := KIND.fullmatch(line)) is not None:
-            kind = heading[1]
-        match = CONSTANT.fullmatch(line)
-        if match is None:
-            continue
-        name, value, comment = match.groups()
-        first = k
-        while comment is None and first > 0 and lines[first - 1].startswith('# ') \
-                and not KIND.fullmatch(lines[first - 1]):
-            first -= 1
-        what = comment or ' '.join(text.removeprefix('# ') for text in lines[first:k])
-        if what:
-            found.append((kind, name, f'`{value}`', what.replace('|', '\\|')))
-    return found
+    rows = [
+        (', '.join(f'`{name}`' for name in found.names), f'`{found.value}`', found.meaning)
+        for found in numbers_of(SETTINGS)
+    ]
+    return markdown(('constant', 'value', 'meaning'), rows)
 
 
 def combinations() -> str:
@@ -263,7 +201,6 @@ TABLES: dict[str, Callable[[], str]] = {
     'plant_facts': plant_facts, 'laws': laws, 'printed_moves': printed_moves,
     'printed_not_finite': printed_not_finite, 'printed_growth': printed_growth,
     'printed_readings': printed_readings, 'disturbance': disturbance,
-    'uncertain_plants': uncertain_plants, 'freedom': freedom,
-    'combinations': combinations,
-    'estimator_constants': estimator_constants, 'estimator_details': estimator_details,
+    'uncertain_plants': uncertain_plants, 'combinations': combinations,
+    'estimator_constants': estimator_constants,
 }

@@ -33,7 +33,7 @@ FEWEST = 10  # samples per unknown of G and u below which nothing is said
 SURE = 5.0  # standard deviations of the gap by which the play output must move to count
 LIKELIER = 1.0  # log-likelihood by which another G than the nominal one must be better
 NO_GAP = 0.01  # standard deviation of a gap over the swing of v that counts as known: there is none
-SMALLEST_NOISE = 1e-12
+SMALLEST_NOISE = 1e-12  # of y, at least
 
 
 @dataclass(frozen=True)
