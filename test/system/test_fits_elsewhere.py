@@ -1,0 +1,77 @@
+"""A controller whose fits are made by a worker: what the death of either costs the other."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drivers.paced_driver import controller_and_driver
+from ros_processes import NodeProcess, ros_world
+from waiting import wait_until
+
+from backlash_ros.core.estimation2 import worker
+
+KILLED = 5  # times
+UNCERTAIN: dict[str, object] = {'plant.uncertainty': 0.2}
+
+
+def workers_of(controller: NodeProcess) -> list[int]:
+    """Process ids of the workers that a controller has started and that still run."""
+    found = []
+    for folder in Path('/proc').glob('[0-9]*'):
+        try:
+            state, parent = (folder / 'stat').read_text().rpartition(')')[2].split()[:2]
+            command = (folder / 'cmdline').read_bytes()
+        except OSError:  # it has ended meanwhile
+            continue
+        is_child = int(parent) == controller.process.pid and state != 'Z'
+        if is_child and worker.__name__.encode() in command:
+            found.append(int(folder.name))
+    return found
+
+
+def test_a_worker_that_is_killed_again_and_again_costs_no_estimate(
+    tmp_path: Path,
+) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world, reports_applied=True, **UNCERTAIN)
+        driver.learn()
+        learned = len(driver.estimates)
+        for count in range(1, KILLED + 1):
+            driver.run_until(lambda: workers_of(controller), 'a worker')
+            (pid,) = workers_of(controller)
+            os.kill(pid, signal.SIGKILL)
+            driver.run_until(
+                lambda: driver.value('processes for fits that died') == count,  # noqa: B023
+                'its death is told',
+            )
+        assert driver.says('the process that makes the fits died')
+        driver.run_until(lambda: workers_of(controller), 'another worker')
+        held = np.array([message.data[:3] for message in driver.estimates[learned:]])
+        assert np.abs(held / [1.3, 3.0, -3.0] - 1.0).max() < 0.02
+        driver.check_sanity()
+        assert controller.stop() == 0
+        assert 'Traceback' not in controller.stderr
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
+def test_no_worker_outlives_its_controller(tmp_path: Path, number: signal.Signals) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world, reports_applied=True, **UNCERTAIN)
+        driver.learn()
+        (pid,) = workers_of(controller)
+        controller.send(number)
+        driver.run_until(lambda: controller.process.poll() is not None, 'the end')
+        wait_until(lambda: not Path(f'/proc/{pid}').exists(), 'the end of the worker')
+        assert 'Traceback' not in controller.stderr
+
+
+def test_a_law_that_fits_nothing_has_no_worker(tmp_path: Path) -> None:
+    with ros_world(tmp_path) as world:
+        controller, driver = controller_and_driver(world, **{'estimator.law': 'lms'})
+        driver.run_until(lambda: len(driver.estimates) > 20, 'estimates')
+        assert workers_of(controller) == []
+        assert controller.stop() == 0
