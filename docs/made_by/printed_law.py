@@ -41,7 +41,8 @@ class PrintedLoop:
 
     def __init__(self, reading: Reading, start: Estimate = START) -> None:
         self.estimate = start
-        self._reading, self._bounds = reading, Bounds()
+        self._reading = reading
+        self._bounds = Bounds(c_r=(0.0, 100.0), c_l=(-100.0, 0.0))
         self._backlash, self._inverse = Backlash(*TRUE), BacklashInverse()
         self._w, self._u = start.c_r, 0.0
 
