@@ -181,7 +181,7 @@ def comparison_document(
         f'c_r = {scenario.get_float("backlash.c_r"):g}, '
         f'c_l = {scenario.get_float("backlash.c_l"):g}, '
         f'{scenario.get_str("waveform")} at {scenario.get_float("frequency"):g} rad/s, '
-        f'noise on y with standard deviation {noise:g}. Written by `compare --out docs`; '
+        f'noise on y with standard deviation {noise:g}. Written by `compare --out docs/results`; '
         'do not edit.',
         '',
         "- In the paper's structure y_m sets u_d, elsewhere y follows y_m scaled by |G| at its "
