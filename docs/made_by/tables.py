@@ -168,7 +168,8 @@ def _crossing_errors(run: RunRecord) -> str:
     for name in ('c_r', 'c_l'):
         true = run.column(f'true_{name}')[-1]
         error, std = run.column(name)[-1] - true, run.column(f'std_{name}')[-1]
-        cells.append(f'{_percent(error / true)} ({_percent(std / true)})')
+        deviation = 'first guess' if np.isnan(std) else _percent(std / true)
+        cells.append(f'{_percent(error / true)} ({deviation})')
     status = Status(int(run.column('status')[-1]))
     return ', '.join(cells) + ('' if status is Status.TRACKING else f', {status.word}')
 
