@@ -16,7 +16,13 @@ from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.protocol import Structure
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
-from backlash_ros.core.control.tracking.design import Weights, design, lq_gains, power_gain
+from backlash_ros.core.control.tracking.design import (
+    Weights,
+    better_design,
+    design,
+    lq_gains,
+    power_gain,
+)
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate
@@ -48,8 +54,8 @@ __all__ = [
     'build_structure', 'build_true_model', 'first_guess', 'known_before', 'law_fits', 'warnings_of',
 ]
 
-# What a process imports that makes fits.
-WORKER_MODULES = (fitted.__module__,)
+# What a process imports that makes fits and gains.
+WORKER_MODULES = (fitted.__module__, better_design.__module__)
 # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
 LITTLE_SMOOTHING = 0.1
 # Laws that belong to one structure, and why.
@@ -87,9 +93,9 @@ def build_controller(
 ) -> AdaptiveController:
     """The controller with the law and the structure that the parameters name.
 
-    estimate: to begin with, None for those that were known before. executor: where fits are made,
-    None for here. Raises ParameterError for parameters that contradict each other and for a G(z)
-    through which the backlash cannot be learned.
+    estimate: to begin with, None for those that were known before. executor: where fits and gains
+    are made, None for here. Raises ParameterError for parameters that contradict each other and for
+    a G(z) through which the backlash cannot be learned.
     """
     check_model(build_model(p))
     _check_first_guess(p)
@@ -99,12 +105,11 @@ def build_controller(
         p.get_float('inverse.direction_band'), p.get_float('inverse.take_up_rate') * period
     )
     _check_structure(p)
-    estimator = ESTIMATORS[p.get_str('estimator.law')](
-        p, estimate or known_before(p), executor or InlineExecutor()
-    )
+    executor = executor or InlineExecutor()
+    estimator = ESTIMATORS[p.get_str('estimator.law')](p, estimate or known_before(p), executor)
     return AdaptiveController(
         estimator, build_structure(p), inverse, build_limits(p), p.get_bool('plant.adapt'),
-        _serial(p),
+        _serial(p), executor,
     )
 
 

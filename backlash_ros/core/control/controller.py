@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor, Future
 from dataclasses import replace
 from math import inf
 from typing import NamedTuple
@@ -13,6 +12,7 @@ from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
 from backlash_ros.core.control.protocol import ControlInput, Structure
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimation.executor import LOST, Channel, Executor, Failure, InlineExecutor
 from backlash_ros.core.law import Interval, Law, StateSource
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -42,11 +42,13 @@ class AdaptiveController:
     compensating: False inverts the slope alone, as if there were no gap.
     redesign: whether the structure is designed anew for the better models of G that the estimator
     proposes. serial: the motor and G as the structure sees them; None where v is what it commands.
+    executor: where it is designed, None for here. failed_designs: those without a result.
     """
 
     def __init__(
         self, estimator: Law, structure: Structure, inverse: BacklashInverse,
         limits: Limits, redesign: bool = False, serial: SerialPlant | None = None,
+        executor: Executor | None = None,
     ) -> None:
         self.estimator, self.structure = estimator, structure
         self.inverse, self.limits = inverse, limits
@@ -57,8 +59,9 @@ class AdaptiveController:
         self._redesign, self._serial = redesign, serial
         self._considered: StateModel | None = None  # the proposal that was designed for last
         self._designed: StateModel | None = None  # that, with the motor in front
-        self.executor: Executor | None = None  # makes gains in another process, None: here
-        self._making: Future[object | None] | None = None
+        self.failed_designs = 0
+        self._executor = executor or InlineExecutor()
+        self._channel: Channel | None = None  # for designs, from the first one on
         self._gains: object | None = None  # that were made, until they may take over
         self._waited = 0  # samples for which it could not
         self._interval: Interval | None = None  # that which began with the newest command
@@ -111,8 +114,10 @@ class AdaptiveController:
         return v if self._serial is None else self._serial.command_of(v)
 
     def close(self) -> None:
-        """Give back what the estimator holds elsewhere."""
+        """Give back what estimator and designs hold elsewhere."""
         self.estimator.close()
+        if self._channel is not None:
+            self._channel.close()
 
     def start_from(self, v: float) -> None:
         """Say which command acts now, so that the first one goes on from there."""
@@ -144,17 +149,17 @@ class AdaptiveController:
         if self._redesign:
             self._make_gains()
 
+    @property
+    def designing(self) -> bool:
+        """Whether gains for a better model of G are being made."""
+        return self._channel is not None and self._channel.busy
+
     def _make_gains(self) -> None:
         """Have gains made for the newest proposal, and use them when the structure may change."""
+        self._take_gains()
         proposal = self.estimator.proposal
         if proposal is not None and proposal is not self._considered:
-            self._considered, self._waited = proposal, 0
-            self._designed = proposal if self._serial is None else self._serial.before(proposal)
-            make = self.structure.redesign(self._designed)
-            self._making = None if self.executor is None else self.executor.submit(make)
-            self._gains = make() if self.executor is None else None
-        if self._making is not None and self._making.done():
-            self._gains, self._making = self._making.result(), None
+            self._design_for(proposal)
         if self._gains is None:
             return
         self._waited += 1
@@ -168,6 +173,28 @@ class AdaptiveController:
                 self._serial.adopt(self._designed)
             self.structure.adopt(self._gains, self._source)
             self._gains = None
+
+    def _design_for(self, proposal: StateModel) -> None:
+        """Have gains made for a model of G, once those for the one before are there."""
+        channel = self._channel = self._channel or self._executor.open()
+        if channel.busy:
+            return
+        self._considered, self._gains, self._waited = proposal, None, 0
+        self._designed = proposal if self._serial is None else self._serial.before(proposal)
+        channel.submit(self.structure.redesign(self._designed))
+        self._take_gains()
+
+    def _take_gains(self) -> None:
+        """Take up gains that are finished; None where the present ones are safer."""
+        if self._channel is None or not self._channel.busy:
+            return
+        gains = self._channel.poll()
+        if not isinstance(gains, Failure):
+            self._gains = gains
+        elif gains.kind == LOST:
+            self._considered = None  # the same again, by another worker
+        else:
+            self.failed_designs += 1
 
     def _learn(
         self, y: float, interval: Interval, lost: int, applied: Sequence[float],

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from functools import lru_cache
 from math import hypot, inf, nan
 from typing import NamedTuple
 
@@ -50,28 +51,41 @@ class Proposal(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """What comes of a fit: what is believed, where play and G stand, a better G if there is one."""
+    """What comes of a fit: what is believed, where play and G stand, a better G if there is one.
+
+    gains: of the observer of the G whose state is wanted, where they were asked for.
+    """
 
     belief: Belief
-    place: Place | None
-    proposal: Proposal | None
+    place: Place | None = None
+    proposal: Proposal | None = None
+    gains: Gains | None = None
 
 
 def fitted(
     samples: Samples, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
+    with_gains: bool,
 ) -> Fitted:
     """What is believed with these samples: the job that is done beside the loop.
 
     model: the G whose state the structure wants. proposed: xi (K,) of the newest proposal.
+    with_gains: whether the gains of the observer of `model` are wanted.
     """
     record = with_swapped(Record(samples.first, *samples.columns), before.swapped)
     belief = learn(setup, record.since(max(before.first, record.end - LONGEST)), before)
     if belief.fit is None or belief.published is None:
-        return Fitted(belief, None, None)
+        return Fitted(belief)
     part = with_swapped(record, belief.swapped - before.swapped)
     part = part.since(belief.first).until(belief.end)
     place = place_of(belief.fit, part, model, setup.family.memory)
-    return Fitted(belief, place, _proposal(setup, belief, proposed))
+    gains = _gains_of(tuple(model.numerator), tuple(model.denominator)) if with_gains else None
+    return Fitted(belief, place, _proposal(setup, belief, proposed), gains)
+
+
+# Remembered: where jobs are done at once, every run of a process would make them anew.
+@lru_cache(maxsize=16)
+def _gains_of(numerator: tuple[float, ...], denominator: tuple[float, ...]) -> Gains:
+    return gains_of(StateModel(TransferFunction(numerator, denominator)))
 
 
 def _proposal(setup: Setup, belief: Belief, proposed: Array) -> Proposal | None:
@@ -283,7 +297,8 @@ class MovingHorizon(Law):
         count, proposal = self._setup.family.count, self._proposal
         proposed: Array = np.zeros(count) if proposal is None else proposal.xi
         channel.submit(
-            fitted, self._setup, self._belief, self.model.transfer_function, proposed
+            fitted, self._setup, self._belief, self.model.transfer_function, proposed,
+            self._following.gains is None,
         )
         self._take(channel.poll())
 
@@ -309,6 +324,8 @@ class MovingHorizon(Law):
         while len(self._newer) > self._end - belief.end:
             self._newer.popleft()
         if result.place is not None and belief.fit is not None:
+            if result.gains is not None and self._following.is_of(result.place):
+                self._following.gains = result.gains
             self._go_on_from(belief, belief.fit, result.place)
 
     def _publish(self, belief: Belief, values: Array) -> None:

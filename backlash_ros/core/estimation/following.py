@@ -76,15 +76,16 @@ def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
 class Following:
     """Follows play operator and state of G from sample to sample.
 
-    model: G of the structure that asks for x_hat. before: gives it until a backlash is known. u:
-    before the newest y; nan before a backlash is known. innovation: of the newest y.
-    since_motion: samples since p, or v before a backlash is known, moved. outliers: readings that
-    did not move the state. surprised: whether so many in a row were beyond the gate that they
-    are none.
+    model: G of the structure that asks for x_hat. gains: of its observer, None where they are made
+    one by one. before: gives x_hat until a backlash is known. u: before the newest y; nan before a
+    backlash is known. innovation: of the newest y. since_motion: samples since p, or v before a
+    backlash is known, moved. outliers: readings that did not move the state. surprised: whether so
+    many in a row were beyond the gate that they are none.
     """
 
     def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
         self.model = model
+        self.gains: Gains | None = None
         self.u = self.innovation = nan
         self.since_motion = self.outliers = 0
         self.surprised = False
@@ -93,7 +94,6 @@ class Following:
         self._p = self._v = nan
         self._d = 0.0
         self._beyond = 0  # readings in a row beyond the gate
-        self._gains: Gains | None = None  # of `model`, where they are known already
         self._u: deque[float] = deque(maxlen=REMEMBERED)  # over the newest samples
         self._y: deque[float] = deque(maxlen=REMEMBERED)
 
@@ -119,7 +119,7 @@ class Following:
 
     def change_model(self, model: StateModel, gains: Gains | None) -> None:
         """Give x_hat for this G from now on; gains: of its observer."""
-        self.model, self._gains = model, gains
+        self.model, self.gains = model, gains
         if self._before is not None:
             self._before = self._before.with_model(model)
         if self._observer is not None:
@@ -129,6 +129,14 @@ class Following:
             if np.isfinite(y).sum() > model.order:
                 x = state_after(model.transfer_function, np.array(self._u), y)
                 self._observer.place(x, True)
+
+    def is_of(self, place: Place) -> bool:
+        """Whether a place is one of this G."""
+        own, of = self.model.transfer_function, place.model
+        return of is own or (
+            np.array_equal(of.denominator, own.denominator)
+            and np.array_equal(of.numerator, own.numerator)
+        )
 
     def settle(self, noise_std: float) -> None:
         """Let the gain of the observer adapt where no fit says where the state is."""
@@ -181,7 +189,7 @@ class Following:
         """
         observer = self._observer
         if observer is None:
-            observer = self._observer = Observer(self.model, noise_std, None, self._gains)
+            observer = self._observer = Observer(self.model, noise_std, None, self.gains)
         else:
             observer.settle(noise_std)
         gap = estimate.c_r - estimate.c_l
@@ -190,8 +198,7 @@ class Following:
         self._y.clear()
         self._u.extend(place.u.tolist())
         self._y.extend(place.y.tolist())
-        follows = place.model is self.model.transfer_function \
-            or np.array_equal(place.model.denominator, self.model.transfer_function.denominator)
+        follows = self.is_of(place)
         if follows:
             observer.place(place.x, known)
         for v, y in newer:

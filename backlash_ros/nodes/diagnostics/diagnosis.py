@@ -190,6 +190,7 @@ def _of_the_fit(loop: ControlLoop) -> dict[str, object]:
         'outliers': report.outliers,
         'commands found to be late': report.reattributed,
         'failed fits': report.failed_fits,
+        'failed designs': loop.core.failed_designs,
         'processes for fits that died': loop.executor.restarts,
         'G(z)': 'as told' if _same(learned.transfer_function, loop.told) else 'learned',
     }
