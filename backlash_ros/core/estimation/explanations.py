@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 CANDIDATES = 3  # best gaps of a search that are fitted
+BEGINNINGS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
 APART = 0.02  # relative difference of two gaps that are two candidates
 FAR_BEHIND = 30.0  # log-likelihood by which a candidate is given up after a few steps
 BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
@@ -141,7 +142,22 @@ def afresh(
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0:
         return best
+    best = _begun_elsewhere(p, best)
     return replace(p.with_intervals(best), spread=spread(best, fits))
+
+
+def _begun_elsewhere(p: Problem, f: Fit) -> Fit:
+    """The fit, or one with another beginning: y has a minimum wherever v has turned meanwhile."""
+    first = float(p.v[0])
+    likeliest, value = f, p.log_posterior(f) + 1.0
+    weights = p.weights(p.output(f))
+    for share in BEGINNINGS:
+        other = replace(f, p0=first + share * f.gap, x=np.zeros(len(f.x)))
+        other = replace(other, x=p.state(other))
+        of_other = p.log_posterior(other, weights)
+        if of_other > value:
+            likeliest, value = other, of_other
+    return f if likeliest is f else p.finished(p.fitted(likeliest))
 
 
 def spread(best: Fit, fits: list[Fit]) -> Array:

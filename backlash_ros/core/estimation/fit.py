@@ -376,18 +376,20 @@ class Problem:
             weights = self.weights(self.output(f))
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
-            new = self.step(f, 1.0 if k < FAR_STEPS < steps else np.inf)
-            new.theta[2] = min(max(new.theta[2], 0.0), 2.0 * float(np.ptp(self.v)))
-            if self.start is None:
-                first = float(self.v[0])
-                new = replace(new, p0=min(max(new.p0, first), first + new.gap))
-            furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-            length = min(LONGEST_STEP / furthest, 1.0) if furthest else 1.0
-            there = _between(f, new, length)
+            most = 1.0 if k < FAR_STEPS < steps else np.inf
+            new = self._kept(self.step(f, most))
+            there = _towards(f, new)
             value = self.log_posterior(there, weights)
+            if not value > best - 0.5:
+                # Beyond a kink of the play, where another side was engaged, it may be better.
+                again = _towards(there, self._kept(self.step(there, most)))
+                of_again = self.log_posterior(again, weights)
+                if of_again > best:
+                    there, value = again, of_again
+            length = 1.0
             while not value > best - 0.5 and length > SHORTEST_STEP:
                 length *= 0.3
-                there = _between(f, new, length)
+                there = _towards(f, new, length)
                 value = self.log_posterior(there, weights)
             if not value > best - 50.0:  # f stands: only its posterior is new
                 return replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
@@ -398,6 +400,15 @@ class Problem:
             if moved < LEAST_MOVE * (1 if steps > FEW_STEPS else 10) and value - best < LEAST_GAIN:
                 break
         return f
+
+    def _kept(self, f: Fit) -> Fit:
+        """The same with its gap and its beginning where they can be."""
+        gap = min(max(f.gap, 0.0), 2.0 * float(np.ptp(self.v)))
+        theta = np.concatenate([f.theta[:2], [gap], f.theta[3:]])
+        if self.start is not None:
+            return replace(f, theta=theta)
+        first = float(self.v[0])
+        return replace(f, theta=theta, p0=min(max(f.p0, first), first + gap))
 
     def _noise_of(self, f: Fit) -> float:
         y = self.output(f)
@@ -487,8 +498,13 @@ def _hats(count: int) -> Array:
     return np.array([np.interp(np.arange(count), at, row) for row in np.eye(KNOTS + 1)[1:]])
 
 
-def _between(f: Fit, new: Fit, length: float) -> Fit:
-    """The values this share of the way from f to new, with the posterior of new."""
+def _towards(f: Fit, new: Fit, share: float = 1.0) -> Fit:
+    """The values this share of the way from f to new, with the posterior of new.
+
+    G moves by no more than LONGEST_STEP at once.
+    """
+    furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
+    length = share * (min(LONGEST_STEP / furthest, 1.0) if furthest else 1.0)
     order = max(len(f.x), len(new.x))
     old, x = (np.pad(each.x, (0, order - len(each.x))) for each in (f, new))
     knots = f.knots if len(f.knots) == len(new.knots) else np.zeros(len(new.knots))
