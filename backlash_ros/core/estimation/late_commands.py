@@ -5,8 +5,8 @@ what G makes of that. With s of that in the residuals r of the fit, the other co
 
     (s.r - s.s / 2) / sigma^2
 
-more likely, less the log-odds against it. The likeliest is believed first, and the rest compared
-again, until none is likely.
+more likely, less the log-odds against it; of both r and s, what other unknowns may explain is left
+out. The likeliest is believed first, and the rest compared again, until none is likely.
 
 Reference: A. S. Willsky, H. L. Jones, A generalized likelihood ratio approach to the detection and
 estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1976) 108-112.
@@ -44,11 +44,17 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     b, a = problem.family.at(fit.xi)
     reach = problem.family.memory
     chosen: set[int] = set()
-    residual = np.nan_to_num(problem.residual(fit))
+    y = problem.output(fit)
+    known = problem.known.astype(np.float64)
+    jacobian = problem.jacobian(fit, y) * known[:, None]
+    size = np.maximum(np.abs(jacobian).max(axis=0), 1e-300)
+    q = np.linalg.qr(jacobian / size)[0]
+    residual = (problem.y - y) * known
     v, other = record.v.copy(), record.other.copy()
     p = play(v, fit.gap, fit.p0)
     odds = log(COMMAND_ODDS)
     for _ in range(MOST):
+        rest = residual - q @ (q.T @ residual)
         best, place, change = 0.0, -1, residual[:0]
         for k in open_.tolist():
             moved = _change(v, other, p, k, reach, fit)
@@ -56,8 +62,10 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
                 continue
             s = lfilter(b, a, fit.m * moved)
             end = k + len(s)
-            seen = s * problem.known[k:end]
-            gain = float(seen @ residual[k:end] - 0.5 * seen @ seen) / fit.noise**2
+            seen = s * known[k:end]
+            explained = q[k:end].T @ seen
+            gain = float(seen @ rest[k:end] - 0.5 * (seen @ seen - explained @ explained))
+            gain /= fit.noise**2
             gain -= odds if (record.first + k in back) == (k in chosen) else -odds
             if gain > best:
                 best, place, change = gain, k, s
@@ -65,7 +73,8 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
             break
         v[place], other[place] = other[place], v[place]
         chosen ^= {place}
-        residual[place:place + len(change)] -= change
+        end = place + len(change)
+        residual[place:end] -= change * known[place:end]
         p = play(v, fit.gap, fit.p0)
     return frozenset(record.first + k for k in chosen)
 

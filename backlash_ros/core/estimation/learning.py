@@ -260,12 +260,13 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
     assert held is not None
     count, new = len(record.v), before.end - record.first
     problem = _problem(setup, record, before)
+    fit = problem.fitted(held, FEW_STEPS)
     since = before.end - setup.family.memory
-    record, others = likelier(problem, held, record, since, before.swapped)
+    record, others = likelier(problem, fit, record, since, before.swapped)
     if others != before.swapped:
         before = replace(before, swapped=others)
         problem = _problem(setup, record, before)
-    fit = problem.fitted(held, FEW_STEPS)
+        fit = problem.fitted(fit, FEW_STEPS)
     z = problem.residual(fit)[new:] / held.noise
     wild = outliers(z)
     if wild.any():
