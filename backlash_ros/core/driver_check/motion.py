@@ -35,7 +35,8 @@ DELAY, SIGN, MODEL, NOISE, BACKLASH = (
 )
 MOTION_SUBJECTS = (DELAY, SIGN, MODEL, NOISE, BACKLASH)
 
-DECISIVE = 10.0  # log-likelihood by which one delay beats another
+DECISIVE = 3.0  # log-likelihood by which one delay beats another
+SURE = 10.0  # log-likelihood by which one sample period beats another
 PREDICTED = 0.9  # share of the motion of y that G has to predict
 BOUND_SLACK = 0.01  # of a value that lies outside its bounds without harm
 NOISIER = 3.0  # times the given deviation of the noise
@@ -150,6 +151,12 @@ def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
             BACKLASH, f'y shows nothing of v, which swung by {swing:.4g}',
             'let v swing wider than the gap; see that the driver applies v',
         )
+    if fit.reversals == 0 and fit.predicted >= PREDICTED:
+        # Without a turn of the play, lag and delay take up what the gap does.
+        return _only(
+            BACKLASH, f'not identifiable from this motion: v swung by {swing:.4g} on one side',
+            'swing v past the gap in both directions, several times; raise --duration',
+        )
     unlike = fit.predicted < PREDICTED or _odd(fit, record.lag, p)
     if unlike or fit.error_scale > FAR:
         other = _other_period(fit, record, p)
@@ -208,7 +215,7 @@ def _mismatch(fit: RecordFit, other: float | None, p: Parameters) -> tuple[str, 
 def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None:
     """Sample period [s] for which the poles of G fit to within plant.uncertainty, or far better."""
     later = Record(record.v[MORE_DELAY:], record.y[MORE_DELAY:], record.lag)
-    others: list[tuple[float, float]] = []
+    others: list[tuple[float, float, float]] = []
     for ratio in OTHER_PERIODS:
         denominator = np.real(np.poly(fit.nominal.poles.astype(complex) ** ratio)).tolist()
         other = TransferFunction(fit.nominal.numerator.tolist(), denominator)
@@ -217,9 +224,13 @@ def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None
         # The zeros are still those of the other period: G may be off by more, if it explains more.
         fits = refit.error_scale <= 1.0 or refit.evidence > fit.evidence + DECISIVE
         if refit.predicted >= PREDICTED and fits:
-            others.append((refit.evidence, ratio))
-    best, ratio = max(others, default=(-inf, 1.0))
-    return p.get_float('sample_period') / ratio if best > fit.evidence - DECISIVE else None
+            others.append((refit.evidence, refit.error_scale, ratio))
+    best = max((evidence for evidence, _, _ in others), default=-inf)
+    if best <= fit.evidence - DECISIVE:
+        return None
+    # Of those that fit alike the one that is least off.
+    _, ratio = min(other[1:] for other in others if other[0] > best - SURE)
+    return p.get_float('sample_period') / ratio
 
 
 def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:

@@ -133,7 +133,8 @@ class ReferenceWindow:
         for i, fit in enumerate(self._parabolas):
             w = len(fit) // 2
             rest = fit @ came[at - w:at + w + 1]
-            mean_square = float(rest @ rest) / ((2 * w - 2) * noise * noise)
+            of_noise = rest / noise  # its square may be too small for a number
+            mean_square = float(of_noise @ of_noise) / (2 * w - 2)
             share = (NO_PARABOLA - mean_square) / (NO_PARABOLA - PARABOLA)
             if share > 0.0:
                 share = min(share, 1.0)
