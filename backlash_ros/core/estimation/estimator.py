@@ -287,6 +287,7 @@ class MovingHorizon(Law):
     def refine(self, budget_s: float = inf) -> None:
         """Take up a fit that is finished, and have the record fitted where that is due."""
         channel = self._channel
+        channel.tend()
         if channel.busy:
             self._take(channel.poll())
         due = self._end >= self._belief.next_at or self._following.surprised

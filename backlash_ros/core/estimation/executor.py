@@ -64,7 +64,10 @@ class Channel(ABC):
     def append(self, *values: float) -> None:
         """Append a sample to the record."""
         self._appended.extend(values)
-        if len(self._appended) >= BLOCK * self._quantities:
+
+    def tend(self) -> None:
+        """Do what `append` leaves undone; for whenever nothing waits for the caller."""
+        if self._quantities and len(self._appended) >= BLOCK * self._quantities:
             self._hand_over()
 
     def submit(self, job: Job, *args: Any) -> bool:

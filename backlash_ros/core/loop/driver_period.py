@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from itertools import pairwise
 from math import nan, sqrt
-from statistics import mean, median
 from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 FEWEST = 20  # intervals
 # What the period is fitted to: the newest stamps of this time, and at most so many.
-WINDOW_NS, STAMPS = 2_000_000_000, 1000
+WINDOW_S, STAMPS = 2.0, 1000
 OTHER_PACE = 0.25  # share by which typical intervals differ from the period where they are no such
 # Share of the period by which stamps may scatter: beyond, as of a driver that is held up all the
 # time, nobody can tell from them which samples were left out.
@@ -72,24 +75,21 @@ class DriverPeriod:
         begin = len(stamps) - FEWEST - 1
         if begin < 0:
             return UNKNOWN_PERIOD
-        while begin > 0 and stamps[begin - 1] >= stamps[-1] - WINDOW_NS:
-            begin -= 1
-        times = [1e-9 * (stamp - stamps[begin]) for stamp in stamps[begin:]]
-        steps = [b - a for a, b in pairwise(times)]
-        ordered = sorted(steps)
+        times = 1e-9 * np.array([float(stamp - stamps[-1]) for stamp in stamps])
+        early = np.flatnonzero(times[:begin] < -WINDOW_S)
+        times = times[early[-1] + 1 if len(early) else 0:]
+        steps = np.diff(times)
+        ordered = np.sort(steps)
         quarter = len(ordered) // 4
-        typical = mean(ordered[quarter:-quarter])
+        typical = float(ordered[quarter:-quarter].mean())
         if not abs(typical / self.nominal_s - 1.0) < OTHER_PACE:
             return UNKNOWN_PERIOD
-        numbers = [0]
-        for step in steps:
-            numbers.append(numbers[-1] + round(step / self.nominal_s))
-        found = _slope(numbers, times)
+        found = _slope(np.append(0.0, np.rint(steps / self.nominal_s)).cumsum(), times)
         if found.mean > 0.0:
-            found = _slope(_numbered(times, found.mean), times)
+            found = _slope(np.array(_numbered(times.tolist(), found.mean), float), times)
         if not (found.mean > 0.0 and found.scatter < SCATTERED * self.nominal_s):
             return UNKNOWN_PERIOD
-        return found._replace(median=median(ordered))
+        return found._replace(median=float(np.median(ordered)))
 
 
 def _numbered(times: list[float], period_s: float) -> list[int]:
@@ -103,13 +103,11 @@ def _numbered(times: list[float], period_s: float) -> list[int]:
     return numbers
 
 
-def _slope(numbers: list[int], times: list[float]) -> Period:
-    middle, centre = mean(numbers), mean(times)
-    spread = sum((number - middle)**2 for number in numbers)
+def _slope(numbers: Array, times: Array) -> Period:
+    n, t = numbers - numbers.mean(), times - times.mean()
+    spread = float(n @ n)
     if not spread:
         return UNKNOWN_PERIOD
-    slope = sum((n - middle) * (t - centre) for n, t in zip(numbers, times, strict=True)) / spread
-    rest = sum(
-        (t - centre - slope * (n - middle))**2 for n, t in zip(numbers, times, strict=True)
-    ) / len(times)
+    slope = float(n @ t) / spread
+    rest = float(np.mean((t - slope * n)**2))
     return Period(slope, sqrt(HELD_UP * rest / spread), scatter=sqrt(rest))

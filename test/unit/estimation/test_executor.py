@@ -60,6 +60,7 @@ def test_a_job_gets_all_samples_up_to_its_submission(count: int) -> None:
     channel = InlineExecutor().open(2, 10_000)
     for k in range(count):
         channel.append(k, -k)
+        channel.tend()
     assert channel.submit(everything, 'x')
     channel.append(7.0, 7.0)
     assert channel.poll() == (0, [[*range(count)], [-k for k in range(count)]], 'x')
