@@ -30,5 +30,5 @@ def test_few_samples_after_a_rest_neither_replace_nor_widen_what_was_known() -> 
         if k >= MOVES + RESTS:
             now = estimator.estimate
             assert now.c_r - now.c_l == pytest.approx(before.c_r - before.c_l, abs=0.01)
-            assert now.std_c_r + now.std_c_l < 0.03  # 0.04 was known
+            assert now.std_c_r + now.std_c_l <= 0.04 + 1e-9  # as was known
     assert now.status is not Status.NOT_EXCITED
