@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -189,8 +188,9 @@ def is_known(setup: Setup, f: Fit, turns: int) -> bool:
     factor = 1.0 / SYSTEMATIC if systematic else 1.0
     std_gap = f.gap_std
     no_gap = f.gap < BY_CHANCE * std_gap and f.gap + BY_CHANCE * std_gap < NO_GAP * setup.guess
-    slope_known = sqrt(float(f.crossings_cov[0, 0])) < factor * STD_SLOPE * f.m
-    return slope_known and (std_gap < factor * STD_GAP * f.gap or no_gap)
+    std_m, *of_crossings = np.sqrt(np.maximum(np.diag(f.crossings_cov), 0.0)).tolist()
+    gap_known = max(std_gap, *of_crossings) < factor * STD_GAP * f.gap
+    return std_m < factor * STD_SLOPE * f.m and (gap_known or no_gap)
 
 
 def outside_bounds(bounds: Bounds, f: Fit) -> list[bool]:

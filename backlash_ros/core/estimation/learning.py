@@ -189,7 +189,11 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
     ):
         # A first estimate has to be found twice: some samples alone may mislead.
         return replace(after, candidate=found, next_at=record.end + max(count // BLOCKS, FEWEST))
-    return _adopted(setup, part, found, replace(after, older=None, start=None))
+    # What leaves correlated residuals must predict a quarter as many samples before it is believed.
+    systematic = found.count * found.correlation > 1.0
+    foretold = min(FORETOLD - len(part.v) // 4, 0) if systematic else before.foretold
+    after = replace(after, older=None, start=None, foretold=foretold)
+    return _adopted(setup, part, found, after)
 
 
 def _coasts(problem: Problem, fit: Fit, known: Array | None) -> bool:

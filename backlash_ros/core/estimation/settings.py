@@ -7,7 +7,7 @@ from __future__ import annotations
 
 # --- what counts as known
 STD_SLOPE = 0.2  # standard deviation of m over m, below which an estimate is published
-STD_GAP = 0.3  # standard deviation of the gap over the gap, below which it is published
+STD_GAP = 0.3  # standard deviation of gap and crossings over the gap, below which it is published
 SYSTEMATIC = 3.0  # factor by which both are smaller while residuals are correlated
 NO_GAP = 0.1  # upper end of a gap that counts as none, over the gap of the first guess
 REVERSALS = 2  # changes of the engaged side before a first estimate where G is uncertain
