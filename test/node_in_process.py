@@ -26,6 +26,7 @@ from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
 from backlash_ros.core.assembly import build_plant, build_reference
+from backlash_ros.core.estimation.executor import InlineExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import JointOutputs, Output
 from backlash_ros.core.parameters import Parameters
@@ -50,6 +51,8 @@ def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode
     rclpy.init(args=arguments, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     try:
         node = ControllerNode()
+        # Samples come as fast as they are computed: a worker would fall behind them.
+        node._executor = InlineExecutor()
         try:
             yield node
         finally:

@@ -136,6 +136,7 @@ class MovingHorizon(Law):
         self._model_known_before = initial.learned  # G was identified together with the backlash
         self._proposal: Proposal | None = None
         self._adapting, self._lost_in_a_row, self._failed_fits = True, 0, 0
+        self._reattributed = 0  # intervals so far over which the other command acted
         self._skipping_fit = False  # whether the fit under way is of a record that was given up
 
     # --- what it says ----------------------------------------------------------------------------
@@ -194,7 +195,7 @@ class MovingHorizon(Law):
             wrong_sign=belief.tried is not None and belief.tried.m < 0.0,
             waiting=self._end - belief.end,
             outliers=self._following.outliers,
-            reattributed=len(belief.swapped),
+            reattributed=self._reattributed,
             failed_fits=self._failed_fits,
         )
 
@@ -315,6 +316,7 @@ class MovingHorizon(Law):
             self._belief = replace(self._belief, next_at=self._end + FEWEST)
             return
         before, self._belief = self._belief, result.belief
+        self._reattributed += len(result.belief.swapped - before.swapped)
         belief = result.belief
         if belief.published is not None and (
             belief.published is not before.published or belief.coasts is not before.coasts

@@ -439,7 +439,9 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
     prior = known.cov + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
     if not agree(fit.crossings, known.crossings, cov + prior):
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
-        if std < REPLACING * fit.gap and belief.foretold >= FORETOLD:
+        # A gear that is no play leaves systematic residuals, and denies nothing.
+        sure = std < REPLACING * fit.gap and fit.count * fit.correlation <= 1.0
+        if sure and belief.foretold >= FORETOLD:
             belief = replace(belief, inherited=None)  # it was that of another plant
         return replace(belief, reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
