@@ -436,11 +436,14 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
     cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
     gap = known.crossings[1] - known.crossings[2]
     of_motion = (LOST_MOTION * gap) ** 2 / 2.0
-    prior = known.cov + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
+    prior = known.cov + 1e-18 * np.diag(known.crossings**2 + gap**2)
+    if not agree(fit.crossings, known.crossings, cov + prior):
+        prior = prior + np.diag([(0.01 * known.crossings[0]) ** 2, of_motion, of_motion])
     if not agree(fit.crossings, known.crossings, cov + prior):
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
         # A gear that is no play leaves systematic residuals, and denies nothing.
-        sure = std < REPLACING * fit.gap and fit.count * fit.correlation <= 1.0
+        white = fit.count * fit.correlation <= 1.0 and fit.noise < AS_GOOD * _noise(setup, fit)
+        sure = std < REPLACING * fit.gap and white and fit.turns >= HELD_REVERSALS
         if sure and belief.foretold >= FORETOLD:
             belief = replace(belief, inherited=None)  # it was that of another plant
         return replace(belief, reason=Status.INCONSISTENT)
@@ -455,6 +458,11 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
         belief, published=joined, cov=left,
         reason=Status.INCONSISTENT if wrong else Status.TRACKING,
     )
+
+
+def _noise(setup: Setup, fit: Fit) -> float:
+    """Standard deviation of a reading as configured, or as its step makes it."""
+    return max(setup.noise_std, fit.step / sqrt(12.0))
 
 
 # --- DOUBTED ----------------------------------------------------------------------------------
