@@ -74,6 +74,9 @@ def run_with_lost_commands(seed: int) -> RunRecord:
     return loop.run(1500)
 
 
+@pytest.mark.xfail(
+    strict=True, reason='*tracking* is said of wrong estimates where nobody reports lost commands',
+)
 def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate() -> None:
     wrong = []
     for seed in range(3, 11):
