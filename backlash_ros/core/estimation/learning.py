@@ -55,6 +55,7 @@ from backlash_ros.core.estimation.settings import (
     LOST_MOTION,
     MISFIT,
     OUTLIER_SHARE,
+    UNEXPLAINED,
 )
 
 Array = NDArray[np.float64]
@@ -450,7 +451,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
     gain = prior @ np.linalg.pinv(cov + prior)
     joined = known.crossings + gain @ (fit.crossings - known.crossings)
     systematic = fit.count * fit.correlation > 1.0 and setup.family.count > 0
-    wrong = systematic and fit.unexplained > 0.1
+    wrong = systematic and fit.unexplained > UNEXPLAINED
     left = prior - gain @ prior
     if np.trace(left[1:, 1:]) > np.trace(known.cov[1:, 1:]):
         joined, left = known.crossings, known.cov  # agreement makes nothing less certain
