@@ -1,8 +1,8 @@
 """Regenerates every picture and every number of the documents: `make docs`.
 
 Pictures go to docs/images. Numbers go between the marks
-`<!-- name: made by docs/made_by/figures.py -->` and `<!-- end -->` of the pages; parameters.md and
-constants.md in docs/reference are written as a whole.
+`<!-- name: made by docs/made_by/figures.py -->` and `<!-- end -->` of the pages;
+docs/reference/parameters.md is written as a whole.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from generate_constants import write_constants
 from generate_parameters import write_parameters
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -225,7 +224,6 @@ def main() -> None:
     for name, draw in FIGURES.items():
         (IMAGES / f'{name}.png').write_bytes(png(draw()))
     write_parameters()
-    write_constants()
     for page in PAGES:
         fill_in(page)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 
 import combinations_of_laws
 import numpy as np
-from generate_constants import numbers_of
 from printed_law import (
     Reading,
     error_growth,
@@ -185,10 +185,10 @@ def _percent(share: complex) -> str:
 
 
 def estimator_constants() -> str:
-    """What the method is tuned by, with the comments beside it, as it stands in the code."""
+    """What the method is tuned by, with the comment behind it, as it stands in the code."""
     rows = [
-        (', '.join(f'`{name}`' for name in found.names), f'`{found.value}`', found.meaning)
-        for found in numbers_of(SETTINGS)
+        (f'`{name}`', f'`{value}`', meaning) for name, value, meaning
+        in re.findall(r'^([A-Z_]+) = ([^#\n]+?) *# (.+)$', SETTINGS.read_text(), re.MULTILINE)
     ]
     return markdown(('constant', 'value', 'meaning'), rows)
 
