@@ -62,7 +62,7 @@ class Options:
     """What is compared. integrators: of G, without and with one. slope: m, where it is known, else
     1: m and the gain of G cannot be told apart. held_out: share of the record, its last."""
 
-    orders: Sequence[int] = (1, 2, 3, 4)
+    orders: Sequence[int] = (0, 1, 2, 3, 4)
     delays: Sequence[int] = (0, 1, 2, 3)
     integrators: Sequence[bool] = (False, True)
     slope: float = 1.0
@@ -164,15 +164,15 @@ def identifying(
     nothing = _nothing(v, y, sample_period, options)
     if nothing is not None:
         return nothing
-    first = max(options.delays) + 1
     part = busiest(v, y)
+    first = max(options.delays) + 1
     searched = Samples(v[part], y[part], first)
-    general = GENERAL._replace(taps=GENERAL.order + max(options.delays))
-    found = yield from _named('searching the gap', search(searched, general))
+    whole = GENERAL._replace(taps=GENERAL.order + max(options.delays))
+    found = yield from _named('searching the gap', search(searched, whole))
     wild = _outliers(searched, found[0])
     if wild.any():
         searched = searched.without(wild)
-        found = yield from _named('searching the gap again', search(searched, general))
+        found = yield from _named('searching the gap again', search(searched, whole))
     candidates = _distinct(found)[:2]
     compared = yield from _named('comparing orders and delays', compare(
         searched, [one.point for one in candidates], options.orders, options.delays,
@@ -185,11 +185,11 @@ def identifying(
             break
         # Only the best fit of all shows that a pole is none.
         compared = [one._replace(fit=best) if one is chosen else one for one in compared]
-    delays = equal_delays(compared, chosen)
+    alike = equal_delays(compared, chosen)
     rows = effective_rows(searched, best)
     # With as many poles, some of them may fit worse.
     others = [
-        one for one in _with_delays(searched, best, delays)
+        one for one in _with_delays(searched, best, alike)
         if rows * np.log(one.squares / max(best.squares, TINY)) <= PLATEAU
     ]
     best = yield from _named('choosing the delay', least_response(
@@ -352,7 +352,7 @@ def _described(
             'm': options.slope * gain_std, 'gap': verdict.gap_std,
             'c_r': float(np.sqrt(c_r_var + more)), 'c_l': float(np.sqrt(c_l_var + more)),
         },
-        numerator=tuple(numerator.tolist()), denominator=tuple(best.denominator.tolist()),
+        numerator=tuple(numerator.tolist()), denominator=_proper(best),
         delay=best.structure.delay,
         delays=tuple(sorted({*equal_delays(compared, chosen), best.structure.delay})),
         integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
@@ -387,6 +387,12 @@ def _observed(samples: Samples, best: Fit, step: float) -> Observed:
         samples.delayed(best.play.p, best.structure.delay), best.simulated,
         max(noise, step / np.sqrt(12.0)), best.point.gap,
     )
+
+
+def _proper(found: Fit) -> tuple[float, ...]:
+    """The denominator as parameters have it: z where G is a gain, for B acts a sample late."""
+    at_zero = found.structure.numerator_taps - found.structure.order
+    return (*found.denominator.tolist(), *[0.0] * at_zero)
 
 
 def _text(root: complex) -> str:

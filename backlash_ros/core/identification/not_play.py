@@ -238,8 +238,9 @@ def creep(o: Observed) -> str:
     fit = _Family(o.v, o.y)
     # Of a G that integrates, y is where it has been driven to.
     columns = fit.columns(o.p)
-    left = fit.squares(columns[:, :-1])[0]
-    solution = fit.squares(columns)[1]
+    left, without = fit.squares(columns[:, :-1])
+    # The integral of a p that is not about 0 on the average is a drift of its own.
+    solution = min(fit.squares(columns)[1], without, key=lambda one: abs(float(one[-3])))
     by_time = 2.0 * float(solution[-3])
     returning = float(np.ptp(fit.target - solution[-3] * fit.common[:, 1]))
     turns = float(np.abs(np.diff(o.p)).sum()) / (2.0 * max(float(np.ptp(o.p)), 1e-300))

@@ -76,6 +76,8 @@ def compare(
         for delay in delays:
             below: Fit | None = None
             for order in orders:
+                if order < integrator:
+                    continue
                 structure = Structure(order, delay, integrator)
                 below = _fit_from(train, structure, candidates, below)
                 whole = fit(samples, structure, below.point)
@@ -97,10 +99,10 @@ def compare(
 
 def selected(compared: Sequence[Compared]) -> Compared:
     """The structure that is taken."""
-    exact = [one for one in compared if one.exact]
+    needed = [one for one in compared if not gives_way(one.fit, compared)]
+    exact = [one for one in needed if one.exact]
     if exact:
         return min(exact, key=lambda one: (one.structure.unknowns, one.fit.squares))
-    needed = [one for one in compared if not gives_way(one.fit, compared)]
     least = min(one.held_out for one in needed)
     good = [one for one in needed if one.held_out <= WITHIN * least]
     return min(good, key=lambda one: one.criterion)

@@ -32,7 +32,7 @@ SINGULAR = 1e-13  # of columns of length 1
 class Structure(NamedTuple):
     """Number of poles, of which one may be an integrator; samples of v before it acts, less one.
 
-    taps: coefficients of B, as many as poles where 0.
+    taps: coefficients of B; where 0 as many as poles, one of G that is a gain (order 0).
     """
 
     order: int
@@ -48,7 +48,7 @@ class Structure(NamedTuple):
     @property
     def numerator_taps(self) -> int:
         """Coefficients of B."""
-        return self.taps or self.order
+        return self.taps or max(self.order, 1)
 
     @property
     def state_terms(self) -> int:

@@ -118,6 +118,11 @@ class Findings(NamedTuple):
         return float(np.ptp(self.observed.v))
 
     @property
+    def delay_at_edge(self) -> bool:
+        """Whether a longer delay may do better."""
+        return self.delay == self.longest_delay > 0
+
+    @property
     def rms(self) -> float:
         """Of the residual."""
         return float(np.sqrt(np.nanmean(self.observed.residual**2)))
@@ -138,6 +143,9 @@ def judge(f: Findings) -> Verdict:
     """The answers to three questions."""
     others = [_parted(text) for text in what_it_is(f.observed)]
     spread = float(np.hypot(f.gap_std, PER_UNEXPLAINED * f.unexplained))
+    if f.delay_at_edge:
+        # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
+        spread = float(np.hypot(spread, np.abs(np.diff(f.observed.v)).mean()))
     remarks = list(_remarks(f))
     backlash = _backlash(f, others, spread)
     if backlash.known and f.gap > SURE * spread:
@@ -284,10 +292,10 @@ def _remarks(f: Findings) -> list[str]:
     found = []
     if f.static < 0.0 and f.gain_std <= PRECISE:
         found.append('y moves against v: the gain of G is negative')
-    if f.delay == f.longest_delay and f.delay > 0:
+    if f.delay_at_edge:
         found.append(
-            f'the delay of {f.delay} samples is the longest that was compared: try '
-            f'--delay {f.delay}-{min(2 * f.delay + 4, 20)}'
+            f'the delay of {f.delay} samples is the longest that was compared, and the gap may '
+            f'have some of a longer one: try --delay {f.delay}-{min(2 * f.delay + 4, 40)}'
         )
     share = f.unexplained / f.gap if f.gap > 0.0 else 0.0
     if UNEXPLAINED < share <= 1.0:

@@ -44,9 +44,9 @@ def make_parser() -> argparse.ArgumentParser:
                         help='parameter file that the result goes on from: limits, topics, axes')
     parser.add_argument('--axis', default='', metavar='NAME',
                         help='of several: the one that is meant')
-    parser.add_argument('--order', type=_range_to(6, 1), default=(1, 2, 3, 4),
-                        metavar='N[-N]', help='numbers of poles that are compared (default: 1-4)')
-    parser.add_argument('--delay', type=_range_to(20, 0), default=(0, 1, 2, 3),
+    parser.add_argument('--order', type=_range_to(6, 0), default=(0, 1, 2, 3, 4),
+                        metavar='N[-N]', help='numbers of poles that are compared (default: 0-4)')
+    parser.add_argument('--delay', type=_range_to(40, 0), default=(0, 1, 2, 3),
                         metavar='N[-N]',
                         help='delays that are compared [samples] (default: 0-3)')
     parser.add_argument('--integrator', choices=sorted(INTEGRATORS), default='auto',

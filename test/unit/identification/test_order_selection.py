@@ -88,3 +88,18 @@ def test_a_slow_motion_of_a_motor_shows_no_integrator() -> None:
     assert not found.integrator
     assert found.denominator == pytest.approx([1.0, -1.2498, 0.5335], abs=1e-3)
     assert found.gap == pytest.approx(0.9, abs=1e-3)
+
+def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
+    rng = np.random.default_rng(8)
+    v = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
+    u = PlayRecord(v).output(0.4, 0.2).p - 0.1
+    y = np.append(np.zeros(3), 1.7 * u[:-3]) + 0.002 * rng.standard_normal(len(v))
+    found = identify(v, y, 0.02, Options((0, 1), (1, 2, 3)))
+    assert found.usable
+    assert (found.delay, found.denominator) == (2, (1.0, 0.0))
+    assert found.numerator == pytest.approx((1.7,), abs=0.01)
+    assert found.gap == pytest.approx(0.4, abs=3.0 * found.std['gap'])
+    # A delay that may be longer than all that were compared is no narrow gap.
+    edge = identify(v, y, 0.02, Options((0, 1), (0, 1)))
+    assert edge.std['gap'] > 0.9 * np.abs(np.diff(v)).mean()
+    assert any('longest that was compared' in text for text in edge.remarks)
