@@ -42,6 +42,7 @@ CANCELS = 0.02  # distance of a pole and a zero that cancel, relative to that of
 SLOWEST = 0.01  # ... which counts as this much at least: a zero at 1 cancels an integrator
 EPS = float(np.finfo(float).eps)
 ROUNDED = 2.0  # the simulated y, and the measured one, which may be a simulation as well
+AS_WELL = 4.0  # ratio of the squares left over: without noise, it shows a pole that is cancelled
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
 
 
@@ -100,7 +101,10 @@ def compare(
 def selected(compared: Sequence[Compared]) -> Compared:
     """The structure that is taken."""
     needed = [one for one in compared if not gives_way(one.fit, compared)]
-    exact = [one for one in needed if one.exact]
+    # What a pole near 1 rounds may hide noise: without it, y is explained as well.
+    exact = [one for one in compared if one.exact and not gives_way(one.fit, [
+        other for other in compared if other.fit.squares < AS_WELL * one.fit.squares
+    ])]
     if exact:
         return min(exact, key=lambda one: (one.structure.unknowns, one.fit.squares))
     least = min(one.held_out for one in needed)
