@@ -24,6 +24,7 @@ from backlash_ros.core.parameters.table import (
     BY_NAME,
     CONTROLLER,
     JOINTS,
+    NODE_WIDE,
     NODES,
     PARAMETERS,
     Parameter,
@@ -33,7 +34,6 @@ from backlash_ros.tools.cli import InputError
 
 ANY = '**'
 EVERY_NODE = f'/{ANY}'
-AXES = 'axes'
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,12 @@ class ParameterFile:
     @property
     def axes(self) -> tuple[str, ...]:
         """The axes that the file lists; raises InputError for two different lists."""
-        listing = [section for section in self.sections if AXES in section.values]
-        value = self._merged(listing).get(AXES, ())
-        assert isinstance(value, tuple)
-        return tuple(map(str, value))
+        return self._names('axes')
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints that the file lists; raises InputError for two different lists."""
+        return self._names(JOINTS)
 
     def check_axes(self, axes: Sequence[str]) -> None:
         """Raise InputError for a section that belongs to none of the axes of the run."""
@@ -87,6 +89,12 @@ class ParameterFile:
     def values(self, axis: str) -> dict[str, Value]:
         """Values for an axis by flat name, empty for a run without axes; raises InputError."""
         return self._merged([section for section in self.sections if section.is_for(axis)])
+
+    def _names(self, parameter: str) -> tuple[str, ...]:
+        listing = [section for section in self.sections if parameter in section.values]
+        value = self._merged(listing).get(parameter, ())
+        assert isinstance(value, tuple)
+        return tuple(map(str, value))
 
     def _merged(self, sections: Sequence[Section]) -> dict[str, Value]:
         merged: dict[str, Value] = {}
@@ -121,7 +129,7 @@ class Configuration:
     axes: tuple[str, ...]
 
     def parameters(self, axis: str = '') -> Parameters:
-        """Return the complete set: defaults, then the file, then --set, then --seed.
+        """Return the complete set of one loop: defaults, the file, then --set, then --seed.
 
         axis: one of the axes, or of the joints, empty only if there are none; raises InputError.
         """
@@ -131,24 +139,24 @@ class Configuration:
                 f'{self.file.path}: holds the joints {", ".join(joints)} of one controller: choose '
                 f'one of them, like --axis {joints[0]}, or start `controller` with the file itself'
             )
-        if joints:
-            return Parameters(self._values('')).of_joint(axis)
+        return self.of_controller('' if joints else axis).of_joint(axis)
+
+    def of_controller(self, axis: str = '') -> Parameters:
+        """Return the same for one controller, with what each of its joints has of its own."""
         check_axis(self.file, axis, self.axes)
-        return Parameters(self._values(axis))
+        values: dict[str, object] = dict(self.file.values(axis))
+        for meant in ('', axis):
+            values |= {s.name: s.value for s in self.settings if s.axis == meant}
+        values |= {f'{s.axis}.{s.name}': s.value for s in self.settings if s.axis in self.joints}
+        if self.seed is not None:
+            values['seed'] = self.seed
+        values.pop('axes', None)
+        return Parameters(values)
 
     @property
     def joints(self) -> tuple[str, ...]:
         """The joints of one controller, empty for a file without."""
-        return Parameters(self._values('')).get_strs(JOINTS) if not self.axes else ()
-
-    def _values(self, axis: str) -> dict[str, object]:
-        values: dict[str, object] = dict(self.file.values(axis))
-        for meant in ('', axis):
-            values.update({s.name: s.value for s in self.settings if s.axis == meant})
-        if self.seed is not None:
-            values['seed'] = self.seed
-        values.pop(AXES, None)
-        return values
+        return () if self.axes else self.file.joints
 
 
 def check_axis(file: ParameterFile, axis: str, axes: Sequence[str]) -> None:
@@ -165,7 +173,7 @@ def check_axis(file: ParameterFile, axis: str, axes: Sequence[str]) -> None:
 def no_such_axis(axis: str, axes: Sequence[str]) -> str:
     """What is wrong with the name of an axis, and the nearest one that exists."""
     if not axes:
-        return f'there is no axis {axis!r}: list it in the parameter {AXES} under /{BRINGUP}'
+        return f'there is no axis {axis!r}: list it in the parameter axes under /{BRINGUP}'
     near = difflib.get_close_matches(axis, axes, n=1, cutoff=0.0)[0]
     return f'there is no axis {axis!r} among {", ".join(axes)}: did you mean {near}?'
 
@@ -181,12 +189,13 @@ def read_configuration(
     parsed = tuple(parse_setting(setting) for setting in settings)
     axes = file.axes
     for setting in parsed:
-        if setting.name == AXES:
-            axes = Parameters({AXES: setting.value}).get_strs(AXES)
+        if setting.name == 'axes':
+            axes = Parameters({'axes': setting.value}).get_strs('axes')
+    named = axes or file.joints
     for setting in parsed:
-        if setting.axis and setting.axis not in axes:
+        if setting.axis and setting.axis not in named:
             raise InputError(f'--set {setting.axis}/{setting.name}: '
-                             + no_such_axis(setting.axis, axes))
+                             + no_such_axis(setting.axis, named))
     file.check_axes(axes)
     return Configuration(file, parsed, seed, axes)
 
@@ -223,8 +232,8 @@ def parse_setting(text: str) -> Setting:
     if not equals or (slash and not axis):
         raise InputError(f'--set {text!r} must be KEY=VALUE or AXIS/KEY=VALUE')
     check_names([name])
-    if axis and name == AXES:
-        raise ParameterError(name, given, 'is for the whole run', f'write --set {AXES}=...')
+    if axis and name == 'axes':
+        raise ParameterError(name, given, 'is for the whole run', 'write --set axes=...')
     value: object = given
     if not isinstance(BY_NAME[name].default, str):  # a word is taken as it is
         try:
@@ -240,14 +249,19 @@ def read_parameter_file(path: Path) -> ParameterFile:
     Raises InputError for a file that cannot be read, ParameterError for a name or value that
     breaks a rule; both name the file.
     """
-    sections = []
-    for name, content in _read_yaml(path).items():
-        try:
-            sections.append(_read_section(str(name), content))
-        except (ParameterError, InputError) as error:
+    try:
+        values = {str(name): _values(content) for name, content in _read_yaml(path).items()}
+        joints: list[str] = []
+        for of_section in values.values():
+            # What is wrong with the values of a joint, all values together tell.
+            joints += Parameters({JOINTS: of_section.get(JOINTS, ())}).get_strs(JOINTS)
+        return ParameterFile(path, tuple(
+            _read_section(name, of_section, joints) for name, of_section in values.items()
+        ))
+    except (ParameterError, InputError) as error:
+        if not str(error).startswith(f'{path}:'):
             error.args = (f'{path}: {error}',)
-            raise
-    return ParameterFile(path, tuple(sections))
+        raise
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -280,17 +294,21 @@ def _read_yaml(path: Path) -> dict[object, object]:
     return document
 
 
-def _read_section(name: str, content: object) -> Section:
-    axis, node = _address(name)
+def _values(content: object) -> dict[str, object]:
+    """What a section holds, by flat name."""
     if not isinstance(content, dict) or set(content) != {'ros__parameters'}:
         raise InputError('each section must hold ros__parameters and nothing else')
     if not isinstance(content['ros__parameters'], dict):
         raise InputError('ros__parameters must hold "name: value" lines')
-    values = dict(_flatten(content['ros__parameters']))
-    # What is wrong with the values of a joint, all values together tell.
-    joints = Parameters(values).get_strs(JOINTS) if JOINTS in values else ()
+    return dict(_flatten(content['ros__parameters']))
+
+
+def _read_section(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
+    axis, node = _address(name)
     shared, own = split(values, joints)
-    check_names(shared)
+    check_names(shared, joints)
+    for joint, changes in own.items():
+        check_names([f'{joint}.{key}' for key in changes if key not in BY_NAME], joints)
     checked = {key: check_value(BY_NAME[key], value) for key, value in shared.items()}
     for joint, changes in own.items():
         checked |= {
@@ -305,7 +323,7 @@ def _read_section(name: str, content: object) -> Section:
                 key, value, f'is not a parameter of {node}',
                 f'put it under {EVERY_NODE} or /{users[0]}',
             )
-        if key == AXES and axis not in (ANY, ''):
+        if key == 'axes' and axis not in (ANY, ''):
             raise ParameterError(key, value, 'is for the whole run', f'put it under /{BRINGUP}')
     return Section(name, axis, node, checked)
 
@@ -358,7 +376,14 @@ def write_config(parameters: Parameters, path: Path) -> None:
     """
     common = [p for p in PARAMETERS if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
     own = [p for p in PARAMETERS if p not in common and parameters[p.name] != p.default]
-    document = {EVERY_NODE: {'ros__parameters': _tree(parameters, common)}}
+    of_all = _tree(parameters, common)
+    for joint in parameters.get_strs(JOINTS):
+        of_joint = parameters.of_joint(joint)
+        of_all[joint] = _tree(of_joint, [
+            p for p in common if CONTROLLER in p.used_by and p.name not in NODE_WIDE
+            and of_joint[p.name] != parameters[p.name]
+        ])
+    document = {EVERY_NODE: {'ros__parameters': of_all}}
     if own:
         document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
     write_atomically(path, yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000))

@@ -214,3 +214,62 @@ def test_a_driver_elsewhere_is_awaited_and_ctrl_c_is_the_regular_end_of_an_endle
         assert (session.out / 'report.html').is_file()
         assert plant.process.poll() is None
     assert json.loads((session.out / 'summary.json').read_text())['samples'] > 0
+
+
+# An arm of two joints and, in the same process, who plans its motion.
+ARM = """
+import signal, rclpy
+from math import sin
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+node, names, k = rclpy.create_node('arm'), ['waist', 'elbow'], 0
+y, v = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
+states = node.create_publisher(JointState, 'robot_joint_states', 10)
+motion = node.create_publisher(JointState, 'robot_joint_command', 10)
+node.create_subscription(
+    JointState, 'joint_commands', lambda m: v.update(zip(m.name, m.position)), 1)
+def tick():
+    global k
+    k += 1
+    y.update((name, y[name] + 0.5 * (v[name] - y[name])) for name in names)
+    now = node.get_clock().now().to_msg()
+    motion.publish(JointState(name=names, position=[0.5 * sin(0.05 * k), 0.3 * sin(0.05 * k)]))
+    message = JointState(name=names, position=list(y.values()))
+    message.header.stamp = now
+    states.publish(message)
+node.create_timer(0.02, tick)
+try:
+    rclpy.spin(node)
+except KeyboardInterrupt:
+    pass
+"""
+JOINTS = """
+/**: {ros__parameters: {joints: [waist, elbow], sample_period: 0.02, proportional: {f: 0.0},
+  io: {style: joint_state_topic}, control: {min: -3.0, max: 3.0, rate_max: 50.0},
+  estimator: {law: fixed, initial: {m: 1.0, c_r: 0.02, c_l: -0.03}}}}
+/controller: {ros__parameters: {
+  waist: {plant: {numerator: [0.5], denominator: [1.0, -0.5]}},
+  elbow: {plant: {numerator: [0.5], denominator: [1.0, -0.5]}}}}
+"""
+
+
+def test_joints_of_an_arm_have_one_controller_and_a_report_each(
+    start: Callable[..., Session], tmp_path: Path,
+) -> None:
+    (tmp_path / 'arm.py').write_text(ARM)
+    (tmp_path / 'arm.yaml').write_text(JOINTS)
+    session = start(
+        '--config', str(tmp_path / 'arm.yaml'), '--duration', '2', '--set',
+        'elbow/estimator.initial.c_r=0.05',
+        '--driver', shlex.join([sys.executable, str(tmp_path / 'arm.py')]),
+    )
+    assert session.wait() == 0, session.stderr
+    assert session.survivors() == {}
+    assert 'waiting for whoever plans the motion, on robot_joint_command' in session.stdout
+    for joint, c_r in (('waist', 0.02), ('elbow', 0.05)):
+        assert (session.out / joint / 'report.html').is_file()
+        summary = json.loads((session.out / joint / 'summary.json').read_text())
+        assert summary['samples'] >= 100
+        assert summary['final']['c_r'] == c_r

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
+from backlash_ros import topics
 from backlash_ros.options import DONE, FAILED, OptionParser
 from backlash_ros.tools import cli
-from backlash_ros.tools.cli import DEFAULT_DURATION_S, BrokenOffError, InputError, StopRequests
+from backlash_ros.tools.cli import DEFAULT_DURATION_S, InputError, StopRequests
 
 if TYPE_CHECKING:
     from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
@@ -27,6 +28,9 @@ given.
 axes: the parameter axes, in the section /bringup of the file, lists names; each gets nodes of its
 own in the namespace of that name and a folder DIR/NAME. Values stand under /**, /**/NODE,
 /NAME/** or /NAME/NODE; a named node goes before a named axis. If one axis fails, all are stopped.
+
+joints: a file with the parameter joints is one controller for all of them, with its recorder. It
+needs --driver; y_m comes from whoever plans the motion. Each joint gets a report in DIR/JOINT.
 
 exit codes: 0 done, 2 bad input, 1 anything else (a process died, nothing moves, interrupted).
 
@@ -98,24 +102,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def perform(plan: RunPlan) -> int:
-    """Run and report; returns the exit code."""
+    """Run and report; returns the exit code. Raises BrokenOffError where nothing can start."""
     from backlash_ros.tools.bringup.plan import plan_processes
     from backlash_ros.tools.bringup.supervisor import ProcessSupervisor
-    from backlash_ros.tools.bringup.watch import RunWatch, complain
-    try:
-        with ExitStack() as stack:
-            requests = stack.enter_context(StopRequests())
-            stages = plan_processes(plan, _announced_domain(plan, stack))
-            managed = [axis.process_name('controller') for axis in plan.axes if axis.is_managed]
-            if managed:
-                print(f'waiting until somebody activates {", ".join(managed)} (autostart: false)',
-                      flush=True)
-            supervisor = stack.enter_context(ProcessSupervisor(stages, requests.insist))
-            watch = RunWatch(plan, supervisor, requests)
-            watch.execute()
-    except BrokenOffError as error:
-        complain(str(error))
-        return FAILED
+    from backlash_ros.tools.bringup.watch import RunWatch
+    with ExitStack() as stack:
+        requests = stack.enter_context(StopRequests())
+        stages = plan_processes(plan, _announced_domain(plan, stack))
+        _announce_others(plan)
+        supervisor = stack.enter_context(ProcessSupervisor(stages, requests.insist))
+        watch = RunWatch(plan, supervisor, requests)
+        watch.execute()
     reported = [watch.has_samples(axis) and report(axis) for axis in plan.axes]
     return DONE if all(reported) and not watch.failure else FAILED
 
@@ -144,28 +141,48 @@ def _announced_domain(plan: RunPlan, stack: ExitStack) -> int | None:
     return free
 
 
+def _announce_others(plan: RunPlan) -> None:
+    """Say who besides the driver is waited for."""
+    managed = [axis.process_name('controller') for axis in plan.axes if axis.is_managed]
+    if managed:
+        print(f'waiting until somebody activates {", ".join(managed)} (autostart: false)',
+              flush=True)
+    for axis in plan.axes:
+        if axis.joints:
+            topic = axis.process_name(topics.ROBOT_COMMAND)
+            print(f'waiting for whoever plans the motion, on {topic}', flush=True)
+
+
 def report(axis: AxisPlan) -> bool:
     """Write and print what came out of an axis; returns whether that worked."""
     if not axis.record:
         print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
         return True
+    reported = [_report(axis, joint) for joint in axis.joints or ('',)]
+    return all(reported)
+
+
+def _report(axis: AxisPlan, joint: str) -> bool:
+    """Report one joint, in a folder of its own, or the only one, which is nameless."""
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.bringup.watch import complain
     from backlash_ros.tools.report import PAGE, write_report
     from backlash_ros.tools.runs.source import read_run
     from backlash_ros.tools.runs.summary import estimate_table
+    out = axis.out / joint
     try:
-        summary = write_report(read_run(axis.bag), axis.out)
+        out.mkdir(exist_ok=True)
+        summary = write_report(read_run(axis.bag, axis=joint), out)
     except (InputError, OSError) as error:
         complain(axis.titled(f'no report: {error}'))
         return False
-    print(estimate_table(summary, axis.name))
+    print(estimate_table(summary, '/'.join(filter(None, (axis.name, joint)))))
     facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
     latency = summary['loop_latency_ms']
     if latency is not None:
         facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
     print(facts)
-    print(f'report: {axis.out / PAGE}')
+    print(f'report: {out / PAGE}')
     return True
 
 

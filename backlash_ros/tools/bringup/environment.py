@@ -13,15 +13,9 @@ import backlash_ros
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.tools.cli import BrokenOffError
 
-# Set by ROS 2 wheels when they have prepared LD_LIBRARY_PATH for the Python that runs.
-WHEELS_MARK, LIBRARY_PATH = '_ROS_WHEELS_BOOTSTRAP_COMPLETE', 'LD_LIBRARY_PATH'
-
-# UDP ports of RTPS: a domain has 250; participant n takes 10 + 2 n and 11 + 2 n of them, and
-# domains up to 101 lie below the ports that Linux hands out to others.
-DOMAINS = 101
-DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250  # as the standard has them
-PARTICIPANT_OFFSETS = range(10, 74, 2)  # as many as the discovery range LOCALHOST looks for
-RESERVATION_OFFSET = 5  # port of a domain that a run holds, which no participant takes
+# UDP ports of RTPS: domain d has those from 7400 + 250 d on, of which participant n takes 10 + 2 n
+# and 11 + 2 n.
+DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250
 
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
@@ -56,15 +50,14 @@ def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
 
     ROS 2 wheels have set variables for this Python alone, with which those of another one fail.
     """
-    foreign = {
-        name: value for name, value in environment.items()
-        if name not in ('BACKLASH_ROS_EVENTS', WHEELS_MARK)
-    }
-    if WHEELS_MARK in environment and LIBRARY_PATH in environment:
-        folders = foreign.pop(LIBRARY_PATH).split(os.pathsep)
+    foreign = dict(environment)
+    foreign.pop('BACKLASH_ROS_EVENTS', None)
+    by_wheels = foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None) is not None
+    if by_wheels and 'LD_LIBRARY_PATH' in foreign:
+        folders = foreign.pop('LD_LIBRARY_PATH').split(os.pathsep)
         kept = [folder for folder in folders if not Path(folder).is_relative_to(sys.prefix)]
         if kept:
-            foreign[LIBRARY_PATH] = os.pathsep.join(kept)
+            foreign['LD_LIBRARY_PATH'] = os.pathsep.join(kept)
     return foreign
 
 
@@ -76,21 +69,24 @@ def free_domain() -> Iterator[int]:
     a participant is taken; a port that no participant ever uses reserves it, and the kernel
     gives that back whatever happens to this process. Raises BrokenOffError if all are in use.
     """
+    domains = 101  # those that lie below the ports that Linux hands out to others
+    # As many participants as the discovery range LOCALHOST looks for.
+    participants = range(10, 74, 2)
     # Starting at the process id spreads runs that start at the same moment.
-    for i in range(DOMAINS):
-        domain = 1 + (os.getpid() + i) % DOMAINS
+    for i in range(domains):
+        domain = 1 + (os.getpid() + i) % domains
         ports = DOMAIN_0_PORT + PORTS_PER_DOMAIN * domain
         with ExitStack() as reservation:
             try:
-                reservation.enter_context(_bound(ports + RESERVATION_OFFSET))
-                for offset in PARTICIPANT_OFFSETS:
+                reservation.enter_context(_bound(ports + 5))
+                for offset in participants:
                     _bound(ports + offset).close()
             except OSError:
                 continue
             yield domain
             return
     raise BrokenOffError(
-        f'every ROS_DOMAIN_ID from 1 to {DOMAINS} is in use on this machine: set one yourself'
+        f'every ROS_DOMAIN_ID from 1 to {domains} is in use on this machine: set one yourself'
     )
 
 

@@ -22,18 +22,13 @@ from backlash_ros.tools.config import Configuration, read_configuration, write_c
 from backlash_ros.tools.runs.files import CONFIG, result_directory
 from backlash_ros.tools.runs.source import BAG
 
-LOGS = 'logs'
-DRIVER, ELSEWHERE = 'driver', 'none'
-LIVE = 'live'
-AXIS_MARK = '{axis}'
-ESTIMATES = 'estimates.file'
 # Each node takes one of the places that discovery on one machine has; some stay for listeners.
 MOST_AXES = 7
 
 
 @dataclass(frozen=True)
 class AxisPlan:
-    """One loop of a run; its parameters are complete and checked, its folder exists.
+    """One controller of a run; its parameters are complete and checked, its folder exists.
 
     name: also its namespace, empty for a run without axes.
     """
@@ -54,6 +49,11 @@ class AxisPlan:
         return self.parameters.get_float('sample_period')
 
     @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints of its controller, empty where it has a single, nameless one."""
+        return self.parameters.get_strs('joints')
+
+    @property
     def bag(self) -> Path:
         """Folder of the bag."""
         return self.out / BAG
@@ -61,22 +61,39 @@ class AxisPlan:
     @property
     def logs(self) -> Path:
         """Folder of the logs."""
-        return self.out / LOGS
+        return self.out / 'logs'
+
+    @property
+    def driver(self) -> str:
+        """Command of what stands in the place of the simulated plant, empty for nothing."""
+        return self.parameters.get_str('driver')
 
     @property
     def has_driver(self) -> bool:
         """Whether something else stands in the place of the simulated plant."""
-        return bool(self.parameters.get_str(DRIVER))
+        return bool(self.driver)
 
     @property
     def driver_is_elsewhere(self) -> bool:
         """Whether somebody else starts the driver."""
-        return self.parameters.get_str(DRIVER) == ELSEWHERE
+        return self.driver == 'none'
 
     @property
     def is_managed(self) -> bool:
         """Whether somebody else activates the controller."""
         return not self.parameters.get_bool('autostart')
+
+    @property
+    def patient_processes(self) -> tuple[str, ...]:
+        """Processes that wait for somebody who may come at any time."""
+        nodes = []
+        if self.driver_is_elsewhere or self.is_managed:
+            nodes.append('controller')
+        if self.is_managed:
+            nodes.append('plant')  # begins when the controller listens
+        if self.joints:
+            nodes.append('recorder')  # begins when the motion is planned
+        return tuple(map(self.process_name, nodes))
 
     def titled(self, text: str) -> str:
         """The text, with the name of the axis where there are axes."""
@@ -89,7 +106,7 @@ class AxisPlan:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """All that runs together: one loop without a name, or one for each axis.
+    """All that runs together: one controller without a name, or one for each axis.
 
     live_port: of the page in the browser, 0 for a free one, None without a page.
     """
@@ -116,15 +133,16 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     if len(names) > MOST_AXES:
         raise InputError(f'{len(names)} axes are too many for one machine: at most {MOST_AXES}')
     parameters = {name: _parameters(configuration, name, options) for name in names}
-    if options.unlimited and not any(values.get_str(DRIVER) for values in parameters.values()):
+    if options.unlimited and not any(values.get_str('driver') for values in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
     live_port = options.live_port if options.live_port is not None else 0 if options.live else None
     if live_port is not None and not 0 <= live_port <= LARGEST_PORT:
         raise InputError(f'--live-port={live_port}: must be from 0 (a free one) to {LARGEST_PORT}')
     _check_files(parameters)
     for name, values in parameters.items():
-        print_warnings(f'bringup: {name}' if name else 'bringup', values)
-    for name in names:
+        for joint in values.joints:
+            where = ': '.join(filter(None, ('bringup', name, joint)))
+            print_warnings(where, values.of_joint(joint))
         if options.out is not None and (options.out / name / BAG).exists():
             raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
     # The nodes need a path that holds wherever it is read.
@@ -146,27 +164,30 @@ def _parameters(
 ) -> Parameters:
     """The parameters of an axis, checked as far as that is possible without running."""
     try:
-        parameters = configuration.parameters(axis)
+        parameters = configuration.of_controller(axis)
         endless = options.duration == inf
         parameters = parameters.replaced({
             'lockstep': options.lockstep or parameters.get_bool('lockstep'),
             'samples': 0 if endless else number_of_samples(parameters, options.duration),
+            **({} if options.driver is None else {'driver': options.driver}),
         })
-        if options.driver is not None:
-            parameters = parameters.replaced({DRIVER: options.driver})
         parameters = _with_driver(axis, parameters)
-        missing = missing_limits(parameters)
-        if parameters.get_str(DRIVER) and missing and not options.unlimited:
-            raise ParameterError(
-                missing[0], parameters.get_float(missing[0]),
-                'is no limit, and a driver moves an actuator',
-                f'set {", ".join(missing)}, or give --unlimited',
-            )
+        driver = parameters.get_str('driver')
+        for joint in parameters.joints if driver and not options.unlimited else ():
+            missing = missing_limits(parameters.of_joint(joint))
+            if missing:
+                raise ParameterError(
+                    f'{joint}.{missing[0]}' if joint else missing[0],
+                    parameters.of_joint(joint).get_float(missing[0]),
+                    'is no limit, and a driver moves an actuator',
+                    f'set {", ".join(missing)}, or give --unlimited',
+                )
         if bag := parameters.get_str('bag'):
             raise ParameterError('bag', bag, 'is made by bringup', 'choose its folder with --out')
-        build_controller(parameters)
+        for joint in parameters.joints:
+            build_controller(parameters.of_joint(joint))
         build_reference(parameters)
-        if not parameters.get_str(DRIVER):
+        if not driver:
             build_plant(parameters)
     except (ParameterError, InputError) as error:
         error.args = (f'{axis}: {error}' if axis else str(error),)
@@ -176,29 +197,37 @@ def _parameters(
 
 def _with_driver(axis: str, parameters: Parameters) -> Parameters:
     """The set with the name of the axis in the command of its driver; raises ParameterError."""
-    text = parameters.get_str(DRIVER).strip()
+    text = parameters.get_str('driver').strip()
+    mark = '{axis}'
     try:
         shlex.split(text)
     except ValueError as error:
-        raise ParameterError(DRIVER, text, 'is not a command', str(error)) from None
+        raise ParameterError('driver', text, 'is not a command', str(error)) from None
     if text and parameters.get_bool('lockstep'):
         raise ParameterError(
-            DRIVER, text, 'excludes lockstep', 'a real plant does not wait for its control'
+            'driver', text, 'excludes lockstep', 'a real plant does not wait for its control'
         )
-    if AXIS_MARK in text and not axis:
-        raise ParameterError(DRIVER, text, 'names an axis', 'list the axes in the parameter axes')
-    return parameters.replaced({DRIVER: text.replace(AXIS_MARK, axis)})
+    if mark in text and not axis:
+        raise ParameterError('driver', text, 'names an axis', 'list the axes in the parameter axes')
+    if parameters['joints'] and not text:
+        raise ParameterError(
+            'driver', text, 'is empty, and nothing here simulates several joints',
+            'give --driver COMMAND, or none for one that you start yourself; '
+            '`simulate --axis JOINT` simulates one of them',
+        )
+    return parameters.replaced({'driver': text.replace(mark, axis)})
 
 
 def _check_files(parameters: Mapping[str, Parameters]) -> None:
     """Raise ParameterError where two axes would save their estimates in one file."""
+    name = 'estimates.file'
     users: dict[str, str] = {}
     for axis, values in parameters.items():
-        file = values.get_str(ESTIMATES)
+        file = values.get_str(name)
         if file and users.setdefault(file, axis) != axis:
             raise ParameterError(
-                ESTIMATES, file, f'is the file of {users[file]} and of {axis}',
-                f'give each axis one of its own, like --set {axis}/{ESTIMATES}=...',
+                name, file, f'is the file of {users[file]} and of {axis}',
+                f'give each axis one of its own, like --set {axis}/{name}=...',
             )
 
 
@@ -207,27 +236,28 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
 
     A simulated plant stops first, so that no output stays without its answer. With a driver the
     controller goes first and the driver hears its last command. The recorder goes last and so
-    has everything that the others have said. domain: ROS_DOMAIN_ID to set, None to leave it alone.
+    has everything that the others have said. The references of joints come from whoever plans
+    their motion. domain: ROS_DOMAIN_ID to set, None to leave it alone.
     """
     stages: list[list[ProcessPlan]] = [[], [], [], []]
     for axis in plan.axes:
-        order = ('controller', None, 'reference', 'recorder') if axis.has_driver \
-            else ('plant', 'reference', 'controller', 'recorder')
+        order = ('controller', '', '' if axis.joints else 'reference', 'recorder') \
+            if axis.has_driver else ('plant', 'reference', 'controller', 'recorder')
         for stage, node in zip(stages, order, strict=True):
-            if node is not None:
+            if node:
                 stage.append(_node(axis, node, child_environment(axis.logs, domain)))
     # Axes with the very same command have one driver together.
     served: dict[tuple[str, ...], list[AxisPlan]] = {}
     for axis in plan.axes:
         if axis.has_driver and not axis.driver_is_elsewhere:
-            served.setdefault(tuple(shlex.split(axis.parameters.get_str(DRIVER))), []).append(axis)
+            served.setdefault(tuple(shlex.split(axis.driver)), []).append(axis)
     stages[1] += [_driver(plan, command, axes, domain) for command, axes in served.items()]
     if plan.live_port is not None:
-        logs = plan.axes[0].logs
+        first = plan.axes[0]
         shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
         stages[-1].append(ProcessPlan(
-            LIVE, (*_module('live.command'), '--port', str(plan.live_port), *shown),
-            logs / f'{LIVE}.log', child_environment(logs, domain), plan.axes[0].name,
+            'live', (*_module('live.command'), '--port', str(plan.live_port), *shown),
+            first.logs / 'live.log', child_environment(first.logs, domain), first.name,
             spectator=True,
         ))
     return stages
@@ -264,10 +294,10 @@ def _node(axis: AxisPlan, node: str, environment: Mapping[str, str]) -> ProcessP
 def _driver(
     plan: RunPlan, command: tuple[str, ...], axes: Sequence[AxisPlan], domain: int | None,
 ) -> ProcessPlan:
-    name, log = axes[0].process_name(DRIVER), axes[0].logs / f'{DRIVER}.log'
+    name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
     if len(axes) > 1:
         names = [axis.name for axis in axes]
-        name, log = f'{DRIVER} of {", ".join(names)}', plan.out / LOGS / f'{"_".join(names)}.log'
+        name, log = f'driver of {", ".join(names)}', plan.out / 'logs' / f'{"_".join(names)}.log'
         log.parent.mkdir(exist_ok=True)
     # The last command of the controller acts from the next sample of the driver on.
     settle_s = min(2.0 * max(axis.sample_period for axis in axes), 1.0)

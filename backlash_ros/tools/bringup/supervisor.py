@@ -19,19 +19,13 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
-from types import TracebackType
 
 from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.cli import BrokenOffError
 
-PROCESSES = Path('/proc')
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
-LINES_OF_LOG = 10  # that a message quotes
-
-Stages = Sequence[tuple[Sequence[int], float]]  # process groups, and time beyond the usual [s]
 
 
 @dataclass(frozen=True)
@@ -81,25 +75,28 @@ class Child:
         *lines, self.unfinished_line = (self.unfinished_line + chunk).split(b'\n')
         events = []
         for line in lines:
-            try:
+            with contextlib.suppress(ValueError):
                 content = json.loads(line)
-            except ValueError:
-                content = None
-            if isinstance(content, dict) and 'event' in content:
-                events.append(Event(self.plan, content))
-            else:
-                with self.plan.log.open('ab') as log:
-                    log.write(line + b'\n')
+                if isinstance(content, dict) and 'event' in content:
+                    events.append(Event(self.plan, content))
+                    continue
+            with self.plan.log.open('ab') as log:
+                log.write(line + b'\n')
         return events
 
+    def describe_end(self, what: str, further: str = '') -> str:
+        """What became of it, how it exited, and the end of its log."""
+        return f'{self.plan.name} {what} ({self.exit}){further}, the end of {self.end_of_log()}'
+
     def end_of_log(self) -> str:
-        """The last lines of the log, indented."""
+        """The last ten lines of the log, indented."""
         log = self.plan.log
         lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
-        quoted = ''.join(f'\n    {line}' for line in lines[-LINES_OF_LOG:])
+        quoted = ''.join(f'\n    {line}' for line in lines[-10:])
         return f'{log}:{quoted}' if quoted else f'{log} is empty'
 
-    def describe_exit(self) -> str:
+    @property
+    def exit(self) -> str:
         """How the process ended, in words."""
         code = self.process.returncode
         if code is not None and code < 0:
@@ -135,29 +132,25 @@ class ProcessSupervisor:
                     children.append(self._start(plan))
                     self._tell_guardian(self._stages)
         except BaseException:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop()
         self._selector.close()
-        streams = [child.process.stdout for child in self.children]
+        for child in self.children:
+            if child.process.stdout is not None:
+                child.process.stdout.close()
         if self._guardian is not None:
-            streams.append(self._guardian.stdin)
-        for stream in streams:
-            if stream is not None:
-                stream.close()
-        if self._guardian is not None:
+            assert self._guardian.stdin is not None
+            self._guardian.stdin.close()
             self._guardian.wait()
 
     @property
     def children(self) -> list[Child]:
         """All that were started."""
-        return list(chain(*self._stages))
+        return [child for stage in self._stages for child in stage]
 
     def events(self, timeout: float) -> list[Event]:
         """What the processes have said; waits up to timeout [s] for a first word."""
@@ -254,20 +247,22 @@ def group_exists(group: int) -> bool:
         return False
     except PermissionError:
         return True
+    processes = Path('/proc')
     # The leader first: only when it has gone all others must be looked through.
-    return not PROCESSES.is_dir() or any(
-        _lives_in(process, group)
-        for process in chain([PROCESSES / str(group)], PROCESSES.glob('[0-9]*'))
+    return not processes.is_dir() or any(
+        _lives_in(stat, group)
+        for stats in (processes.glob(f'{group}/stat'), processes.glob('[0-9]*/stat'))
+        for stat in stats
     )
 
 
-def _lives_in(process: Path, group: int) -> bool:
+def _lives_in(stat: Path, group: int) -> bool:
     try:
-        stat = (process / 'stat').read_text(encoding='utf-8', errors='replace')
+        text = stat.read_text(encoding='utf-8', errors='replace')
     except OSError:
         return False
     # The name of the program stands in parentheses and may hold anything.
-    state, _, its_group = stat.rpartition(')')[2].split()[:3]
+    state, _, its_group = text.rpartition(')')[2].split()[:3]
     return int(its_group) == group and state not in ('Z', 'X')
 
 
@@ -279,7 +274,7 @@ def guard(lines: Iterable[str]) -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    stages: Stages = []
+    stages: Sequence[tuple[Sequence[int], float]] = []  # as _groups returns them
     for line in lines:
         stages = json.loads(line)
     for groups, grace_s in stages:

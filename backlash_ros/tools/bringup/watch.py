@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import time
 from collections.abc import Mapping
 from math import inf, isfinite, nan
 from typing import TextIO
-
-from tqdm import tqdm
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
@@ -24,63 +21,11 @@ LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
 # For the recorder, after the last sample: the middleware sends again what got lost on the way to a
 # recorder that was held up, with its own settings every 3 s.
 CATCH_UP_DEADLINE_S = 10.0
-PLAIN_LINE_PERIOD_S = 2.0  # between two lines of progress where there is no terminal
-
-# Where y may come from, as the ends of full names.
-OUTPUTS = (f'/{topics.PLANT_OUTPUT}', f'/{topics.JOINT_STATES}')
-# How a driver may end that was told to by a signal; a shell adds 128 to its number.
-TOLD_TO_END = {
-    code for number in (signal.SIGINT, signal.SIGTERM) for code in (-number, 128 + number)
-}
 
 
 def complain(message: str) -> None:
     """Say on stderr what went wrong."""
     print(f'bringup: {message}', file=sys.stderr, flush=True)
-
-
-class ProgressDisplay:
-    """Progress of an axis: a bar on a terminal, now and then a plain line anywhere else.
-
-    line: the one of its bar among those of all axes.
-    """
-
-    def __init__(self, plan: AxisPlan, stream: TextIO, line: int = 0) -> None:
-        self._plan, self._stream = plan, stream
-        self._next_line = 0.0  # when a plain one is due, on the monotonic clock [s]
-        self._bar: tqdm[None] | None = None
-        # The terminals of containers and recorders may have no size: tqdm would show nothing.
-        if stream.isatty() and all(os.get_terminal_size(stream.fileno())):
-            tqdm.monitor_interval = 0  # no thread beside the loop that starts processes
-            done = '{percentage:3.0f} % |{bar:16}| {n_fmt}/{total_fmt}' if plan.samples \
-                else '{n_fmt}'
-            self._bar = tqdm(
-                total=plan.samples or None, file=stream, dynamic_ncols=True, position=line,
-                bar_format=f'{plan.titled(done)}{{postfix}}',
-            )
-
-    def show(self, progress: Mapping[str, object], made: int) -> None:
-        """Show one progress event; made: samples so far."""
-        if self._bar is not None:
-            self._bar.n = made
-            self._bar.set_postfix_str(describe(progress))
-        elif time.monotonic() >= self._next_line:
-            self._next_line = time.monotonic() + PLAIN_LINE_PERIOD_S
-            of_all = f'/{self._plan.samples}' if self._plan.samples else ''
-            t = made * self._plan.sample_period
-            self.say(self._plan.titled(f'{t:7.2f} s  {made}{of_all}  {describe(progress)}'))
-
-    def say(self, line: str) -> None:
-        """Print a line above the bar."""
-        if self._bar is not None:
-            self._bar.write(line, file=self._stream)
-        else:
-            print(line, file=self._stream, flush=True)
-
-    def close(self) -> None:
-        """Leave the bar as it is and free the line below it."""
-        if self._bar is not None:
-            self._bar.close()
 
 
 def describe(progress: Mapping[str, object]) -> str:
@@ -108,20 +53,21 @@ def _counts(values: Mapping[str, object], name: str) -> dict[str, int]:
 
 
 class AxisProgress:
-    """How far an axis has come, and how long to wait for its next sample.
+    """How far an axis has come, said now and then, and how long to wait for its next sample.
 
     made: samples so far. first: number of the one that counts as the first. began, moved: when the
     run began, and when the newest sample was heard of, on the monotonic clock [s]. published:
     samples and messages by topic that can have been heard of a simulated plant, once it is done.
     """
 
-    def __init__(self, plan: AxisPlan, display: ProgressDisplay) -> None:
-        self.plan, self.display = plan, display
+    def __init__(self, plan: AxisPlan, stream: TextIO) -> None:
+        self.plan, self._stream = plan, stream
         self.made = self.first = 0
         self.began = self.moved = time.monotonic()
         self.published: Mapping[str, int] | None = None
         self._heard: dict[str, int] = {}
-        self._silence_told = False
+        self._says_silence = True
+        self._next_line = 0.0  # on the monotonic clock [s]
 
     @property
     def patience(self) -> float:
@@ -145,11 +91,10 @@ class AxisProgress:
     @property
     def unheard(self) -> dict[str, int]:
         """What is missing of the published ones."""
-        missing = {
+        return {
             what: count - self._heard.get(what, 0)
-            for what, count in (self.published or {}).items()
+            for what, count in (self.published or {}).items() if count > self._heard.get(what, 0)
         }
-        return {what: count for what, count in missing.items() if count > 0}
 
     def begin(self) -> None:
         """The time starts to run."""
@@ -167,8 +112,13 @@ class AxisProgress:
         made = int(sample) + 1 - self.first
         self._heard = {'samples': made, **_counts(progress, 'received')}
         if made > self.made:
-            self.made, self.moved, self._silence_told = made, time.monotonic(), False
-            self.display.show(progress, made)
+            self.made, self.moved, self._says_silence = made, time.monotonic(), True
+            if self.moved >= self._next_line:
+                # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
+                self._next_line = self.moved + max(2.0, 0.05 * (self.moved - self.began))
+                of_all = f'/{self.plan.samples}' if self.plan.samples else ''
+                t = made * self.plan.sample_period
+                self._say(self.plan.titled(f'{t:7.2f} s  {made}{of_all}  {describe(progress)}'))
 
     def check_pace(self) -> None:
         """Raise BrokenOffError for samples that do not come."""
@@ -180,23 +130,25 @@ class AxisProgress:
                     f'output? See {plan.logs}; where it needs longer, start it yourself '
                     '(--driver none)'
                 ))
+        elif self.complete:
             return
-        if self.complete:
-            return
-        if now > self.deadline:
+        elif now > self.deadline:
             raise BrokenOffError(plan.titled(
                 f'only {self.made} of {plan.samples} samples, {LATE_DEADLINE_S:g} s after the end '
                 f'was due, see {plan.logs}'
             ))
-        if now > self.moved + self.patience:
+        elif now > self.moved + self.patience:
             at = f' after sample {self.first + self.made - 1}' if self.made else ''
-            silence = plan.titled(f'no new sample for {self.patience:g} s{at}')
+            silence = f'no new sample for {self.patience:g} s{at}'
             if not plan.has_driver:
-                raise BrokenOffError(f'{silence}, see {plan.logs}')
+                raise BrokenOffError(plan.titled(f'{silence}, see {plan.logs}'))
             # The controller knows what to do when a real plant falls silent.
-            if not self._silence_told:
-                self._silence_told = True
-                self.display.say(f'bringup: {silence}, waiting for the driver')
+            if self._says_silence:
+                self._says_silence = False
+                self._say(f'bringup: {plan.titled(silence)}, waiting for the driver')
+
+    def _say(self, text: str) -> None:
+        print(text, file=self._stream, flush=True)
 
 
 class RunWatch:
@@ -210,10 +162,7 @@ class RunWatch:
         stream: TextIO = sys.stderr,
     ) -> None:
         self._plan, self._supervisor, self._requests = plan, supervisor, requests
-        self._axes = {
-            axis.name: AxisProgress(axis, ProgressDisplay(axis, stream, line))
-            for line, axis in enumerate(plan.axes)
-        }
+        self._axes = {axis.name: AxisProgress(axis, stream) for axis in plan.axes}
         self._ready: set[str] = set()
         self._gone: set[str] = set()  # spectators that have died
         self.failure = ''
@@ -235,7 +184,7 @@ class RunWatch:
                     axis.check_pace()
             self._catch_up()
             if self._over:
-                self._say(f'{self._requests.last} ends the run')
+                complain(f'{self._requests.last} ends the run')
         except BrokenOffError as error:
             # Said before the processes are stopped, which may take a while.
             self._fail(str(error))
@@ -243,8 +192,6 @@ class RunWatch:
             self._note(event)
         if not self.failure:
             self._judge_exits()
-        for axis in self._axes.values():
-            axis.display.close()
 
     @property
     def _over(self) -> bool:
@@ -256,17 +203,19 @@ class RunWatch:
 
     def _fail(self, message: str) -> None:
         self.failure = message
-        self._say(message)
-
-    def _say(self, message: str) -> None:
-        """Print a line above all bars."""
-        next(iter(self._axes.values())).display.say(f'bringup: {message}')
+        complain(message)
 
     def _wait_until_ready(self) -> None:
         deadline = time.monotonic() + READY_DEADLINE_S
-        while self._missing():
+        while missing := [
+            child for child in self._supervisor.children
+            if not child.plan.foreign and child.plan.name not in self._ready
+        ]:
             self._listen()
-            late = [child for child in self._missing() if not self._may_wait(child)]
+            late = [
+                child for child in missing if child.plan.name not in self._ready
+                and child.plan.name not in self._axes[child.plan.axis].plan.patient_processes
+            ]
             if late and time.monotonic() > deadline:
                 names = ', '.join(child.plan.name for child in late)
                 hint = ' (a controller waits until the driver subscribes to its command)' \
@@ -275,23 +224,6 @@ class RunWatch:
                 raise BrokenOffError(
                     f'not ready within {READY_DEADLINE_S:g} s: {names}{hint}\n{logs}'
                 )
-
-    def _missing(self) -> list[Child]:
-        return [
-            child for child in self._supervisor.children
-            if not child.plan.foreign and child.plan.name not in self._ready
-        ]
-
-    def _may_wait(self, child: Child) -> bool:
-        """Whether it waits for somebody who may come at any time."""
-        axis = self._axes[child.plan.axis].plan
-        waiting = []
-        if axis.driver_is_elsewhere or axis.is_managed:
-            waiting.append(axis.process_name('controller'))
-        if axis.is_managed:
-            # The plant begins when the controller listens.
-            waiting.append(axis.process_name('plant'))
-        return child.plan.name in waiting
 
     def _catch_up(self) -> None:
         """Wait until the recorder has told of all that was published, and say what is missing."""
@@ -303,7 +235,7 @@ class RunWatch:
         for axis in self._axes.values():
             if axis.unheard:
                 missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
-                self._say(axis.plan.titled(
+                complain(axis.plan.titled(
                     f'the plant has published more than the recorder heard: {missing}'
                 ))
 
@@ -314,7 +246,7 @@ class RunWatch:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
         dead = [child for child in self._supervisor.ended() if not self._may_end(child)]
         if dead:
-            raise BrokenOffError('\n'.join(_end(child, 'died') for child in dead))
+            raise BrokenOffError('\n'.join(child.describe_end('died') for child in dead))
 
     def _may_end(self, child: Child) -> bool:
         """Whether the run goes on without it, which is said once."""
@@ -323,7 +255,7 @@ class RunWatch:
             return False
         if name not in self._gone:
             self._gone.add(name)
-            self._say(_end(child, 'died', ', the run goes on without it'))
+            complain(child.describe_end('died', ', the run goes on without it'))
         return True
 
     def _note(self, event: Event) -> None:
@@ -338,21 +270,9 @@ class RunWatch:
             axis.take(event.content)
         elif event.kind == 'recording_stopped':
             # The log may lie on the very disk that is full.
-            self._say(str(event.content.get('reason', '')))
+            complain(str(event.content.get('reason', '')))
         elif event.kind == 'closed' and axis.plan.record and axis.made:
-            self._report_unheard(event.content)
-
-    def _report_unheard(self, closed: Mapping[str, object]) -> None:
-        """Say so where the bag holds what the controller made of y, but no y."""
-        if closed.get('failure'):
-            return
-        for topic, count in _counts(closed, 'messages').items():
-            if topic.endswith(OUTPUTS) and count == 0:
-                self._say(
-                    f'the bag holds no message of {topic}, which the controller has heard: the '
-                    'recorder did not discover its publisher before the end of the run; let the '
-                    f'driver wait until {topic} has two subscribers, or run longer'
-                )
+            _complain_of_missing_output(event.content)
 
     def _judge_exits(self) -> None:
         """Look at how the processes have ended that were told to."""
@@ -362,16 +282,23 @@ class RunWatch:
             if code == 0 or child.plan.name in self._gone:
                 continue
             if not child.plan.foreign or code == -signal.SIGKILL:
-                bad.append(_end(child, 'did not stop cleanly'))
-            elif code not in TOLD_TO_END:
+                bad.append(child.describe_end('did not stop cleanly'))
+            # A driver may end so that was told to by a signal; a shell adds 128 to its number.
+            elif code not in (-signal.SIGINT, -signal.SIGTERM,
+                              128 + signal.SIGINT, 128 + signal.SIGTERM):
                 # How a program of the user says good-bye is its own affair.
-                self._say(_end(child, 'was stopped'))
+                complain(child.describe_end('was stopped'))
         if bad:
             self._fail('\n'.join(bad))
 
 
-def _end(child: Child, what: str, further: str = '') -> str:
-    return (
-        f'{child.plan.name} {what} ({child.describe_exit()}){further}, the end of '
-        f'{child.end_of_log()}'
-    )
+def _complain_of_missing_output(closed: Mapping[str, object]) -> None:
+    """Say so where a bag that was closed holds what the controller made of y, but no y."""
+    outputs = topics.PLANT_OUTPUT, topics.JOINT_STATES, topics.ROBOT_STATES
+    for topic, count in _counts(closed, 'messages').items():
+        if not closed.get('failure') and topic.rpartition('/')[2] in outputs and count == 0:
+            complain(
+                f'the bag holds no message of {topic}, which the controller has heard: the '
+                'recorder did not discover its publisher before the end of the run; let the '
+                f'driver wait until {topic} has two subscribers, or run longer'
+            )

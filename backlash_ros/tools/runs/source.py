@@ -8,7 +8,7 @@ from pathlib import Path
 from backlash_ros.bags.reading import is_bag
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.cli import WHOLE, InputError, Span
-from backlash_ros.tools.config import effective_parameters, load_config
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import CONFIG, RECORD, SAMPLES, read_record, read_samples
 from backlash_ros.tools.runs.run import Run, cut
@@ -27,7 +27,7 @@ def read_run(
     """
     if not path.exists():
         raise InputError(f'{path}: does not exist')
-    parameters = _parameters_beside(path) if config is None else effective_parameters(config)
+    parameters = _parameters(path, config, axis)
     period = parameters.get_float('sample_period') if parameters else None
     bag = find_bag(path)
     if bag is not None:
@@ -52,10 +52,17 @@ def find_bag(path: Path) -> Path | None:
     return next((place for place in (path, path / BAG) if is_bag(place)), None)
 
 
-def _parameters_beside(path: Path) -> Parameters | None:
-    places = [path] if path.is_dir() else [path.parent]
+def _parameters(path: Path, config: Path | None, axis: str) -> Parameters | None:
+    """Those of the file, or of the one beside the run, None without; of the first joint if any."""
+    places = [path if path.is_dir() else path.parent]
     if is_bag(path):
         # A bag lies in the folder of the results to which the parameters belong.
         places.append(places[0].parent)
-    files = [place / CONFIG for place in places if (place / CONFIG).is_file()]
-    return Parameters(load_config(files[0])) if files else None
+    files = [config] if config else [file for place in places if (file := place / CONFIG).is_file()]
+    if not files:
+        return None
+    configuration = read_configuration(files[0])
+    known = configuration.axes or configuration.joints
+    if axis not in known:
+        axis = configuration.joints[0] if configuration.joints else ''
+    return configuration.parameters(axis)

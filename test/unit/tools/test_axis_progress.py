@@ -13,7 +13,6 @@ from backlash_ros.tools.bringup.watch import (
     FIRST_SAMPLE_DEADLINE_S,
     LATE_DEADLINE_S,
     AxisProgress,
-    ProgressDisplay,
 )
 from backlash_ros.tools.cli import BrokenOffError
 from backlash_ros.tools.config import effective_parameters
@@ -23,8 +22,7 @@ def begun(folder: Path, driver: str = '', **values: object) -> tuple[AxisProgres
     """An axis whose run of 100 samples has just begun, and what is said of it."""
     p = effective_parameters(None).replaced({'samples': 100, 'driver': driver, **values})
     said = io.StringIO()
-    plan = AxisPlan('', p, folder, record=True)
-    axis = AxisProgress(plan, ProgressDisplay(plan, said))
+    axis = AxisProgress(AxisPlan('', p, folder, record=True), said)
     axis.begin()
     return axis, said
 

@@ -18,7 +18,7 @@ from backlash_ros.tools.bringup import environment
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
 from backlash_ros.tools.bringup.supervisor import ProcessPlan
-from backlash_ros.tools.bringup.watch import ProgressDisplay, describe
+from backlash_ros.tools.bringup.watch import AxisProgress, describe
 from backlash_ros.tools.config import effective_parameters
 
 CONFIG = ROOT / 'config' / 'two_axes.yaml'
@@ -54,6 +54,9 @@ DRIVER = 'drive --axis {axis}'
         (['--set', 'axes=[a, b]', '--set', 'b/backlash.c_l=4'], ['b: backlash.c_l=4.0', '<']),
         (['--set', 'axes=[a, b]', '--set', 'estimates.file=e'], ["'e'", 'of a and of b']),
         (['--set', 'axes=[a, b, c, d, e, f, g, h]'], ['8 axes', 'at most 7']),
+        (['--config', 'arm.yaml'], ["driver=''", 'several joints', '`simulate --axis JOINT`']),
+        (['--config', 'arm.yaml', '--driver', 'x', '--set', 'waist/control.max=.inf'],
+         ['waist.control.max=inf', 'give --unlimited']),
         (['--config', 'nowhere.yaml'], ['nowhere.yaml']),
         (['--out', '/proc/nowhere'], ['/proc/nowhere']),
         (['--speed', '3'], ['--speed']),
@@ -214,7 +217,7 @@ def test_progress_names_the_axis_and_an_endless_run_has_no_total(tmp_path: Path)
     stream = io.StringIO()
     progress = {'sample': 149, 'm': 1.0, 'lost': 0}
     for axis in (*plan(tmp_path, '', 'x', samples=200).axes, *plan(tmp_path, '', samples=0).axes):
-        ProgressDisplay(axis, stream).show(progress, 150)
+        AxisProgress(axis, stream).take(progress)
     first, second = stream.getvalue().splitlines()
     assert first.startswith('x:    1.50 s  150/200  m 1')
     assert second.startswith('   1.50 s  150  m 1')

@@ -65,6 +65,23 @@ def test_of_an_arm_one_joint_is_chosen(config: Path) -> None:
         effective_parameters(config, axis='waist')
 
 
+def test_values_of_joints_are_written_back_and_may_stand_apart_from_their_list(
+    config: Path, tmp_path: Path,
+) -> None:
+    written(config, """/**: {ros__parameters: {joints: [waist, wrist], sample_period: 0.02}}
+/controller: {ros__parameters: {waist: {plant: {denominator: [1, -0.5], numerator: [0.5]}}}}""")
+    configuration = read_configuration(config, ['waist/control.max=3'])
+    parameters = configuration.of_controller()
+    assert parameters.of_joint('waist')['control.max'] == 3.0
+    copy = tmp_path / 'copy.yaml'
+    write_config(parameters, copy)
+    again = read_configuration(copy).of_controller()
+    for joint in ('waist', 'wrist'):
+        assert again.of_joint(joint) == parameters.of_joint(joint)
+    with pytest.raises(InputError, match="no axis 'wist' among waist, wrist"):
+        read_configuration(config, ['wist/control.max=3'])
+
+
 def test_shipped_file_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     assert find_config(Path('geared_motor.yaml')).is_file()
