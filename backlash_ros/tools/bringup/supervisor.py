@@ -24,6 +24,7 @@ from pathlib import Path
 from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.cli import BrokenOffError
 
+NUM_THREADS = 14  # of the fields behind the process group in /proc/PID/stat
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
@@ -262,8 +263,10 @@ def _lives_in(stat: Path, group: int) -> bool:
     except OSError:
         return False
     # The name of the program stands in parentheses and may hold anything.
-    state, _, its_group = text.rpartition(')')[2].split()[:3]
-    return int(its_group) == group and state not in ('Z', 'X')
+    state, _, its_group, *others = text.rpartition(')')[2].split()
+    # A process whose main thread has ended is shown as a zombie while other threads still end.
+    has_ended = state == 'X' or (state == 'Z' and int(others[NUM_THREADS]) == 1)
+    return int(its_group) == group and not has_ended
 
 
 def guard(lines: Iterable[str]) -> None:
