@@ -21,9 +21,11 @@ from ros_processes import ros_world
 
 from backlash_ros import topics
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
+from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import effective_parameters
-from backlash_ros.tools.runs.bag import read_bag
+from backlash_ros.tools.records.reading import read_record
+from backlash_ros.tools.runs.source import read_run
 
 TWO_AXES = ROOT / 'config' / 'two_axes.yaml'
 BIAS = {'pan': 0.5, 'tilt': 0.25}
@@ -91,7 +93,14 @@ def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_p
     assert session.survivors() == {}
     simulated = build_closed_loop(effective_parameters(None, settings, 5)).run(samples)
     bag = session.out / 'bag'
-    assert_same(read_bag(bag).record, simulated)
+    source = read_run(bag)
+    assert_same(source.record, simulated)
+    assert source.parameters is not None
+    assert parting(source.record, replay(source.record, source.parameters)) is None
+    record, rows = read_record(session.out), np.round(simulated.column('t') / 0.01).astype(int)
+    assert record.v[rows].tolist() == simulated.column('v').tolist()
+    assert record.y[rows].tolist() == simulated.column('y').tolist()
+    assert record.lost == len(record.y) - len(rows)
     counts = bag_counts(bag)
     for topic in (topics.PLANT_OUTPUT, topics.REFERENCE, topics.CONTROL, topics.SIGNALS):
         assert counts[topic] == simulated.samples

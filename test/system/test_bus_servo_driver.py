@@ -6,7 +6,6 @@ import math
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -92,55 +91,43 @@ class World:
         return self.log.read_text()
 
 
-@pytest.fixture
-def arm(tmp_path: Path) -> Iterator[World]:
+def test_joints_follow_through_silence_and_a_pulled_plug_and_are_limp_at_the_end(
+    tmp_path: Path,
+) -> None:
     with ExitStack() as stack:
-        yield World(tmp_path, stack)
+        arm = World(tmp_path, stack)
 
+        def await_log(words: str) -> None:
+            arm.probe.wait_until(lambda: words in arm.log.read_text(), words)
 
-def test_joints_follow_both_forms_of_command_and_are_limp_at_the_end(arm: World) -> None:
-    assert list(arm.heard[0].name) == NAMES
-    goals = [0.3, -0.2, 0.25, 0.5, -0.4, 0.35]
-    arm.probe.wait_until(lambda: arm.told(goals), 'the arm')
+        assert list(arm.heard[0].name) == NAMES
+        goals = [0.3, -0.2, 0.25, 0.5, -0.4, 0.35]
+        arm.probe.wait_until(lambda: arm.told(goals), 'the arm')
+        # Names in another order, one that is nobody's, one without a position; the others stay.
+        message = JointState(name=['elbow', 'nobody', 'waist', 'shoulder'],
+                             position=[0.1, 1.0, -0.1, math.nan])
+        expected = [-0.1, -0.2, 0.1, 0.5, -0.4, 0.35]
+
+        def went() -> bool:
+            arm.by_name.publish(message)
+            return list(arm.applied[-1].position) == pytest.approx(expected, abs=RESOLUTION)
+
+        arm.probe.wait_until(went, 'the named joints')
+        arm.bus.dead.add(2)
+        others = [name for name in NAMES if name != 'shoulder']
+        arm.probe.wait_until(lambda: arm.heard[-1].name == others, 'messages without the joint')
+        await_log('shoulder is silent')
+        arm.bus.dead.clear()
+        arm.probe.wait_until(lambda: arm.told([0.1] * 6), 'all joints')
+        arm.port.close()
+        await_log('waist is silent')
+        arm.port = Port(arm.bus, arm.link)
+        arm.probe.wait_until(lambda: arm.told([-0.3] * 6), 'all joints')
+        log = arm.stop()
     assert arm.bus.largest <= MOST
-    # Names in another order, one that is nobody's, one without a position; the others stay.
-    message = JointState(name=['elbow', 'nobody', 'waist', 'shoulder'],
-                         position=[0.1, 1.0, -0.1, math.nan])
-    expected = [-0.1, -0.2, 0.1, 0.5, -0.4, 0.35]
-
-    def went() -> bool:
-        arm.by_name.publish(message)
-        return list(arm.applied[-1].position) == pytest.approx(expected, abs=RESOLUTION)
-
-    arm.probe.wait_until(went, 'the named joints')
-    log = arm.stop()
-    assert [servo.get(TORQUE_ENABLE) for servo in arm.bus.servos.values()] == [0] * 6
-    assert re.search(r'\d+ cycles, \d+ of them lost; torque is off$', log, re.MULTILINE)
-
-
-def test_a_silent_servo_is_named_and_comes_back_while_the_others_go_on(arm: World) -> None:
-    goals = [0.2] * 6
-    arm.probe.wait_until(lambda: arm.told(goals), 'the arm')
-    others = [name for name in NAMES if name != 'shoulder']
-    arm.bus.dead.add(2)
-    arm.probe.wait_until(lambda: arm.heard[-1].name == others, 'messages without the joint')
-    arm.probe.wait_until(lambda: 'shoulder is silent' in arm.log.read_text(), 'a word about it')
-    arm.bus.dead.clear()
-    arm.probe.wait_until(lambda: arm.told([0.1] * 6), 'all joints')
-    assert arm.bus.largest <= MOST
-    arm.stop()
-
-
-def test_a_pulled_plug_is_counted_and_its_return_makes_nothing_jump(arm: World) -> None:
-    arm.probe.wait_until(lambda: arm.told([0.3] * 6), 'the arm')
-    arm.port.close()
-    arm.probe.wait_until(lambda: 'waist is silent' in arm.log.read_text(), 'a word about it')
-    arm.port = Port(arm.bus, arm.link)
-    arm.probe.wait_until(lambda: arm.told([-0.3] * 6), 'all joints')
-    assert arm.bus.largest <= MOST
-    found = re.search(r'(\d+) cycles, (\d+) of them lost', arm.stop())
+    found = re.search(r'(\d+) cycles, (\d+) of them lost; torque is off$', log, re.MULTILINE)
     assert found
     assert 0 < int(found[2]) < int(found[1])
-    assert {servo.get(GOAL) for servo in arm.bus.servos.values()} == {
-        CENTRE + round(-0.3 / RESOLUTION)
-    }
+    servos = arm.bus.servos.values()
+    assert [servo.get(TORQUE_ENABLE) for servo in servos] == [0] * 6
+    assert {servo.get(GOAL) for servo in servos} == {CENTRE + round(-0.3 / RESOLUTION)}

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 from places import ROOT
-from ros_processes import ros_world
-from std_msgs.msg import Float64MultiArray
 
-from backlash_ros import topics
 from backlash_ros.tools.bringup.environment import child_environment, free_domain
 
 EXAMPLES = ROOT / 'examples'
@@ -28,38 +22,6 @@ BLOCKS = re.findall(
 FOREVER = ('motor_driver.py', 'bare_dds_driver.py', '/controller', '/reference')
 SHORT = {'--duration': '2'}  # s; the pages give a user more time
 DEADLINE_S = 240.0
-
-
-@contextmanager
-def running(
-    command: list[str], environment: dict[str, str], folder: Path = ROOT
-) -> Iterator[subprocess.Popen[bytes]]:
-    """A process that is ended with the context."""
-    process = subprocess.Popen(
-        command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
-def test_a_bare_dds_program_is_a_driver_and_ends_on_a_signal(tmp_path: Path) -> None:
-    pytest.importorskip('cyclonedds')
-    with ros_world(tmp_path) as world:
-        probe = world.probe()
-        heard = probe.collect(topics.ESTIMATES, Float64MultiArray)
-        world.start('reference')
-        world.start('controller', {'estimator.use_applied_control': True})
-        command = [sys.executable, str(EXAMPLES / 'bare_dds_driver.py')]
-        with running(command, world.environment) as driver:
-            probe.wait_until(
-                lambda: heard and np.allclose(heard[-1].data[:3], (1.3, 3.0, -3.0), rtol=0.01),
-                'estimates within 1 %',
-            )
-            driver.send_signal(signal.SIGTERM)
-            assert driver.wait(DEADLINE_S) == 0
 
 
 def commands_of_driver_page() -> list[list[str]]:
@@ -98,7 +60,7 @@ def page_in_parts() -> list[list[list[str]]]:
     return parts
 
 
-def test_commands_of_the_driver_page_run(tmp_path: Path) -> None:
+def test_commands_of_the_driver_page_run_and_its_drivers_end_on_a_signal(tmp_path: Path) -> None:
     pytest.importorskip('cyclonedds')
     for name in ('examples', 'config'):
         (tmp_path / name).symlink_to(ROOT / name)
@@ -110,10 +72,19 @@ def test_commands_of_the_driver_page_run(tmp_path: Path) -> None:
                 for words in part:
                     run_or_start(words, environment, tmp_path, started)
                 assert all(process.poll() is None for process in started)
+                for process in started:
+                    if '_driver.py' in process.args[1]:
+                        process.terminate()
+                        assert process.wait(DEADLINE_S) == 0, process.args
             finally:
                 for process in started:
                     process.kill()
                     process.wait()
+    found = json.loads((tmp_path / 'identified' / 'identified.json').read_text())
+    assert found['gap'] == pytest.approx(0.9, abs=0.01)
+    assert found['c_r'] == pytest.approx(0.55, abs=0.01)
+    assert found['delay_samples'] == 0
+    assert sum(found['numerator']) / sum(found['denominator']) == pytest.approx(1.0, rel=0.01)
 
 
 def run_or_start(

@@ -7,7 +7,6 @@ import signal
 from pathlib import Path
 
 import numpy as np
-import pytest
 from drivers.paced_driver import controller_and_driver
 from ros_processes import NodeProcess, ros_world
 from waiting import wait_until
@@ -33,7 +32,7 @@ def workers_of(controller: NodeProcess) -> list[int]:
     return found
 
 
-def test_a_worker_that_is_killed_again_and_again_costs_no_estimate(
+def test_a_worker_that_is_killed_costs_no_estimate_and_ends_with_its_controller(
     tmp_path: Path,
 ) -> None:
     with ros_world(tmp_path) as world:
@@ -50,28 +49,10 @@ def test_a_worker_that_is_killed_again_and_again_costs_no_estimate(
             )
         assert driver.says('the process that makes the fits died')
         driver.run_until(lambda: workers_of(controller), 'another worker')
+        (pid,) = workers_of(controller)
         held = np.array([message.data[:3] for message in driver.estimates[learned:]])
         assert np.abs(held / [1.3, 3.0, -3.0] - 1.0).max() < 0.02
         driver.check_sanity()
         assert controller.stop() == 0
-        assert 'Traceback' not in controller.stderr
-
-
-@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])
-def test_no_worker_outlives_its_controller(tmp_path: Path, number: signal.Signals) -> None:
-    with ros_world(tmp_path) as world:
-        controller, driver = controller_and_driver(world, reports_applied=True, **UNCERTAIN)
-        driver.learn()
-        (pid,) = workers_of(controller)
-        controller.send(number)
-        driver.run_until(lambda: controller.process.poll() is not None, 'the end')
         wait_until(lambda: not Path(f'/proc/{pid}').exists(), 'the end of the worker')
         assert 'Traceback' not in controller.stderr
-
-
-def test_a_law_that_fits_nothing_has_no_worker(tmp_path: Path) -> None:
-    with ros_world(tmp_path) as world:
-        controller, driver = controller_and_driver(world, **{'estimator.law': 'lms'})
-        driver.run_until(lambda: len(driver.estimates) > 20, 'estimates')
-        assert workers_of(controller) == []
-        assert controller.stop() == 0

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import csv
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from bringup_processes import UNDRAWN
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from undrawn import leave_out
 
@@ -19,10 +16,7 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import simulate as simulate
-from backlash_ros.tools.bringup.environment import child_environment, free_domain
-from backlash_ros.tools.records.reading import read_record
 from backlash_ros.tools.replay.command import main
-from backlash_ros.tools.runs.source import read_run
 
 NOISY = {'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
 # Losses, a structure that feeds y back, a learned G, a law of another kind, a limited v.
@@ -136,25 +130,6 @@ def test_several_runs_and_values_give_a_table(recorded: Path, tmp_path: Path) ->
         'plant.uncertainty=0', 'plant.uncertainty=0.1',
     ] * 2
     assert all(float(row['c_r']) == pytest.approx(3.0, rel=0.05) for row in rows)
-
-
-def test_the_bag_of_a_run_in_lockstep_is_replayed_and_read(tmp_path: Path) -> None:
-    with free_domain() as domain:
-        done = subprocess.run(
-            [sys.executable, str(UNDRAWN), '--duration', '2', '--lockstep',
-             '--set', 'output_loss=0.1', '--set', 'output_noise_std=1e-4',
-             '--out', str(tmp_path / 'run')],
-            env=child_environment(tmp_path, domain), capture_output=True, text=True, timeout=150.0,
-        )
-    assert done.returncode == 0, done.stderr
-    source = read_run(tmp_path / 'run' / 'bag')
-    assert source.parameters is not None
-    assert parting(source.record, replay(source.record, source.parameters)) is None
-    record = read_record(tmp_path / 'run')
-    rows = np.round(source.record.column('t') / 0.01).astype(int)
-    assert record.v[rows].tolist() == source.record.column('v').tolist()
-    assert record.y[rows].tolist() == source.record.column('y').tolist()
-    assert record.lost == len(record.y) - len(rows)
 
 
 @pytest.mark.parametrize('arguments', [
