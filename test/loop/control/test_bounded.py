@@ -95,20 +95,6 @@ def test_u_d_stays_within_a_stated_multiple_of_what_is_asked(
         assert abs(step.u_d) <= 1.05 * (1.0 + allowed) * asked
 
 
-def test_a_sign_that_is_wrong_from_the_start_moves_v_no_further_than_that() -> None:
-    p = Parameters({'structure': 'tracking', 'amplitude': 0.2})
-    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
-    v = []
-    for k in range(1000):
-        step = controller.step(-plant.measure(), reference(k * 0.01))
-        controller.refine()
-        plant.step(step.v)
-        v.append(abs(step.v))
-    asked = asked_by_the_reference('tracking') / 0.696 + 0.5  # through the first guess
-    assert max(v) <= (1.0 + LARGEST_IN_ACQUISITION) * asked
-    assert max(v[600:]) <= 1.01 * max(v[:600])
-
-
 class Told:
     """An estimator that knows what it is told, and x of no plant."""
 
@@ -136,21 +122,6 @@ def structure_named(name: str) -> Structure:
     if name == 'tracking':
         return Tracking(DESIGN, WEIGHTS, 1.0, 1e-3)
     return Proportional() if name == 'proportional' else PolePlacement(BLOCKS)
-
-
-@pytest.mark.parametrize('status', [Status.TRACKING, Status.ACQUIRING, Status.INCONSISTENT])
-def test_a_state_far_from_the_trajectory_moves_a_loop_at_rest_no_further(status: Status) -> None:
-    structure, source = structure_named('tracking'), Told()
-    inverse = BacklashInverse()
-    source.x_cov = 1e-12 * np.eye(2)
-    known = Estimate(1.0, 1.0, -1.0, 0.1, 1e-6, 1e-6, 1e-6, status)
-    asked = 2.0  # the u that the gap takes
-    rng = np.random.default_rng(1)
-    for k in range(600):
-        # A sensor that shows something else, once the reference has rested for long.
-        source.x_hat = (1e6 * rng.standard_normal(2)).tolist() if k > 300 else [0.0, 0.0]
-        command = structure.control(ControlInput(0.0, 0.0, known, source), inverse)
-        assert abs(command.u_d) <= (1.0 + LARGEST_FEEDBACK) * asked, k
 
 
 @settings(max_examples=200)

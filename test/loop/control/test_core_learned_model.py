@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isnan, nan
+from math import isnan
 
 import numpy as np
 import pytest
@@ -55,14 +55,6 @@ def test_a_model_without_its_delay_is_the_same_with_it(
     assert again.delay == 1 or again.denominator[-1] != 0.0
 
 
-def test_delay_of_the_parameters_comes_out_as_it_was_told() -> None:
-    p = MOTOR.replaced({'control.delay_samples': 2})
-    found = learned(build_closed_loop(p))
-    assert found.numerator == p.get_floats('plant.numerator')
-    assert found.denominator == p.get_floats('plant.denominator')
-    assert found.delay_samples == 2
-
-
 def test_before_anything_is_learned_the_told_model_stands_without_deviations() -> None:
     loop = build_closed_loop(MOTOR)
     found = learned(loop)
@@ -104,20 +96,6 @@ def test_the_structure_gets_a_finer_model_than_the_fit_needs() -> None:
     assert loop.controller.estimator.learned_model is adopted
 
 
-def test_exact_model_has_no_deviations() -> None:
-    found = build_closed_loop(MOTOR.replaced({'plant.uncertainty': 0.0})).run(600).learned
-    assert found is not None
-    assert found.response_std == (0.0,) * len(FREQUENCIES)
-
-
-def test_a_law_that_learns_no_model_goes_by_the_told_one() -> None:
-    p = MOTOR.replaced({'estimator.law': 'lms'})
-    found = build_closed_loop(p).run(50).learned
-    assert found is not None
-    assert found.numerator == p.get_floats('plant.numerator')
-    assert isnan(found.noise_ratio)
-
-
 @given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=4), st.integers(0, 5))
 def test_fields_hold_all(numbers: list[float], delay: int) -> None:
     model = LearnedModel(
@@ -144,16 +122,6 @@ def test_wrong_sign_is_told_until_there_is_an_estimate() -> None:
     loop.run(800)
     assert loop.controller.estimator.estimate.learned
     assert not report(loop).wrong_sign
-
-
-def test_samples_wait_while_there_is_no_time_for_a_fit() -> None:
-    loop = build_closed_loop(MOTOR)
-    loop.run(400)
-    few = report(loop).waiting
-    assert few < 64
-    loop.controller.refine = lambda budget_s=nan: None  # type: ignore[method-assign]
-    loop.run(100)
-    assert report(loop).waiting >= 99 + few
 
 
 @pytest.mark.parametrize('waveform', ['triangle', 'multisine'])

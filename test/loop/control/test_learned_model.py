@@ -277,12 +277,3 @@ def test_only_structures_that_depend_on_a_model_refuse_one() -> None:
     assert Proportional().redesign(model)() is not None
     closed = np.poly([0.5, 0.5])
     assert PolePlacement(place_poles(motor(), closed, 0.2)).redesign(model)() is None
-
-
-def test_weights_follow_the_model() -> None:
-    # A plant that moves ten times as far for the same u gets a tenth of the feedback.
-    once = motor()
-    tenfold = TransferFunction((10.0 * once.numerator).tolist(), once.denominator.tolist())
-    weak, strong = (design(StateModel(m), WEIGHTS).gains for m in (tenfold, once))
-    assert 10.0 * weak.state == pytest.approx(strong.state, rel=1e-6)
-    assert 10.0 * weak.preview == pytest.approx(strong.preview, rel=1e-6)

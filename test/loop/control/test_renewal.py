@@ -62,13 +62,3 @@ def test_proportional_loop_that_knows_the_backlash_does_not_notice() -> None:
     followed(build_closed_loop(p), unchanged, AT[-1] + 50)
     for v in renewed(p, AT, 50):
         assert v == pytest.approx(np.array(unchanged[:len(v)]))
-
-
-def test_v_that_was_moved_meanwhile_is_where_the_next_command_starts() -> None:
-    p = Parameters({'structure': 'tracking', 'amplitude': 0.2, 'estimator.law': 'fixed'})
-    loop = build_closed_loop(p)
-    loop.run(300)
-    again = build_controller(p, loop.controller.estimator.estimate)
-    again.go_on_from(loop.controller)
-    again.start_from(1.5)
-    assert again.step(loop.plant.measure(), loop.reference(3.0)).v == 1.5

@@ -60,14 +60,6 @@ def test_v_engages_once_where_the_engaged_side_is_unknown(initial_u: float, band
     assert turns(v, 0.5 * GAP) <= 1
 
 
-def test_noise_of_y_does_not_make_v_cross_the_gap() -> None:
-    asked, noise = slow(30.0), 1e-3
-    v, error = moved(asked, output_noise_std=noise, estimator__output_noise_std=noise,
-                     fixed__doubt=0.1)
-    assert turns(v, 0.5 * GAP) <= turns(asked, 0.1) + 3
-    assert error < 0.2 * noise
-
-
 def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
     rng = np.random.default_rng(3)
     asked = [np.zeros(200)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -101,16 +100,6 @@ class SilentDriver:
         self.loop.take_applied(reported, stamp_ns - 1)
         self.loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, self._k))
         return self.sent[-1]
-
-
-def test_limits_that_were_narrowed_meanwhile_are_met_at_the_rate() -> None:
-    driver = SilentDriver()
-    before = driver.sent[-1]
-    driver.narrow(3.0)
-    assert driver.answer(before) == pytest.approx(before - MOVE)
-    while driver.sent[-1] > 3.0:
-        before = driver.sent[-1]
-        assert driver.answer(before) == pytest.approx(max(before - MOVE, 3.0))
 
 
 @given(reported=st.floats(-1e12, 1e12), high=st.sampled_from([3.0, 9.0]))

@@ -7,7 +7,6 @@ from math import sin, sqrt
 
 import numpy as np
 import pytest
-from cases.cramer_rao import cramer_rao
 from contract.judged import judged
 from contract.learning_rows import PAPER as EXACT
 from contract.learning_rows import Job, Outcome, run_job, run_random
@@ -154,31 +153,3 @@ def test_ill_conditioned_data_neither_break_the_filters_nor_mislead(
         std = np.array([run.column(f'std_{name}')[-1] for name in ('m', 'c_r', 'c_l')])
         error = np.abs([run.column(name)[-1] for name in ('m', 'c_r', 'c_l')] - np.array(TRUTH))
         assert np.all(error <= 5.0 * std + 1e-5 * np.abs(TRUTH))
-
-
-def test_bound_of_the_benchmark_equals_the_inverse_of_a_numerical_information_matrix() -> None:
-    v = 10.0 * np.sin(0.126 * np.arange(150))
-    found = cramer_rao(v, *PAPER, TRUTH, 1e-3)
-    sensitivity = np.column_stack([
-        (_output(v, unknowns + step) - _output(v, unknowns - step)) / (2.0 * step.max())
-        for unknowns, step in ((UNKNOWNS, 1e-4 * axis) for axis in np.eye(7))
-    ])
-    expected = 1e-3 * np.sqrt(np.diag(np.linalg.inv(sensitivity.T @ sensitivity)))
-    assert found == pytest.approx(expected[:3], rel=1e-4)
-
-
-UNKNOWNS = np.array([*TRUTH, 0.0, 0.01, 0.01, 0.01])  # and u and the state at the start
-
-
-def _output(v: np.ndarray, unknowns: np.ndarray) -> np.ndarray:
-    """y(0..N) of the example, simulated sample by sample from the paper's equations."""
-    m, c_r, c_l, u, *x = unknowns
-    numerator, denominator = PAPER
-    y = []
-    for value in [*v, 0.0]:
-        y.append(x[0])
-        u = min(max(u, m * (value - c_r)), m * (value - c_l))
-        x = [x[1] - denominator[1] * x[0] + numerator[0] * u,
-             x[2] - denominator[2] * x[0] + numerator[1] * u,
-             -denominator[3] * x[0] + numerator[2] * u]
-    return np.array(y)

@@ -80,15 +80,6 @@ def test_held_estimates_do_not_move_and_learning_can_go_on(law: str) -> None:
         assert errors([controller.estimator.estimate])[0] < 0.05
 
 
-def test_estimator_that_is_held_before_it_knows_anything_learns_afterwards() -> None:
-    p = Parameters({**EXACT, 'output_noise_std': 1e-3})
-    loop, controller = Loop(p), build_controller(p)
-    controller.estimator.adapting = False
-    assert {e.m for e in loop.run(controller, 100)} == {0.696}
-    controller.estimator.adapting = True
-    assert errors(loop.run(controller, 400)[-1:])[0] < 0.02
-
-
 @pytest.mark.parametrize('structure', ['proportional', 'tracking'])
 @pytest.mark.parametrize('deaf', [5, 25, 150])
 def test_driver_that_does_not_hear_v_at_first_spoils_nothing(structure: str, deaf: int) -> None:

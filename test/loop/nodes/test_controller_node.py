@@ -221,14 +221,6 @@ def test_who_waits_hears_of_a_controller_throughout_its_last_ramp(
         made.wait_until(lambda: len(heard) >= before + steps - 1, 'a word at each step')
 
 
-def test_saving_without_a_file_says_what_to_do() -> None:
-    with bench() as made:
-        made.run(5)
-        answer = made.trigger('save_estimates')
-        assert not answer.success
-        assert 'start with -p estimates.file:=PATH, or set it while unconfigured' in answer.message
-
-
 def test_live_parameters_change_together_or_not_at_all() -> None:
     with bench(structure='tracking', **{'control.min': -200.0, 'control.max': 200.0}) as made:
         made.run(200)

@@ -116,15 +116,6 @@ def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(
     assert result_of(channel) == -4
 
 
-def test_what_a_job_prints_is_no_result(capfd: pytest.CaptureFixture[str]) -> None:
-    executor = WorkerExecutor()  # here: pytest captures the output of a fixture elsewhere
-    channel = executor.open()
-    channel.submit(print, 'said by a job')
-    assert result_of(channel) is None
-    executor.close()
-    assert capfd.readouterr().err == 'said by a job\n'
-
-
 def test_a_worker_imports_neither_ros_nor_the_program_that_started_it(
     executor: WorkerExecutor,
 ) -> None:

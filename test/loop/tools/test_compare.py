@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.compare import HEADER, Result, compare, contenders, main, row
+from backlash_ros.tools.compare import HEADER, compare, contenders, main
 
 
 def test_document_and_figure_come_from_one_command(
@@ -21,16 +21,6 @@ def test_document_and_figure_come_from_one_command(
     for contender in contenders(Parameters()):
         assert f'| {contender.name} |' in page
         assert contender.name in printed
-
-
-def test_without_a_folder_it_writes_where_all_results_go(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(['--duration', '2.5']) == 0
-    assert [path.name for path in tmp_path.iterdir()] == ['results']
-    assert (tmp_path / 'results' / 'latest' / 'comparison.md').is_file()
-    assert 'document: results/' in capsys.readouterr().out
 
 
 def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -47,8 +37,3 @@ def test_learned_backlash_costs_less_than_an_uncompensated_one() -> None:
     assert merits['no backlash, tracking']['backlash penalty'] == 0.0
     assert plain['backlash penalty'] > 0.0
     assert learned['control error'] < 0.01 * plain['control error']
-
-
-def test_a_loop_that_breaks_off_is_named_and_not_dropped() -> None:
-    broken = Result(contenders(Parameters())[0], note='it broke off')
-    assert row(broken)[:2] == (broken.contender.name, 'broke off')

@@ -53,17 +53,6 @@ def test_other_parameters_part_from_the_run_and_learn_from_its_v() -> None:
     assert again.column('c_r')[-1] == pytest.approx(3.0, rel=0.02)
 
 
-def test_a_controller_that_would_have_moved_otherwise_learns_from_what_was_moved() -> None:
-    """The first guess is so wrong that its own commands tell nothing of the record."""
-    parameters = Parameters({'plant.uncertainty': 0.0, **NOISY})
-    run = build_closed_loop(parameters).run(300)
-    again = replay(run, parameters.replaced({
-        'estimator.initial.m': 5.0, 'proportional.f': 0.0,
-    }))
-    assert again.column('m')[-1] == pytest.approx(1.3, rel=0.01)
-    assert again.column('c_l')[-1] == pytest.approx(-3.0, rel=0.01)
-
-
 def test_what_the_driver_reports_is_learned_from() -> None:
     """A driver that applies half of each command, and says so."""
     parameters = Parameters({

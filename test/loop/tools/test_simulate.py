@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from math import inf, isnan, nan
+from math import inf, nan
 from pathlib import Path
 
 import pytest
@@ -17,11 +17,9 @@ from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.tools import batch
 from backlash_ros.tools.batch import Outcome, Sweep, statistics
 from backlash_ros.tools.cli import InputError, number_of_samples
-from backlash_ros.tools.runs.run import run_loop
 from backlash_ros.tools.simulate import main
 
 NOISY = ['--set', 'output_noise_std=1e-3', '--set', 'estimator.law=lms']
@@ -52,29 +50,6 @@ def test_run_writes_its_results_and_prints_a_table(
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[1:4]] == ['m', 'c_r', 'c_l']
     assert lines[-1] == f'report: {tmp_path / "report.html"}'
-
-
-@pytest.mark.usefixtures('one_processor')
-def test_sweep_over_true_plants_that_differ_from_the_known_one(tmp_path: Path) -> None:
-    sweep = ['--sweep', 'truth.scale_frequency=0.8,1,1.2', '--set', 'estimator.law=lms']
-    arguments = ['--duration', '1', '--config', 'geared_motor.yaml', *sweep]
-    assert main([*arguments, '--out', str(tmp_path)]) == 0
-    rows = rows_of(tmp_path / 'sweep.csv')
-    assert [float(row['truth.scale_frequency']) for row in rows] == [0.8, 1.0, 1.2]
-    assert len({row['tracking_error_rms'] for row in rows}) == 3
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_true_plant_of_a_file_is_simulated(tmp_path: Path) -> None:
-    text = '/plant: {ros__parameters: {truth: {numerator: [0.5], denominator: [1.0, -0.5]}}}'
-    (tmp_path / 'my.yaml').write_text(text)
-    arguments = ['--duration', '1', '--set', 'estimator.law=fixed']
-    assert main([*arguments, '--config', str(tmp_path / 'my.yaml'), '--out', str(tmp_path)]) == 0
-    rows = rows_of(tmp_path / 'samples.csv')
-    y, u = ([float(row[name]) for row in rows] for name in ('y', 'u'))
-    assert max(map(abs, u)) > 1.0
-    # u is what the backlash lets through, y what the true plant makes of it.
-    assert y[1:] == pytest.approx([0.5 * a + 0.5 * b for a, b in zip(y, u, strict=True)][:-1])
 
 
 def test_seed_decides_every_sample() -> None:
@@ -119,21 +94,6 @@ def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
         for noise in ('0.0001', '0.001') for law in ('lms', 'printed') for seed in ('1', '2')
     ]
     assert (tmp_path / 'sweep.png').read_bytes().startswith(b'\x89PNG')
-
-
-def test_swept_seed_and_sample_period_take_effect() -> None:
-    changes = batch.combinations([Sweep('seed', (3, 4)), Sweep('sample_period', (0.01, 0.02))])
-    jobs = batch.make_jobs(noisy(), changes, [1], 1.0)
-    assert [(job.values['seed'], job.samples) for job in jobs] == [
-        (3, 100), (3, 50), (4, 100), (4, 50)
-    ]
-
-
-def test_file_as_reference_is_followed(tmp_path: Path) -> None:
-    path = tmp_path / 'y_m.csv'
-    path.write_text('t,y_m\n' + ''.join(f'{k * 0.01!r},{k / 8}\n' for k in range(40)))
-    loop = build_closed_loop(noisy({'waveform': 'file', 'file': str(path), 'amplitude': 1.0}))
-    assert run_loop(loop, 40).column('y_m').tolist() == [k / 8 for k in range(40)]
 
 
 @pytest.mark.parametrize(
@@ -186,10 +146,6 @@ def test_sweep_lists_values_as_in_yaml(text: str, expected: Sweep) -> None:
     assert batch.parse_sweep(text) == expected
 
 
-def test_no_sweep_is_one_combination() -> None:
-    assert batch.combinations([]) == [{}]
-
-
 def test_length_comes_from_the_duration_or_the_parameter() -> None:
     assert number_of_samples(Parameters(), None) == 1000
     assert number_of_samples(Parameters({'samples': 30}), None) == 30
@@ -221,11 +177,6 @@ def test_statistics_are_those_of_the_errors() -> None:
     assert of['c_r'].within == 1.0
 
 
-def test_nees_needs_every_standard_deviation() -> None:
-    of = statistics([outcome(0.01, 1.0, 0.01), outcome(0.01, 1.0)])
-    assert isnan(of['m'].nees)
-
-
 def test_run_that_broke_off_is_left_out_of_the_statistics() -> None:
     of = statistics([outcome(0.01, 1.0), {'problem': 'y=inf'}])
     assert of['m'].rmse == pytest.approx(0.01)
@@ -239,16 +190,6 @@ def test_run_that_breaks_off_says_why() -> None:
     broken = batch.run_job(job)
     assert 'must be finite' in str(broken['problem'])
     assert broken['m'] is None
-
-
-def test_single_run_that_breaks_off_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    arguments = ['--set', 'amplitude=1e99', '--duration', '1', '--out', str(tmp_path)]
-    assert main(arguments) == 1
-    err = capsys.readouterr().err
-    assert err.startswith('simulate: the run broke off: ')
-    assert err.count('\n') == 1
 
 
 def test_bad_combination_is_refused_before_anything_runs() -> None:

@@ -25,18 +25,6 @@ def as_printed(
     return u_d / m + c_r
 
 
-@given(play=plays(), signal=signals())
-def test_exact_inverse_cancels_a_backlash_at_rest_from_the_first_sample(
-    play: Play, signal: list[float],
-) -> None:
-    backlash, inverse = Backlash(play.m, play.c_r, play.c_l), BacklashInverse()
-    for u_d in signal:
-        v = inverse.step(u_d, play.m, play.c_r, play.c_l)
-        if inverse.side == Region.GAP:
-            continue  # u_d has not moved yet, and nothing drives the backlash
-        assert backlash.step(v) == pytest.approx(u_d, abs=play.rounding(u_d))
-
-
 @given(play=plays(), u=st.floats(-100.0, 100.0), signal=signals())
 def test_exact_inverse_cancels_any_backlash_after_the_first_engagement(
     play: Play, u: float, signal: list[float],
@@ -50,14 +38,6 @@ def test_exact_inverse_cancels_any_backlash_after_the_first_engagement(
             assert u == pytest.approx(u_d, abs=play.rounding(u_d))
 
 
-@given(play=plays())
-def test_a_swing_wider_than_the_held_output_engages(play: Play) -> None:
-    backlash, inverse = Backlash(play.m, play.c_r, play.c_l, 5.0), BacklashInverse()
-    for u_d in (7.0, -7.0, 2.0):
-        u = backlash.step(inverse.step(u_d, play.m, play.c_r, play.c_l))
-    assert u == pytest.approx(2.0, abs=play.rounding(7.0))
-
-
 @given(samples=st.lists(st.tuples(plays(), st.floats(-100.0, 100.0)), min_size=1, max_size=40))
 def test_adaptive_inverse_equals_the_three_printed_cases(
     samples: list[tuple[Play, float]],
@@ -68,16 +48,6 @@ def test_adaptive_inverse_equals_the_three_printed_cases(
         v = inverse.step(u_d, play.m, play.c_r, play.c_l)
         assert v == as_printed(u_d, u_d_before, v_before, play.m, play.c_r, play.c_l)
         u_d_before, v_before = u_d, v
-
-
-@given(play=usual_plays(), signal=signals())
-def test_asking_for_the_direction_changes_nothing(play: Play, signal: list[float]) -> None:
-    asked, untouched = BacklashInverse(1.0), BacklashInverse(1.0)
-    for u_d in signal:
-        asked.direction(-u_d)
-        assert asked.step(u_d, play.m, play.c_r, play.c_l) == untouched.step(
-            u_d, play.m, play.c_r, play.c_l
-        )
 
 
 @given(

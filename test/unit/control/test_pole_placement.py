@@ -76,21 +76,6 @@ def closed_of(p: Parameters) -> np.ndarray:
     return build_four_blocks(p).reference.denominator
 
 
-def test_exact_inverse_makes_the_backlash_vanish() -> None:
-    known = {
-        'structure': 'pole_placement', 'estimator.law': 'fixed', 'estimator.initial.m': 1.3,
-        'amplitude': 0.2,
-    }
-    exact = build_closed_loop(Parameters({
-        **known, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0,
-    })).run(400)
-    gapless = build_closed_loop(Parameters({
-        **known, 'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
-        'backlash.c_r': 1e-12, 'backlash.c_l': -1e-12,
-    })).run(400)
-    np.testing.assert_allclose(exact.column('y'), gapless.column('y'), atol=1e-6)
-
-
 def test_common_factor_of_numerator_and_denominator_is_refused() -> None:
     model = TransferFunction([1.0, -0.5], [1.0, -1.4, 0.45])
     with pytest.raises(ParameterError, match='common factors'):

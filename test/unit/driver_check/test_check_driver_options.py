@@ -20,10 +20,3 @@ def test_bad_options_are_one_line_and_code_2(
     assert left.value.code == 2
     assert word in told
     assert len(told.splitlines()) == 1
-
-
-def test_help_names_the_exit_codes(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(['--help'])
-    assert left.value.code == 0
-    assert 'Exit codes' in capsys.readouterr().out

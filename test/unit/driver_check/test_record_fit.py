@@ -13,9 +13,8 @@ from scipy.special import chdtri
 
 from backlash_ros.core.driver_check.record_fit import RecordFit, fit_record
 from backlash_ros.core.estimate import Bounds
-from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.records.samples import SEARCHED_AT_MOST, frequencies_of
+from backlash_ros.core.records.samples import SEARCHED_AT_MOST
 
 NOISE = 1e-3
 TRUTH = Truth()
@@ -118,13 +117,6 @@ def test_a_model_that_is_off_is_learned_with_its_sign(ratio: float, sign: float)
     assert fit.gap == pytest.approx(TRUTH.gap, rel=0.01)
 
 
-def test_an_exact_model_stays_the_one_that_was_told() -> None:
-    fit = of(*record(500), model=StateModel(MODEL))
-    assert fit.model is MODEL
-    assert fit.error_of_model([0.1, 0.2]) == pytest.approx([0.0, 0.0])
-    assert fit.error_scale < 0.05
-
-
 @pytest.mark.parametrize('uncertainty', [0.0, 0.2])
 def test_deviations_are_honest(uncertainty: float) -> None:
     errors = []
@@ -198,15 +190,6 @@ def test_bounds_limit_what_is_usable() -> None:
     assert any('m would be 1.3, outside' in reason for reason in fit.reasons)
     narrow = of(v, y, bounds=Bounds(c_r=(0.0, 0.3), c_l=(-0.3, 0.0)))
     assert not narrow.usable
-
-
-def test_frequencies_are_those_of_the_motion() -> None:
-    t = np.arange(2000.0)
-    y = np.sin(0.05 * t) + 0.3 * np.sin(0.4 * t)
-    y[::9] = nan
-    low, high = frequencies_of(y)
-    assert low == pytest.approx(0.05, abs=0.01)
-    assert high == pytest.approx(0.4, abs=0.01)
 
 
 @pytest.mark.parametrize(('v', 'y', 'delays', 'message'), [

@@ -98,14 +98,6 @@ def test_gain_settles_where_innovations_are_as_large_as_they_are(level: int) -> 
     assert np.std(errors[1500:]) <= 1.35 * best.innovation * NOISE
 
 
-def test_a_larger_disturbance_makes_the_gain_and_the_covariance_larger() -> None:
-    model = MODELS['resonance']
-    calm, rough = Observer(model, NOISE), Observer(model, NOISE)
-    follow(calm, 0.0, 2000)
-    follow(rough, 100.0 * NOISE, 2000)
-    assert np.trace(rough.noise_cov) > 10.0 * np.trace(calm.noise_cov)
-
-
 def followed_by_another_model(disturbance: float) -> float:
     """Size of the state's covariance in that of an observer which knows nothing before."""
     before, model = Observer(MODELS['resonance'], NOISE), MODELS['delayed']

@@ -24,7 +24,6 @@ from backlash_ros.core.identification.output_error import (
     Point,
     Samples,
     Structure,
-    fit,
     linear_columns,
     slopes,
     solve_linear,
@@ -159,15 +158,6 @@ def test_slopes_are_the_derivatives_of_the_simulation() -> None:
         assert by[:, column] == pytest.approx(difference, abs=2e-4 * np.abs(difference).max())
 
 
-def test_fit_without_noise_is_exact() -> None:
-    v, y = record(800, gap=0.9137, noise=0.0)
-    found = fit(Samples(v, y, 3), Structure(2, 1, False),
-                Point(np.array([-1.69, 0.745]), 0.91, float(v[0]) + 0.36))
-    assert found.point.gap == pytest.approx(0.9137, abs=1e-6)
-    assert found.c_r == pytest.approx(0.5, abs=1e-6)
-    assert found.numerator == pytest.approx([0.03, 0.025], rel=1e-4)
-
-
 def reasons(v: Array, y: Array, options: Options = QUICK) -> str:
     found = identify(v, y, PERIOD_S, options)
     assert not found.usable
@@ -177,61 +167,6 @@ def reasons(v: Array, y: Array, options: Options = QUICK) -> str:
 def test_a_v_that_stays_within_the_gap_shows_nothing() -> None:
     v = 0.1 * motion(1600)
     assert 'y shows nothing of v' in reasons(v, answer(v, 0.9, 0.45, 2e-3))
-
-
-def test_too_few_reversals_are_told() -> None:
-    # Up once and halfway down.
-    v = np.append(np.linspace(0.0, 3.0, 400), np.linspace(3.0, 0.5, 400))
-    text = reasons(v, answer(v, 0.9, 0.5, 2e-3))
-    assert 'went past the gap' in text or 'known to' in text
-
-
-def test_a_gap_that_noise_hides_is_told() -> None:
-    v, y = record(500, gap=0.4, c_r=0.2, noise=0.8)
-    assert 'the gap, about' in reasons(v, y)
-
-
-def test_a_sensor_at_its_end_is_told() -> None:
-    v, y = record()
-    assert 'the sensor is at its end' in reasons(v, np.clip(y, -1.2, 1.2))
-
-
-def test_where_zero_of_v_is_makes_no_difference() -> None:
-    v, y = record()
-    found = identify(v, y + 2.0, PERIOD_S, QUICK)
-    assert found.reasons == ()
-    assert found.c_r == pytest.approx(0.5 - 2.0, abs=5.0 * found.std['c_r'])
-    assert found.c_r < 0.0
-
-
-def test_a_load_that_coasts_in_the_gap_is_told() -> None:
-    # While v crosses the gap, u goes on as it went before, ever slower.
-    v = motion(1600)
-    held = PlayRecord(v).output(0.9, float(v[0]) + 0.4).p
-    u, speed = held.copy(), 0.0
-    for k in range(1, len(u)):
-        speed = held[k] - held[k - 1] if held[k] != held[k - 1] else 0.97 * speed
-        u[k] = min(max(u[k - 1] + speed, v[k]), v[k] + 0.9)
-        if u[k] in (v[k], v[k] + 0.9):
-            speed = u[k] - u[k - 1]
-    y = lfilter([0.0, 0.03, 0.025], [1.0, -1.7, 0.755], u - 0.5)
-    text = reasons(v, y + 2e-3 * np.random.default_rng(1).standard_normal(len(v)))
-    assert 'something else than a backlash and a linear G' in text
-
-
-def test_one_speed_is_noted() -> None:
-    t = np.arange(1600) % 320
-    v = np.where(t < 160, t, 320 - t) / 40.0 - 2.0
-    found = identify(v, answer(v, 0.9, 0.5, 2e-3), PERIOD_S, QUICK)
-    assert any('one speed' in text for text in found.remarks)
-
-
-def test_no_backlash_is_noted() -> None:
-    v = motion(1600)
-    found = identify(v, answer(v, 0.0, 0.0, 2e-3), PERIOD_S, QUICK)
-    assert found.verdict is not None
-    assert 'there is no backlash: the gap is below' in found.verdict.backlash.reason
-    assert found.reasons == ()
 
 
 @pytest.mark.parametrize(('v', 'y', 'said'), [

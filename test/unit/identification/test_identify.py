@@ -14,10 +14,9 @@ from test_identification import PERIOD_S, motion, record
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimates_file import load_estimate
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.cli import InputError
-from backlash_ros.tools.config import effective_parameters, read_parameter_file
+from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.records.messages import from_messages
 from backlash_ros.tools.records.reading import read_record
@@ -89,24 +88,6 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
     build_controller(parameters)
 
 
-def test_what_describes_the_simulated_plant_stands_in_its_own_section(result: Path) -> None:
-    file = read_parameter_file(result / 'identified.yaml')
-    simulated = {'backlash.m', 'output_quantum', 'input_disturbance', 'seed'}
-    assert simulated <= set(file.values(''))
-    common = {
-        name for section in file.sections if section.node != 'plant' for name in section.values
-    }
-    assert not simulated & common
-
-
-def test_every_value_that_was_found_has_its_deviation_beside_it(result: Path) -> None:
-    text = (result / 'identified.yaml').read_text()
-    assert 'mine.csv' in text
-    for name in ('numerator:', 'c_r: 0.', 'c_l: -0.'):
-        line = next(line for line in text.splitlines() if name in line)
-        assert '±' in line
-
-
 def test_a_controller_begins_with_what_was_found(result: Path) -> None:
     estimate = load_estimate(effective_parameters(result / 'identified.yaml'))
     assert estimate is not None
@@ -120,12 +101,6 @@ def test_the_loop_with_the_file_follows(result: Path, tmp_path: Path) -> None:
     assert simulate.main(['--config', str(result / 'identified.yaml'), '--duration', '5',
                           '--out', str(out)]) == 0
     assert json.loads((out / 'summary.json').read_text())['tracking_error_rms'] < 0.05
-
-
-def test_the_page_needs_nothing_else(result: Path) -> None:
-    page = (result / 'identify.html').read_text()
-    assert page.count('src="data:image/png;base64,') == 7
-    assert 'http' not in page.replace('http-equiv', '')
 
 
 @pytest.mark.usefixtures('undrawn')
@@ -202,28 +177,6 @@ def test_a_bag_holds_v_and_y(tmp_path: Path, report: bool) -> None:
     assert found.lost == 1
     assert np.isnan(found.y[120])
     assert np.delete(found.y, 120).tolist() == np.delete(y, 120).tolist()
-
-
-def test_a_truncated_bag_is_told_or_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    v, y = record(300)
-    write_bag(tmp_path / 'bag', v, y, False)
-    file = next((tmp_path / 'bag').glob('*.mcap'))
-    for share in (0.0, 0.3, 0.9):
-        file.write_bytes(file.read_bytes()[:int(share * file.stat().st_size)])
-        assert main([str(tmp_path / 'bag'), '--out', str(tmp_path / 'out')]) in (1, 2)
-        assert 'Traceback' not in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_results_of_a_simulation_are_a_record(tmp_path: Path) -> None:
-    assert simulate.main(['--duration', '2', '--set', 'output_loss=0.1',
-                          '--out', str(tmp_path / 'run')]) == 0
-    found = read_record(tmp_path / 'run')
-    assert len(found.v) == pytest.approx(200, abs=3)
-    assert 5 < found.lost < 40
-    assert np.isfinite(found.v).all()
 
 
 def test_late_samples_are_numbered_by_the_last_of_their_heap() -> None:
@@ -308,25 +261,3 @@ def test_an_axis_gets_a_file_of_its_own(
     assert main([*given, '--axis', 'z']) == 0
     found = effective_parameters(tmp_path / 'out' / 'identified.yaml', axis='z')
     assert found.get_float('control.max') == 5.0
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_a_longer_record_than_is_searched_is_fitted_as_a_whole(tmp_path: Path) -> None:
-    v, y = record(8000)
-    y[7000] = 40.0
-    source = write_csv(tmp_path / 'a.csv', v, y)
-    assert main([str(source), *QUICK, '--out', str(tmp_path / 'out')]) == 0
-    found = json.loads((tmp_path / 'out' / 'identified.json').read_text())
-    assert found['samples'] == 8000
-    assert found['outliers'] >= 1
-    assert abs(found['gap'] - 0.9) < 4.0 * found['std']['gap'] < 2e-3
-
-
-def test_shipped_limits_are_enough_for_a_drive() -> None:
-    from backlash_ros.core.driver_check.gentle_drive import drive_range
-    from backlash_ros.tools.identify.command import given_values
-    given_by_user = given_values(Path('limits.yaml'), '')
-    assert set(given_by_user) == {
-        'sample_period', 'control.min', 'control.max', 'control.rate_max',
-    }
-    assert drive_range(Parameters(dict(given_by_user)), None, None).rate == 300.0

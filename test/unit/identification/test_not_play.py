@@ -126,11 +126,6 @@ def test_noise_that_is_not_white_is_no_nonlinearity(noise: float) -> None:
     assert saturation(o) == ''
 
 
-def test_a_quantised_play_is_nothing_else() -> None:
-    y = np.round(behind(play(V, GAP), 'lag', 0.0) / 0.05) * 0.05
-    assert what_it_is(observed(V, y, GAP, 0.05 / np.sqrt(12.0))) == []
-
-
 def test_a_dead_zone_before_an_integrator_is_named() -> None:
     assert 'a dead zone' in other_nonlinearity(observed(V, behind(dead_zone(V), 'integrator')))
 
@@ -181,10 +176,3 @@ def test_the_gap_of_each_part_is_told(plant: str) -> None:
     found, std = varies(observed(V, behind(u, plant)), thirds())
     assert found - found[0] == pytest.approx([0.0, 0.0, 0.15], abs=0.02)
     assert std.max() < 0.02
-
-
-def test_a_gap_that_stays_is_the_same_in_each_part() -> None:
-    for plant in ('gain', 'lag', 'resonance'):
-        found, std = varies(observed(V, behind(play(V, GAP), plant)), thirds())
-        assert np.abs(found - GAP).max() < 0.004
-        assert (np.abs(found - GAP) < 5.0 * std).all()

@@ -105,13 +105,3 @@ def test_one_speed_with_rests_takes_nothing_from_what_was_identified(
     run = gear_runs.close_loop(gear, controller, 'moves and rests')
     assert np.abs(run.gap / identified.found.gap - 1.0).max() < 0.02
     assert run.error < 0.1 * SERVO.lost_motion
-
-
-@pytest.mark.parametrize('setting', ['gab=0.1', 'gap', 'about=1', 'gap=wide'])
-def test_settings_that_are_none_are_refused(setting: str) -> None:
-    with pytest.raises(ValueError, match=f'{setting!r} must be KEY=NUMBER'):
-        SERVO.with_settings([setting])
-
-
-def test_settings_change_a_preset() -> None:
-    assert SERVO.with_settings(['gap=0.1', 'friction=2']) == replace(SERVO, gap=0.1, friction=2.0)

@@ -129,22 +129,6 @@ def test_estimates_stay_within_bounds_that_the_truth_violates(
         assert F_BOUNDS[0] <= e.f <= F_BOUNDS[1]
 
 
-@pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_only_the_product_of_the_side_in_motion_is_learned(sign: float) -> None:
-    first = lessons(lms(), PAPER, ramp(sign * 5.0, sign * 8.0))[0]
-    product_r, product_l = (first.new.m * c for c in (first.new.c_r, first.new.c_l))
-    moved, kept = (product_r, product_l) if sign > 0.0 else (product_l, product_r)
-    assert kept == pytest.approx(-sign * 0.696 * 0.5)
-    assert moved != pytest.approx(sign * 0.696 * 0.5)
-
-
-def test_a_step_of_one_explains_every_sample_at_once() -> None:
-    learned = lessons(lms(), PAPER, ramp(5.0, 6.9))  # further on, c_r would be projected to 0
-    assert len(learned) > 20
-    for lesson in learned:
-        assert lesson.new.m * (lesson.v - lesson.new.c_r) == pytest.approx(lesson.u)
-
-
 def test_status_says_whether_anything_was_learned() -> None:
     estimator = lms()
     lessons(estimator, PAPER, ramp(0.0, 2.9))
@@ -168,11 +152,6 @@ def test_a_slope_below_0_is_said_and_not_learned() -> None:
     told = [e for e in estimates if e.status is Status.INCONSISTENT]
     assert estimates.index(told[0]) < 200
     assert {(e.m, e.c_r, e.c_l) for e in told} == {(told[0].m, told[0].c_r, told[0].c_l)}
-
-
-def test_v_near_zero_does_no_harm() -> None:
-    plant = Play(1.3, 1e-200, -1e-200)
-    assert lessons(lms(), plant, ramp(0.0, 1e-180))
 
 
 def test_f_is_kept_without_a_step_and_follows_the_gradient_of_j_with_one() -> None:

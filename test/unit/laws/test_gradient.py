@@ -8,7 +8,6 @@ import pytest
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
 
@@ -51,26 +50,11 @@ def test_estimates_never_leave_their_bounds() -> None:
         assert run.column(name).max() <= high
 
 
-def test_unit_of_y_does_not_matter() -> None:
-    plain = build_closed_loop(four_blocks()).run(300)
-    scaled = build_closed_loop(four_blocks(
-        plant__numerator=[1e-2, 4e-2, 1e-2], amplitude=200.0, estimator__output_noise_std=1e-2,
-    )).run(300)
-    for name in TRUTH:
-        np.testing.assert_allclose(scaled.column(name), plain.column(name), rtol=1e-4)
-
-
 def test_lost_samples_teach_nothing_and_do_no_harm() -> None:
     run = build_closed_loop(four_blocks(output_loss=0.02)).run(1500)
     assert run.lost_samples > 10
     assert np.abs(run.column('y')).max() < 1.0
     assert last(run) == pytest.approx(TRUTH, rel=0.01)
-
-
-def test_learns_without_compensation() -> None:
-    loop = build_closed_loop(four_blocks())
-    loop.controller.compensating = False
-    assert last(loop.run(1500)) == pytest.approx(TRUTH, rel=0.01)
 
 
 def test_says_that_y_moves_against_v() -> None:
@@ -80,12 +64,3 @@ def test_says_that_y_moves_against_v() -> None:
         step = controller.step(-plant.measure(), reference(k * 0.01))
         plant.step(step.v)
     assert step.estimate.status is Status.INCONSISTENT
-
-
-@pytest.mark.parametrize(('law', 'structure', 'wanted'), [
-    ('gradient', 'proportional', 'pole_placement'), ('gradient', 'tracking', 'pole_placement'),
-    ('printed', 'tracking', 'proportional'), ('printed', 'pole_placement', 'proportional'),
-])
-def test_a_law_outside_of_its_structure_is_refused(law: str, structure: str, wanted: str) -> None:
-    with pytest.raises(ParameterError, match=rf'structure=.*{structure}.*must be {wanted}'):
-        build_controller(Parameters({'estimator.law': law, 'structure': structure}))

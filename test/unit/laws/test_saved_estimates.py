@@ -7,7 +7,6 @@ from dataclasses import replace
 from math import isnan, nan
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,8 +20,6 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import replay
-from backlash_ros.core.simulation.run_record import stated_deviations
-from backlash_ros.tools.compare import compare
 from backlash_ros.tools.runs.summary import summarise
 
 LEARNED = Estimate(1.25, 2.5, -3.5, 0.2, 0.01, 0.02, 0.03, Status.TRACKING)
@@ -119,12 +116,6 @@ def test_a_file_without_the_law_serves_a_law_with_deviations_if_it_holds_some(
         assert load_estimate(p) is not None
 
 
-def test_deviations_of_constants_that_are_given_are_published_as_nan() -> None:
-    run = build_closed_loop(Parameters({'estimator.law': 'fixed'})).run(3)
-    assert np.isnan([run.column(name) for name in ('std_m', 'std_c_r', 'std_c_l')]).all()
-    assert stated_deviations(LEARNED) == (0.01, 0.02, 0.03)
-
-
 @pytest.mark.parametrize(
     'content',
     ['', '{', '[]', '3', '{"version": 1}', 'null', '{"version": 1, "key": {}, "estimate": 2}',
@@ -187,14 +178,3 @@ def test_whoever_builds_a_controller_begins_with_what_was_known(tmp_path: Path) 
     plain = Parameters()
     began = summarise(build_closed_loop(plain).run(30), plain)['began_with']
     assert (began['c_r'], began['from']) == (0.5, 'estimator.initial')
-
-
-def test_other_laws_are_compared_from_the_first_guess(tmp_path: Path) -> None:
-    p = parameters(tmp_path / 'estimates.json')
-    save_estimate(Path(p.get_str('estimates.file')), LEARNED, p)
-    with_file, without = (
-        {result.contender.name: result.merits for result in compare(each, 60)}
-        for each in (p, p.replaced({'estimates.load': False}))
-    )
-    changed = {name for name, merits in with_file.items() if merits != without[name]}
-    assert changed == {'moving_horizon, u_d = y_m + f v', 'moving_horizon, tracking'}

@@ -11,10 +11,6 @@ from backlash_ros.core.loop.held_control import HeldControl
 PERIOD_NS = 10_000_000
 
 
-def test_a_driver_that_has_heard_nothing_holds_zero() -> None:
-    assert HeldControl().over(1) == 0.0
-
-
 @pytest.mark.parametrize(('periods_ago', 'applied'), [
     (0.4, [1.0, 1.0, 2.0]), (1.0, [1.0, 2.0, 2.0]), (5.0, [2.0, 2.0, 2.0]),
 ])

@@ -22,10 +22,6 @@ def test_the_newest_command_acts_that_is_there_when_the_interval_ends() -> None:
     assert told([0, 1, 2], [0.0, 1.0, 2.0], [0.1, 1.1, 1.2], False) == [0.0, 2.0, 2.0]
 
 
-def test_nothing_is_known_before_the_first_message() -> None:
-    assert told([0, 1, 2], [0.0, 1.0, 2.0], [1.1], False) == [-1.0, 0.0, 0.0]
-
-
 def test_reports_of_a_driver_that_was_held_up_are_taken_in_their_order() -> None:
     # It wakes at 4 and reports three intervals at once, of which it has sampled the last only.
     late = [0.99, 3.97, 3.98, 3.99, 4.99]

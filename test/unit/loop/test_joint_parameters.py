@@ -42,11 +42,6 @@ def test_a_joint_that_nobody_describes_passes_its_reference_through() -> None:
     assert shared['plant.denominator'] == (1.0, -0.9)
 
 
-def test_without_joints_there_is_one_loop_with_the_parameters_as_they_are() -> None:
-    p = Parameters({'sample_period': 0.02})
-    assert p.of_joint('') is p
-
-
 @pytest.mark.parametrize(('file', 'of_waist'), [
     ('saved/arm.json', 'saved/arm-waist.json'), ('{joint}/e.json', 'waist/e.json'), ('', ''),
 ])

@@ -26,10 +26,6 @@ def test_a_change_of_level_is_one_line_and_one_when_all_is_well_again() -> None:
     ]
 
 
-def test_well_from_the_beginning_is_no_line() -> None:
-    assert lines_of([(float(t), WELL) for t in range(10)]) == []
-
-
 def test_another_cause_at_the_same_level_is_told() -> None:
     findings = [(0.0, SLOW), (0.5, SLOW._replace(kind='bad', text='no number')), (1.0, SLOW)]
     assert [text for _, text in lines_of(findings)] == ['too slow', 'no number']
@@ -52,12 +48,6 @@ def test_what_comes_and_goes_is_told_once_per_while() -> None:
 def test_what_passes_by_itself_is_told_once_it_has_lasted() -> None:
     assert lines_of([(0.0, WAITING), (LASTS_S / 2.0, WAITING), (LASTS_S, WELL)]) == []
     assert lines_of([(0.0, WAITING), (LASTS_S, WAITING)]) == [(Level.WARN, 'waiting')]
-
-
-def test_looks_that_come_a_little_early_do_not_put_off_the_line() -> None:
-    looks = [(0.0, WAITING), (0.999, WAITING), (1.998, WAITING)]
-    assert lines_of(looks[:2]) == []
-    assert lines_of(looks) == [(Level.WARN, 'waiting')]
 
 
 def test_trouble_that_was_not_told_is_not_told_to_be_over() -> None:

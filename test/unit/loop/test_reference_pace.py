@@ -63,15 +63,6 @@ def test_reference_of_the_next_sample_leaves_half_a_period_after_each_output() -
     assert [sample for _, sample in sent] == list(range(sent[0][1], sent[0][1] + len(sent)))
 
 
-def test_output_at_a_quarter_of_the_rate_brings_a_message_per_period_for_the_right_sample() -> None:
-    end_s = 100 * 4 * PERIOD_S
-    sent = messages_of(times(100, 4 * PERIOD_S), end_s)
-    check_rate(sent, end_s)
-    assert len(sent) == pytest.approx(400, abs=8)
-    for at, sample in sent[10:]:
-        assert (at - 0.5 * PERIOD_S) / PERIOD_S == pytest.approx(sample - 0.5, abs=0.6)
-
-
 @given(arrival_gaps, st.booleans())
 def test_there_is_never_more_than_a_message_per_period_nor_two_close_together(
     gaps: list[float], sleeps: bool,
@@ -103,12 +94,6 @@ def test_silence_is_gone_through_by_the_own_clock_and_leaves_no_shift() -> None:
     check_rate(sent, 300 * PERIOD_S)
     assert len(sent) == pytest.approx(300, abs=3)
     assert sent[-1][1] == pytest.approx(299, abs=1)
-
-
-def test_before_the_first_output_the_first_value_is_repeated_once_per_period() -> None:
-    sent = messages_of([], 20 * PERIOD_S)
-    assert [sample for _, sample in sent] == [0] * len(sent)
-    assert len(sent) == pytest.approx(20, abs=1)
 
 
 def test_a_node_that_waits_for_nobody_goes_on_by_its_own_clock() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
-from joint_trajectory import TopicSystem, swing
+from joint_trajectory import TopicSystem
 from sensor_msgs.msg import JointState
 
 
@@ -43,12 +43,3 @@ def test_states_are_taken_by_name_and_only_where_they_are_finite() -> None:
     known = system(a=0.5, b=0.25)
     known.read(JointState(name=['other', 'b', 'a'], position=[9.0, 0.75, math.nan]))
     assert known.states == {'a': 0.5, 'b': 0.75}
-
-
-def test_a_swing_begins_at_rest_and_stays_within_its_amplitude() -> None:
-    way = [swing(0.01 * k, 2, 0.2, 8.0) for k in range(2400)]
-    assert way[0] == 0.0
-    assert abs(way[1]) < 1e-5
-    assert max(way) == pytest.approx(0.2, rel=1e-3)
-    assert min(way) == pytest.approx(-0.2, rel=1e-3)
-    assert math.isnan(swing(math.nan, 0, 0.2, 8.0))

@@ -6,13 +6,10 @@ from io import StringIO
 from math import inf, nan
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rich.console import Console
 
-from backlash_ros.nodes.monitor.command import main
 from backlash_ros.nodes.monitor.state import ControllerState
-from backlash_ros.nodes.monitor.view import BLOCKS, axis_end, bar, plain_line, screen
+from backlash_ros.nodes.monitor.view import axis_end, bar, plain_line, screen
 
 VALUES = {
     'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',
@@ -38,19 +35,6 @@ def shown(states: list[ControllerState], **changes: object) -> list[str]:
     console.print(screen(states, **arguments))  # type: ignore[arg-type]
     assert isinstance(console.file, StringIO)
     return console.file.getvalue().rstrip('\n').split('\n')
-
-
-@given(
-    st.floats(-10.0, 10.0), st.floats(0.0, 10.0) | st.just(nan), st.floats(0.1, 10.0),
-    st.integers(1, 60),
-)
-def test_a_bar_fills_its_columns_in_order(
-    value: float, half_width: float, scale: float, width: int,
-) -> None:
-    drawn = bar(value, half_width, scale, width)
-    assert len(drawn) == width
-    assert drawn == ''.join(sorted(drawn, key=BLOCKS.index))
-    assert (BLOCKS[1] in drawn) >= (half_width > 0.0)
 
 
 def test_a_bar_ends_at_the_value_and_shades_the_band() -> None:
@@ -96,12 +80,6 @@ def test_any_number_of_controllers_fits_into_a_terminal(count: int) -> None:
         assert (f'> {states[selected].name}' in text) == (count > 1)
 
 
-def test_what_is_too_long_for_a_line_goes_on_in_the_next() -> None:
-    message = 'plant_output is silent for longer than timeout.plant_output: is the driver there?'
-    text = ' '.join(' '.join(shown([controller(message=message)])).replace('│', ' ').split())
-    assert message in text
-
-
 def test_a_text_in_which_only_figures_change_is_one_event() -> None:
     state = controller(message='9.38 % was lost')
     state.take_diagnostics(1, '8.1 % was lost', VALUES, 101.0, '12:00:01')
@@ -129,12 +107,3 @@ def test_a_plain_line_says_the_same_in_short() -> None:
         '/controller: tracking; m 1.3 ± 0.2, c_r 3 ± 0.4, c_l -3; '
         'excitation 4.25, latency 0.912 ms, lost 5'
     )
-
-
-def test_an_unknown_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as left:
-        main(['--nonsense'])
-    assert left.value.code == 2
-    said = capsys.readouterr().err
-    assert said.startswith('monitor: unrecognized arguments: --nonsense')
-    assert len(said.splitlines()) == 1

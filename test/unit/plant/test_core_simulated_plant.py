@@ -51,15 +51,6 @@ def test_y_is_g_of_the_backlash_output_plus_the_disturbance(
     )
 
 
-def test_v_acts_on_the_next_output_and_not_on_this_one() -> None:
-    simulated = plant()
-    assert simulated.measure() == 0.0
-    u = simulated.step(10.0)
-    assert u == pytest.approx(1.3 * 7.0)
-    assert simulated.measure() == pytest.approx(0.1 * u)
-    assert simulated.measure() == pytest.approx(0.1 * u)
-
-
 def test_noise_has_the_given_spread_and_follows_the_seed() -> None:
     noisy = Imperfections(output_noise_std=0.2)
     y = outputs(plant(noisy), [0.0] * 4000)

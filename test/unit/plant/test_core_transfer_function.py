@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
-from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, output_of, plants
+from strategies import output_of, plants
 
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -30,24 +30,9 @@ def test_state_space_and_simulation_agree_with_scipy(model: TransferFunction, se
 
 
 @given(model=plants())
-def test_output_is_the_first_state(model: TransferFunction) -> None:
-    a, b, c = model.state_space()
-    assert (a.shape, b.shape) == ((model.order, model.order), (model.order,))
-    assert c.tolist() == [1.0] + [0.0] * (model.order - 1)
-
-
-@given(model=plants())
 def test_frequency_response_agrees_with_scipy(model: TransferFunction) -> None:
     w, expected = signal.freqz(model.numerator, model.denominator, np.linspace(0.1, 3.1, 30))
     np.testing.assert_allclose(model.response(np.exp(1j * w)), expected, rtol=1e-6, atol=1e-12)
-
-
-def test_poles_and_zeros_of_the_papers_example() -> None:
-    model = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
-    assert sorted(model.poles.real) == pytest.approx([0.90478, 0.98026, 1.0], abs=1e-4)
-    assert sorted(model.zeros.real) == pytest.approx([-3.73205, -0.26795], abs=1e-5)
-    assert model.order == 3
-    assert model.delay == 1
 
 
 @given(scale=st.floats(0.01, 100.0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from math import pi
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,15 +17,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.plant.true_plant import Alteration, altered_plant, delayed
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.tools.config import effective_parameters
 
 PERIOD = 0.005
-NOTHING = {
-    'truth.numerator': [], 'truth.denominator': [], 'truth.delay_samples': -1,
-    'truth.scale_frequency': 1.0, 'truth.scale_damping': 1.0, 'truth.extra_lag': 0.0,
-    'truth.walk_std': 0.0,
-}
 
 
 def motor(frequency: float = 20.0, damping: float = 0.5) -> TransferFunction:
@@ -65,12 +57,6 @@ def test_scaled_damping_is_the_motor_with_that_damping(damping: float) -> None:
     assert_equal(altered, motor(damping=damping), 1e-12)
 
 
-def test_shipped_motor_is_altered_as_the_exact_one() -> None:
-    p = effective_parameters(Path('geared_motor.yaml'))
-    altered = p.replaced({'truth.scale_frequency': 1.2, 'truth.scale_damping': 1.2})
-    assert_equal(build_true_model(altered), motor(24.0, 0.6), 1e-9)
-
-
 def test_lag_of_whole_samples_is_a_pole_at_zero_for_each() -> None:
     for samples in (1, 2):
         expected = TransferFunction(
@@ -106,19 +92,6 @@ def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(
     np.testing.assert_allclose(lagging, expected, rtol=0.0, atol=1e-7 * np.abs(slow).max())
 
 
-@given(plants(), st.floats(0.3, 3.0), st.floats(0.3, 3.0))
-def test_gain_at_rest_is_kept(model: TransferFunction, frequency: float, damping: float) -> None:
-    assume(continuous(model))
-    altered = altered_plant(model, Alteration(frequency, damping))
-    # Of an integrator, that of the velocity: its denominator is 0 at z = 1.
-    order = int(np.any(np.abs(model.poles - 1.0) < 1e-6))
-    gain, expected = (
-        float(np.polyval(m.numerator, 1.0) / np.polyval(np.polyder(m.denominator, order), 1.0))
-        for m in (altered, model)
-    )
-    assert gain == pytest.approx(expected, rel=1e-6, abs=1e-7 * np.abs(model.numerator).sum())
-
-
 def test_delay_stays_a_delay_whatever_the_frequency() -> None:
     altered = altered_plant(delayed(motor(), 3), Alteration(frequency=1.2))
     assert_equal(altered, delayed(motor(24.0), 3), 1e-12)
@@ -136,21 +109,6 @@ def test_taps_of_a_delay_by_part_of_a_sample_are_refused() -> None:
     taps = TransferFunction([0.07, 0.03], [1.0, -0.9, 0.0])
     with pytest.raises(ParameterError, match='1 poles at 0 that are no delay by whole samples'):
         altered_plant(taps, Alteration(frequency=1.2))
-
-
-def test_defaults_leave_a_run_as_it_is_to_the_last_bit() -> None:
-    values = {'output_noise_std': 1e-3, 'control.delay_samples': 2, 'seed': 5}
-    plain = build_plant(Parameters(values))
-    same = build_plant(Parameters({**values, **NOTHING}))
-    model = build_model(Parameters(values))
-    assert_equal(build_true_model(Parameters(values)), model, 0.0)
-    expected = step_response(model, 50)
-    for k in range(50):
-        y = plain.measure()
-        assert y == same.measure()
-        assert abs(y - 1.3 * 7.0 * expected[k]) < 0.01
-        plain.step(10.0)
-        same.step(10.0)
 
 
 def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() -> None:
@@ -190,14 +148,3 @@ def test_walk_of_u_is_one_and_leaves_the_noise_alone() -> None:
     steps = np.diff(walk[1:])
     assert steps.std() == pytest.approx(std * PERIOD**0.5, rel=0.05)
     assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 0.05
-
-
-def test_controller_is_told_nothing_of_the_truth() -> None:
-    p = effective_parameters(Path('geared_motor.yaml'), ['truth.scale_frequency=1.5'])
-    loop = build_closed_loop(p.replaced({'estimator.law': 'fixed'}))
-    plain = build_closed_loop(p.replaced({
-        'estimator.law': 'fixed', 'truth.scale_frequency': 1.0,
-    }))
-    run, told = loop.run(200), plain.run(200)
-    assert np.array_equal(run.column('v'), told.column('v'))
-    assert not np.allclose(run.column('y'), told.column('y'), atol=1e-3)

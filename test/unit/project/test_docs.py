@@ -15,7 +15,6 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 from generate_parameters import parameters_page
-from PIL import Image
 from places import ROOT
 
 from backlash_ros import topics
@@ -94,16 +93,6 @@ def test_links_lead_to_files_and_headings() -> None:
 def test_every_picture_is_shown() -> None:
     shown = {(page.parent / link).resolve() for page, link in of_every_page(LINK)}
     assert set((DOCS / 'images').iterdir()) <= shown
-
-
-def test_readme_begins_with_a_film_that_loads_fast() -> None:
-    first = re.search(r'!\[[^\]]*\]\((\S+)\)', README)
-    assert first is not None
-    path = ROOT / first[1]
-    assert path.stat().st_size < 3e6
-    with Image.open(path) as film:
-        assert film.n_frames > 50
-        assert film.info['loop'] == 0  # for ever
 
 
 def test_made_tables_are_filled_and_known_to_the_script() -> None:
@@ -255,13 +244,3 @@ def test_readme_names_every_executable_and_topic() -> None:
     assert console_scripts() <= codes
     named = {value for name, value in vars(topics).items() if name.isupper()}
     assert {name for name in named if isinstance(name, str)} <= codes
-
-
-def test_terminals_of_the_readme_make_a_whole_loop_with_a_file_that_is_installed() -> None:
-    block = next(text for _, text in BLOCK.findall(README) if 'rosdep install' in text)
-    lines = block.splitlines()
-    # From Python 3.11 on, rosdep refuses the keys that come from pip otherwise.
-    assert lines[0].startswith('PIP_BREAK_SYSTEM_PACKAGES=1 rosdep install')
-    assert '$(ros2 pkg prefix --share backlash_ros)/config/geared_motor.yaml' in block
-    started = re.findall(r'ros2 run backlash_ros (\w+)', block)
-    assert {'controller', 'plant', 'reference', 'recorder'} <= set(started)

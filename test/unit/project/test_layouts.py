@@ -68,13 +68,5 @@ def test_plotjuggler_subscribes_to_what_it_draws() -> None:
     assert sorted(listed) == sorted({parts(PLOTJUGGLER_PATH, path)[0] for path in curves()})
 
 
-def test_splitters_of_plotjuggler_count_their_parts() -> None:
-    splitters = list(PLOTJUGGLER.iter('DockSplitter'))
-    assert splitters
-    for splitter in splitters:
-        sizes = splitter.attrib['sizes'].split(';')
-        assert int(splitter.attrib['count']) == len(splitter) == len(sizes)
-
-
 def test_every_panel_of_foxglove_has_its_place() -> None:
     assert sorted(panels_in(FOXGLOVE['layout'])) == sorted(PANELS)

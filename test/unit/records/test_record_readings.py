@@ -55,14 +55,6 @@ def test_what_only_looks_repeated_is_kept(y: Array) -> None:
     assert held(T[:len(y)], y) is None
 
 
-def test_every_second_reading_lost_leaves_the_others() -> None:
-    y = MOTION.copy()
-    y[1::2] = np.nan
-    record = record_of(T, MOTION, y)
-    assert record.y[::2].tolist() == MOTION[::2].tolist()
-    assert np.isnan(record.y[1::2]).all()
-
-
 @pytest.mark.parametrize('value', [0.0, -1.0, 65535.0])
 @pytest.mark.parametrize('share', [0.002, 0.3])
 def test_reads_that_failed_are_lost(value: float, share: float) -> None:
@@ -109,10 +101,3 @@ def test_what_only_jumps_is_not_unwrapped(values: Array) -> None:
 ])
 def test_the_step_of_a_quantised_y_is_told(y: Array, step: float) -> None:
     assert quantum(y) == pytest.approx(step, rel=1e-3)
-
-
-@pytest.mark.parametrize(('offset', 'scale'), [(8e8, 1.0), (0.0, 5e-8), (-3e5, 1e-3)])
-def test_numbers_of_any_size_are_numbers(offset: float, scale: float) -> None:
-    record = record_of(T, offset + scale * MOTION, offset + scale * (MOTION + NOISE))
-    assert record.v.tolist() == (offset + scale * MOTION).tolist()
-    assert record.lost == 0

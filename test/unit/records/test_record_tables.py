@@ -117,13 +117,6 @@ def test_without_a_time_the_period_numbers_the_rows(tmp_path: Path) -> None:
     assert read_record(path, 0.02).sample_period == 0.02
 
 
-def test_a_motor_encoder_has_its_commands_beside_it(tmp_path: Path) -> None:
-    text = 't,v,y,command\n' + rows('{t:.3f},{v:.3f},{y:.3f},{k}')
-    record = read_record(written(tmp_path / 'a.csv', text))
-    assert record.commands is not None
-    assert record.commands.tolist() == list(range(COUNT))
-
-
 @pytest.mark.parametrize(('names', 'said'), [
     (('time', 'target pos (5)', 'pos (5)', 'target pos (3)', 'pos (3)'), 'several columns may be'),
     (('t', 'voltage', 'y'), 'no column is v'), (('t', 'v', 'speed'), 'no column is y'),

@@ -72,13 +72,6 @@ def _begin(record: Record, t: Array) -> float:
     return float(shifts[int(np.argmin(errors))])
 
 
-def test_steps_that_vary_from_row_to_row_are_true_instants() -> None:
-    steps = PERIOD_S * np.random.default_rng(3).choice([1.0, 1.0, 1.0, 1.4], COUNT)
-    t = np.append(0.0, np.cumsum(steps[1:]))
-    record = log(t)
-    assert off(record, t[0] + _begin(record, t)) < 2e-3
-
-
 def test_late_stamps_of_even_samples_are_numbered() -> None:
     late = 0.7 * PERIOD_S * np.random.default_rng(1).random(COUNT)
     record = log(even(), stamps=even() + late)
@@ -171,13 +164,6 @@ def test_a_short_gap_is_missing_samples_and_a_long_one_ends_the_record() -> None
     record = log(t)
     assert len(record.v) == 700
     assert 'long gap' in record.timing
-
-
-def test_rows_that_repeat_the_one_before_count_once() -> None:
-    t = np.repeat(even(), 2)
-    record = log(t, noise=0.0)
-    assert record.v.tolist() == command(even()).tolist()
-    assert '1200 rows that repeat' in record.timing
 
 
 def test_where_moving_y_would_show_the_grid_is_finer() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import re
-from dataclasses import replace
 from math import nan
 from pathlib import Path
 
@@ -14,17 +13,15 @@ import pytest
 from made_bags import LATENCY_S, PARAMETERS, TYPES, believed, write_bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from backlash_ros.core.loop.learned_model import LearnedModel
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import report as report
-from backlash_ros.tools.cli import InputError, Span
+from backlash_ros.tools.cli import Span
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs import analysis
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import write_run, write_summary
-from backlash_ros.tools.runs.run import Run
 from backlash_ros.tools.runs.source import read_run
 from backlash_ros.tools.runs.summary import summarise
 
@@ -74,21 +71,6 @@ def test_page_tells_the_summary_and_the_parameters(page: Path) -> None:
     assert 'law: lms' in html
 
 
-@pytest.mark.usefixtures('undrawn')
-def test_page_tells_what_is_known_of_the_fit(run: RunRecord, tmp_path: Path) -> None:
-    believed_then = LearnedModel((0.1,), (1.0, -0.5), 0, (0.1,) * 5, 1.234, 0.0567)
-    pages = {}
-    for name, learned in (('known', believed_then), ('unknown', None)):
-        (tmp_path / name).mkdir()
-        report.write_report(Run(replace(run, learned=learned), PARAMETERS), tmp_path / name)
-        pages[name] = (tmp_path / name / 'report.html').read_text(encoding='utf-8')
-    assert '<td>noise on y, learned / nominal</td><td>1.23</td>' in pages['known']
-    assert '<td>unexplained motion of u</td><td>5.67 % of m times the gap</td>' in pages['known']
-    assert '<td>unexplained motion of u</td><td>–</td>' in pages['unknown']
-    for html in pages.values():
-        assert '<td>state at the end</td><td>acquiring</td>' in html
-
-
 def test_summary_of_a_bag_tells_latency_losses_and_truth(page: Path) -> None:
     summary = json.loads((page.parent / 'summary.json').read_text())
     assert summary['loop_latency_ms'] == pytest.approx({'p50': 0.4, 'p99': 0.4})
@@ -122,14 +104,6 @@ def test_bag_without_a_whole_model_is_read_all_the_same(
     assert summarise(found, None)['model'] is None
 
 
-def test_part_of_saved_results_knows_no_model_of_its_end(run: RunRecord, tmp_path: Path) -> None:
-    write_run(run, tmp_path)
-    whole = read_run(tmp_path / 'record.npz').record
-    assert whole.learned == run.learned or repr(whole.learned) == repr(run.learned)
-    assert read_run(tmp_path / 'record.npz', span=Span(to_s=0.5)).record.learned is None
-    assert read_run(tmp_path / 'record.npz', span=Span(0.5)).record.learned is not None
-
-
 @pytest.mark.parametrize('storage', [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_bag_gives_back_the_run(tmp_path: Path, storage: StoragePlugin) -> None:
     worn = build_closed_loop(PARAMETERS.replaced({'backlash.rate': [0.1, 0.2, -0.3]})).run(40)
@@ -158,13 +132,6 @@ def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path)
     found = read_bag(bag, run.sample_period)
     assert (found.record.lost_samples, found.record.samples) == (0, 118)
     assert found.notes[0].startswith('2 samples were left out')
-
-
-def test_bag_of_a_namespace_is_read_without_being_told_the_period(
-    run: RunRecord, tmp_path: Path,
-) -> None:
-    bag = write_bag(tmp_path / 'bag', run, namespace='robot1/', lost=frozenset({5}))
-    assert read_bag(bag).record.sample_period == pytest.approx(0.01)
 
 
 def test_report_without_truth_shows_estimates_and_innovation(
@@ -251,18 +218,6 @@ def test_unusable_input_is_one_line_and_leaves_nothing(
     assert message in err
     assert err.count('\n') == 1
     assert not (tmp_path / 'results').exists()
-
-
-def test_file_of_another_kind_is_refused(tmp_path: Path) -> None:
-    (tmp_path / 'notes.txt').touch()
-    with pytest.raises(InputError, match='is neither a bag'):
-        read_run(tmp_path / 'notes.txt')
-
-
-def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
-    run = build_closed_loop(PARAMETERS).run(1)
-    assert report.write_report(Run(run, PARAMETERS), tmp_path)['samples'] == 1
-    assert (tmp_path / 'report.html').is_file()
 
 
 def test_output_is_compared_with_the_reference_as_late_as_the_structure_makes_it() -> None:

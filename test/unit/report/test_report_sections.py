@@ -8,23 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_bags import MULTI_ARRAY, PARAMETERS, TYPES, rows_of
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from backlash_ros import topics
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import Span
 from backlash_ros.tools.runs.bag import read_bag
-from backlash_ros.tools.runs.run import Run
-from backlash_ros.tools.runs.source import read_run
 
 PERIOD_NS = 10_000_000
 START_NS = 10**18
 OTHER = Parameters({'estimator.law': 'lms', 'amplitude': 7.0})
-COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 
 
 @dataclass(frozen=True)
@@ -109,13 +105,6 @@ def test_from_and_to_choose_the_other_part(
     assert report.main([str(bag), '--from', '2', '--to', '1']) == 2
 
 
-@pytest.mark.usefixtures('undrawn')
-def test_bag_of_a_renamed_controller_gives_a_report(tmp_path: Path, first: RunRecord) -> None:
-    bag = write_pieces(tmp_path / 'bag', Piece(first, node='left'))
-    assert same(read_bag(bag).record, first)
-    assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
-
-
 def test_a_controller_that_keeps_its_name_goes_before_a_renamed_one(
     tmp_path: Path, first: RunRecord, second: RunRecord,
 ) -> None:
@@ -124,45 +113,6 @@ def test_a_controller_that_keeps_its_name_goes_before_a_renamed_one(
     assert same(found.record, second)
     assert 'holds /controller/signals, /a/signals: this is controller' in found.notes[0]
     assert same(read_bag(bag, axis='a').record, first)
-
-
-def test_topics_of_others_with_the_same_ending_are_left_alone(
-    tmp_path: Path, first: RunRecord,
-) -> None:
-    bag = write_pieces(tmp_path / 'bag', Piece(first))
-    path = tmp_path / 'with others'
-    with AnyReader([bag]) as reader, \
-            Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        other = writer.add_connection('/a/signals', MULTI_ARRAY, typestore=TYPES)
-        connections = {
-            each.id: writer.add_connection(each.topic, MULTI_ARRAY, typestore=TYPES)
-            for each in reader.connections
-        }
-        for connection, stamp_ns, raw in reader.messages():
-            writer.write(connections[connection.id], stamp_ns, raw)
-        empty = TYPES.types['std_msgs/msg/MultiArrayLayout']([], 0)
-        message = TYPES.types[MULTI_ARRAY](empty, np.ones(3))
-        writer.write(other, START_NS, TYPES.serialize_cdr(message, MULTI_ARRAY))
-    assert same(read_bag(path).record, first)
-    assert read_bag(path, 0.01).notes == ()
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> None:
-    report.write_report(Run(first, PARAMETERS), tmp_path)
-    part = read_run(tmp_path, span=Span(0.5, 0.8)).record
-    assert np.array_equal(part.column('y'), first.column('y')[50:80])
-    assert part.column('t')[0] == 0.0
-
-
-def test_count_that_goes_on_after_a_restart_makes_one_run(
-    tmp_path: Path, first: RunRecord, second: RunRecord,
-) -> None:
-    bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=1.5, first=150))
-    found = read_bag(bag, 0.01)
-    assert found.notes == ()
-    assert found.record.samples == first.samples + second.samples
-    assert found.record.column('t')[-1] == pytest.approx(1.5 + 0.89)
 
 
 def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(

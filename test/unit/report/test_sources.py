@@ -43,19 +43,6 @@ def test_a_lone_file_of_a_bag_is_a_bag(
     ]
 
 
-def test_a_bag_of_which_only_the_metadata_are_gone_is_whole(tmp_path: Path, run: RunRecord) -> None:
-    bag = write_bag(tmp_path / 'bag', run)
-    (bag / 'metadata.yaml').unlink()
-    assert read_run(bag).record.samples == run.samples
-
-
-def test_metadata_of_a_later_rosbag2_are_no_obstacle(tmp_path: Path, run: RunRecord) -> None:
-    bag = write_bag(tmp_path / 'bag', run)
-    metadata = bag / 'metadata.yaml'
-    metadata.write_text(metadata.read_text().replace('version: 9', 'version: 99'))
-    assert read_run(bag).record.samples == run.samples
-
-
 def test_compressed_chunks_are_read(
     tmp_path: Path, run: RunRecord, monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from math import inf
 from pathlib import Path
 
 import pytest
@@ -87,13 +86,6 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
     axis.began -= 1.0
     with pytest.raises(BrokenOffError, match=r'^only 42 of 100 samples, '):
         axis.check_pace()
-
-
-@pytest.mark.parametrize('values', [{'lockstep': True}, {'samples': 0}])
-def test_lockstep_and_endless_runs_have_no_deadline(
-    tmp_path: Path, values: dict[str, object],
-) -> None:
-    assert begun(tmp_path, **values)[0].deadline == inf
 
 
 def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts_it(

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import signal
 import struct
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,9 +14,6 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-from places import ROOT
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
@@ -27,26 +21,12 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from backlash_ros.bags.reading import BagError, BagReader
 from backlash_ros.bags.repair import damage, repair, repair_command
 from backlash_ros.bags.writer import STORAGE, Bag
-from backlash_ros.nodes import recorder
 
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 CDR = b'\x00\x01\x00\x00'
 MESSAGES, PER_FLUSH = 400, 40
 PAGE = 4096  # of SQLite
 MAGIC = b'\x89MCAP0\r\n'
-
-# Writes without end, and tells after each flush what is safe.
-WRITER = """
-import itertools, struct, sys
-from backlash_ros.bags.writer import Bag
-bag = Bag(sys.argv[1], sys.argv[2])
-number = bag.add_topic('/number', 'std_msgs/msg/Float64')
-for i in itertools.count():
-    bag.write(number, 10**18 + i * 1_000_000, bytes([0, 1, 0, 0]) + struct.pack('<d', i))
-    if i % 100 == 99:
-        bag.flush()
-        print(bag.saved, flush=True)
-"""
 
 
 def number_message(i: int) -> bytes:
@@ -75,14 +55,6 @@ def numbers_in(bag: Path) -> list[float]:
         ]
 
 
-def numbers_for_mcap_reader(bag: Path) -> list[float]:
-    """The same by the reader that has nothing to do with rosbags."""
-    (file,) = bag.glob('*.mcap')
-    with file.open('rb') as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [message.data for *_, message in reader.iter_decoded_messages(['/number'])]
-
-
 def message_file(bag: Path) -> Path:
     (file,) = (file for file in bag.iterdir() if file.suffix in ('.mcap', '.db3'))
     return file
@@ -90,45 +62,6 @@ def message_file(bag: Path) -> Path:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob('*') if path.is_file()}
-
-
-@contextmanager
-def writer_process(bag: Path, storage: str) -> Iterator[subprocess.Popen[str]]:
-    process = subprocess.Popen(
-        [sys.executable, '-c', WRITER, str(bag), storage], cwd=ROOT,
-        stdout=subprocess.PIPE, text=True,
-    )
-    try:
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-        assert process.stdout is not None
-        process.stdout.close()
-
-
-@pytest.mark.parametrize('storage', STORAGE)
-def test_kill_of_the_writer_loses_nothing_that_was_flushed(tmp_path: Path, storage: str) -> None:
-    bag = tmp_path / 'bag'
-    with writer_process(bag, storage) as process:
-        assert process.stdout is not None
-        lines = [process.stdout.readline() for _ in range(5)]
-        process.send_signal(signal.SIGKILL)
-        lines += process.stdout.readlines()
-    reader = BagReader(bag)
-    left = [message.data for message in reader.messages()]
-    assert reader.damage == 'was never closed'
-    assert left == [number_message(i) for i in range(len(left))]
-    assert len(left) >= int(lines[-1])
-    done = repair(bag)
-    assert done is not None
-    assert done.messages == {'/number': len(left)}
-    assert damage(bag) == ''
-    assert numbers_in(bag) == list(map(float, range(len(left))))
-    if storage == 'mcap':
-        assert numbers_for_mcap_reader(bag) == list(map(float, range(len(left))))
-    assert {path.name for path in tmp_path.iterdir()} == {'bag', 'bag.damaged'}
-    assert repair(bag) is None
 
 
 class Finished:
@@ -226,35 +159,12 @@ def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_erro
         assert (damage(bag) == '') == complete
 
 
-def test_length_that_is_garbage_is_not_taken_for_a_need_of_memory(
-    finished: dict[str, Finished],
-) -> None:
-    whole = finished['mcap']
-    begin, flushed = whole.flushed[5]
-    assert whole.data[begin] == 6  # a chunk
-    changed = whole.data[:begin + 1] + struct.pack('<Q', 2**62) + whole.data[begin + 9:]
-    with whole.with_file(changed, metadata=False) as bag:
-        assert len(repaired_numbers(bag)) >= flushed
-
-
 def test_sqlite_that_lost_its_end_gives_the_messages_before_it(
     finished: dict[str, Finished],
 ) -> None:
     whole = finished['sqlite3']
     with whole.with_file(whole.data[:-2 * PAGE], metadata=True) as bag:
         assert MESSAGES // 2 < len(repaired_numbers(bag)) < MESSAGES
-
-
-def test_page_of_zeros_costs_only_the_block_that_it_lies_in(
-    finished: dict[str, Finished],
-) -> None:
-    whole = finished['mcap']
-    (begin, before), (end, after) = whole.flushed[4:6]
-    at = begin + (end - begin) // 2
-    changed = whole.data[:at] + bytes(600) + whole.data[at + 600:]
-    with whole.with_file(changed, metadata=False) as bag:
-        found = repaired_numbers(bag)
-    assert found == [i for i in range(MESSAGES) if not before <= i < after]
 
 
 def test_files_of_a_split_bag_and_lone_files_are_read_in_their_order(
@@ -316,16 +226,6 @@ def test_bag_that_is_whole_is_left_alone(
         assert contents(whole.bag.parent) == before
 
 
-def test_bag_that_is_being_recorded_is_left_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    bag = Bag(str(tmp_path / 'bag'), 'mcap')
-    assert repair_command(bag.path) == 1
-    assert 'is being recorded: stop its recorder first' in capsys.readouterr().err
-    bag.close()
-    assert repair_command(bag.path) == 0
-
-
 def nothing_flushed(bag: Path) -> None:
     file = message_file(bag)
     file.write_bytes(file.read_bytes()[:60])
@@ -379,20 +279,3 @@ def test_second_repair_keeps_both_originals(
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         'mcap_bag', 'mcap_bag.damaged', 'mcap_bag.damaged.1',
     ]
-
-
-@pytest.mark.parametrize(('arguments', 'words'), [
-    (['--repair', '/nowhere/bag'], '/nowhere/bag: does not exist'),
-    (['--repair', str(ROOT)], 'holds no .mcap and no .db3 file'),
-    (['--repair'], '--repair needs the folder of a bag'),
-])
-def test_repair_of_what_is_no_bag_is_bad_input(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: list[str],
-    words: str,
-) -> None:
-    monkeypatch.setattr(signal, 'signal', lambda number, handler: None)  # that of the tests stays
-    assert recorder.main(arguments) == 2
-    said = capsys.readouterr()
-    assert said.out == ''
-    assert words in said.err
-    assert said.err.count('\n') == 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import shlex
 import socket
@@ -18,7 +17,7 @@ from backlash_ros.tools.bringup import environment
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
 from backlash_ros.tools.bringup.supervisor import ProcessPlan
-from backlash_ros.tools.bringup.watch import AxisProgress, describe
+from backlash_ros.tools.bringup.watch import describe
 from backlash_ros.tools.config import effective_parameters
 
 CONFIG = ROOT / 'config' / 'two_axes.yaml'
@@ -202,22 +201,3 @@ def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
         'tilt/plant', 'tilt/reference', 'tilt/controller', 'tilt/recorder',
     ]
     assert all('__ns:=/tilt' in process.command for process in processes)
-
-
-def test_axis_that_holds_a_bag_is_not_written_over(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
-    (tmp_path / 'tilt' / 'bag').mkdir(parents=True)
-    assert bringup.main(['--config', str(CONFIG), '--out', str(tmp_path)]) == 2
-    assert 'holds a bag already' in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ['tilt']
-
-
-def test_progress_names_the_axis_and_an_endless_run_has_no_total(tmp_path: Path) -> None:
-    stream = io.StringIO()
-    progress = {'sample': 149, 'm': 1.0, 'lost': 0}
-    for axis in (*plan(tmp_path, '', 'x', samples=200).axes, *plan(tmp_path, '', samples=0).axes):
-        AxisProgress(axis, stream).take(progress)
-    first, second = stream.getvalue().splitlines()
-    assert first.startswith('x:    1.50 s  150/200  m 1')
-    assert second.startswith('   1.50 s  150  m 1')

@@ -103,14 +103,6 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
     assert all(parameters[name] == () for name in set(parameters) - set(load_config(config)))
 
 
-def test_empty_list_is_left_out_and_so_is_what_bringup_alone_would_use(config: Path) -> None:
-    # ROS 2 knows no empty list.
-    write_config(Parameters(), config)
-    assert '/bringup' not in config.read_text()
-    assert '[]' not in config.read_text()
-    assert Parameters(load_config(config)) == Parameters()
-
-
 def test_written_infinity_is_one_for_ros_as_well(config: Path) -> None:
     write_config(Parameters(), config)
     text = config.read_text()
@@ -147,14 +139,6 @@ def test_section_of_a_node_is_accepted(config: Path, section: str) -> None:
     assert load_config(config) == {'estimator.law': 'lms'}
 
 
-def test_section_of_a_node_goes_before_that_of_all(config: Path) -> None:
-    written(
-        config,
-        '/plant: {ros__parameters: {seed: 5}}\n/**: {ros__parameters: {seed: 4, amplitude: 2.0}}',
-    )
-    assert load_config(config) == {'seed': 5, 'amplitude': 2.0}
-
-
 @pytest.mark.parametrize(
     ('text', 'message'),
     [
@@ -186,15 +170,6 @@ def test_mistake_in_a_file_is_one_line_that_names_the_file(
     assert str(caught.value).startswith(f'{config}:')
     assert message in str(caught.value)
     assert '\n' not in str(caught.value)
-
-
-def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r'nothing\.yaml: cannot be read: No such file'):
-        load_config(tmp_path / 'nothing.yaml')
-    binary = tmp_path / 'binary.yaml'
-    binary.write_bytes(b'\xff\xfe\x00')
-    with pytest.raises(InputError, match='not a text file'):
-        load_config(binary)
 
 
 @pytest.mark.parametrize(
@@ -315,11 +290,3 @@ def test_one_of_several_axes_must_be_chosen_by_its_name(config: Path) -> None:
         effective_parameters(config, axis='z')
     with pytest.raises(InputError, match="--set z/seed: there is no axis 'z' among x, y"):
         effective_parameters(config, ['z/seed=1'], axis='x')
-
-
-def test_equal_lists_are_written_in_full_as_rcl_wants_them(tmp_path: Path) -> None:
-    write_config(Parameters(), tmp_path / 'parameters.yaml')
-    text = (tmp_path / 'parameters.yaml').read_text()
-    assert text.count('[0.0, 0.0, 0.0]') > 1
-    assert '&' not in text
-    assert ' *' not in text

@@ -85,21 +85,6 @@ def test_u_is_left_empty_where_it_is_unknown(run: RunRecord, tmp_path: Path) -> 
     assert np.isnan(results.read_samples(tmp_path / 'samples.csv').column('u')).all()
 
 
-def test_record_keeps_every_bit(run: RunRecord, tmp_path: Path) -> None:
-    results.write_run(run, tmp_path)
-    again = results.read_record(tmp_path / 'record.npz')
-    np.testing.assert_array_equal(again.rows, run.rows)
-    assert (again.sample_period, again.lost_samples) == (run.sample_period, run.lost_samples)
-
-
-def test_record_of_fewer_columns_is_read(run: RunRecord, tmp_path: Path) -> None:
-    path = tmp_path / 'record.npz'
-    np.savez(path, columns=['t', 'm'], rows=run.rows[:, :2], sample_period=0.01, lost_samples=0)
-    again = results.read_record(path)
-    np.testing.assert_array_equal(again.column('m'), run.rows[:, 1])
-    assert np.isnan(again.column('v')).all()
-
-
 def test_summary_has_the_agreed_fields(run: RunRecord) -> None:
     summary = summarise(run, Parameters({'estimator.law': 'lms'}))
     assert list(summary) == FIELDS
@@ -191,13 +176,6 @@ def test_latest_points_at_the_newest_folder(
     assert latest.resolve() == folders[-1].resolve()
     # Relative, so that the results can be moved.
     assert str(latest.readlink()) == folders[-1].name
-
-
-def test_named_folder_leaves_latest_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert results.result_directory(Path('a/b')) == Path('a/b')
-    assert Path('a/b').is_dir()
-    assert not Path('results').exists()
 
 
 def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
