@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,14 +47,16 @@ from backlash_ros.core.estimation.settings import (
     BLOCKS,
     FEWEST,
     FIRST_FIT,
-    FORETOLD,
     GROWTH,
     HELD_REVERSALS,
+    LASTING,
     LIVELY,
     LONGEST,
     LOST_MOTION,
     MISFIT,
+    MOST_PREDICTED,
     OUTLIER_SHARE,
+    PREDICTED,
     UNEXPLAINED,
 )
 
@@ -92,8 +94,9 @@ class Belief:
     first: number of the first sample of the record. older, start: what samples before it say.
     next_at: number of samples at which to look again, thorough_at: for other gaps too. candidate:
     found once. tried: newest fit that is not known well enough. doubt_from: sample from which on
-    the fit is contradicted. foretold: samples since the last contradiction that the fit has
-    foretold. published, cov: of m, c_r, c_l, None while nothing was. rejected: numbers of readings
+    the fit is contradicted. predicted: samples that the fit has predicted since it was adopted.
+    must_predict: how many of them before it is published. adopted_noise: of the fit as adopted.
+    published, cov: of m, c_r, c_l, None while nothing was. rejected: numbers of readings
     that are outliers. swapped: numbers of the samples over which the other command acted. coasts:
     whether the load runs on within the gap.
     """
@@ -110,13 +113,20 @@ class Belief:
     candidate: Fit | None = None
     tried: Fit | None = None
     doubt_from: int | None = None
-    foretold: int = FORETOLD
+    predicted: int = 0
+    must_predict: int = 0
+    adopted_noise: float = inf
     published: Array | None = None
     cov: Array | None = None
     inherited: Inherited | None = None
     rejected: frozenset[int] = frozenset()
     swapped: frozenset[int] = frozenset()
     coasts: bool = False
+
+    @property
+    def on_probation(self) -> bool:
+        """Whether the fit follows one that was contradicted and has not held for long."""
+        return self.predicted < LASTING * self.must_predict
 
     @property
     def trusted(self) -> bool:
@@ -192,8 +202,8 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
         return replace(after, candidate=found, next_at=record.end + max(count // BLOCKS, FEWEST))
     # What leaves correlated residuals must predict a quarter as many samples before it is believed.
     systematic = found.count * found.correlation > 1.0
-    foretold = min(FORETOLD - len(part.v) // 4, 0) if systematic else before.foretold
-    after = replace(after, older=None, start=None, foretold=foretold)
+    must = max(before.must_predict, len(part.v) // 4 if systematic else 0)
+    after = replace(after, older=None, start=None, must_predict=must)
     return _adopted(setup, part, found, after)
 
 
@@ -248,7 +258,7 @@ def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
     after = replace(
         before, state=State.KNOWN, fit=fit, first=record.first, end=record.end, candidate=None,
         tried=None, doubt_from=None, next_at=record.end + max(count // BLOCKS, FEWEST),
-        thorough_at=int(GROWTH * count),
+        thorough_at=int(GROWTH * count), predicted=0, adopted_noise=fit.noise,
     )
     return _published(setup, after)
 
@@ -281,16 +291,19 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
     if _contradicts(problem, fit, z, new):
         fit = problem.fitted(held)  # before anything is blamed
         z = problem.residual(fit)[new:] / held.noise
-    if _contradicts(problem, fit, z, new):
+    noisier = before.on_probation and fit.noise > AS_GOOD * before.adopted_noise
+    if noisier or _contradicts(problem, fit, z, new):
         excess = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
         change = int(np.argmax(np.cumsum(excess[::-1])[::-1]))
         return replace(
             before, state=State.DOUBTED, end=record.end, candidate=None,
             doubt_from=record.first + new + change, next_at=record.end + FEWEST,
+            must_predict=_must_predict(before),
+            reason=Status.INCONSISTENT if before.on_probation else before.reason,
         )
     after = replace(
         before, end=record.end, next_at=record.end + max(count // BLOCKS, FEWEST),
-        foretold=before.foretold + count - new,
+        predicted=before.predicted + count - new,
     )
     if count >= before.thorough_at:
         after = replace(after, thorough_at=int(REFIT_GROWTH * count))
@@ -307,6 +320,16 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
     after = _published(setup, after)
     wrong = after.reason is Status.INCONSISTENT
     return replace(after, coasts=wrong and coasting(problem, fit).found)
+
+
+def _must_predict(contradicted: Belief) -> int:
+    """How many samples the next explanation has to predict before it is published.
+
+    Twice as many as this one where it did not hold for long: what contradicts one explanation after
+    the other is no backlash.
+    """
+    must = contradicted.must_predict
+    return min(2 * must, MOST_PREDICTED) if contradicted.on_probation else PREDICTED
 
 
 def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> Fit:
@@ -342,7 +365,7 @@ def _excess(setup: Setup, record: Record, problem: Problem, fit: Fit) -> int:
     """
     count = len(record.v)
     drift = setup.drift**2 * count / 3.0
-    if count > 4 * FORETOLD and (drift > np.diag(fit.crossings_cov)).any():
+    if count > 4 * PREDICTED and (drift > np.diag(fit.crossings_cov)).any():
         return count // 3
     if count < LIVELY:
         return 0
@@ -421,7 +444,7 @@ def _published(setup: Setup, belief: Belief) -> Belief:
         return _beside_inherited(setup, belief, fit, belief.inherited)
     if not is_known(setup, fit, 9):
         return replace(belief, reason=Status.INCONSISTENT)
-    if belief.foretold < FORETOLD:
+    if belief.predicted < belief.must_predict:
         return belief
     cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.first) / 3.0)
     return replace(belief, published=fit.crossings, cov=cov, reason=Status.TRACKING)
@@ -445,7 +468,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
         # A gear that is no play leaves systematic residuals, and denies nothing.
         white = fit.count * fit.correlation <= 1.0 and fit.noise < AS_GOOD * _noise(setup, fit)
         sure = std < REPLACING * fit.gap and white and fit.turns >= HELD_REVERSALS
-        if sure and belief.foretold >= FORETOLD:
+        if sure and belief.predicted >= belief.must_predict:
             belief = replace(belief, inherited=None)  # it was that of another plant
         return replace(belief, reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
@@ -479,14 +502,14 @@ def _doubted(setup: Setup, record: Record, before: Belief) -> Belief:
                     next_at=record.end + max(newer // 4, FEWEST))
     problem = _problem(setup, record, before)
     z = problem.residual(held) / held.noise
-    if newer >= 2 * FORETOLD and np.nanmean(z[-FORETOLD:] ** 2) < MISFIT:
+    if newer >= 2 * PREDICTED and np.nanmean(z[-PREDICTED:] ** 2) < MISFIT:
         # Whatever it was, it is over: what was measured meanwhile says nothing.
-        lost = frozenset(range(since, record.end - FORETOLD))
+        lost = frozenset(range(since, record.end - PREDICTED))
         return replace(
             after, state=State.KNOWN, doubt_from=None, rejected=before.rejected | lost,
             end=record.end - 1, next_at=record.end,
         )
-    if newer >= FORETOLD:
+    if newer >= PREDICTED:
         after = replace(after, reason=Status.INCONSISTENT)
     short = max(SHORT_SEARCH, 4 * setup.family.memory)
     whole = afresh(setup, record) if count <= max(short, 4 * newer) and count < LONGEST else None
@@ -494,7 +517,7 @@ def _doubted(setup: Setup, record: Record, before: Belief) -> Belief:
     known_xi = of_xi(held, setup.family.count)
     for first in (since, (since + record.end) // 2):
         part = record.since(first)
-        if len(part.v) < FORETOLD:
+        if len(part.v) < PREDICTED:
             continue
         found = afresh(setup, part, known_xi, held.theta[3:], held.scale)
         if found is None or found.rms > explained \
@@ -509,7 +532,7 @@ def _doubted(setup: Setup, record: Record, before: Belief) -> Belief:
         if candidate is not None and agree(
             candidate.crossings, found.crossings, candidate.crossings_cov + found.crossings_cov
         ):
-            changed = replace(after, older=known_xi, start=None, foretold=0)
+            changed = replace(after, older=known_xi, start=None)
             return _adopted(setup, part, found, changed)
         return replace(after, candidate=found)
     if whole is not None and whole.rms < explained and is_known(setup, whole, whole.turns):

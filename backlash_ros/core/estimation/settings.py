@@ -22,7 +22,9 @@ OUTLIERS = 5  # readings in a row beyond the gate that are no outliers
 OUTLIER_SHARE = 0.2  # of a block, up to which readings beyond the gate are outliers
 MISFIT = 3.0  # mean square of normalised residuals of a block that contradicts an estimate
 AS_GOOD = 1.5  # ratio of residuals up to which another explanation is as good
-FORETOLD = 30  # samples that an explanation must foretell after a contradiction
+PREDICTED = 30  # samples that an explanation must predict after one that was contradicted
+MOST_PREDICTED = 1000  # as many at most: twice as many as the last one if that did not last
+LASTING = 8.0  # times what it had to predict, over which an explanation holds for long
 COMMAND_ODDS = 20.0  # against a command other than the one that was sent
 
 # --- how much is looked at
