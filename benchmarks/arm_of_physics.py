@@ -52,26 +52,27 @@ def move(share: float) -> Motion:
     """The arm with loops that take this share of what each joint loses for its gap."""
     arm = ArmPhysics()
     p = parameters(arm, share)
-    sample_s = p.get_float('sample_period')
-    v = dict.fromkeys(p.joints, 0.0)
+    sample_s = p.sample_period
+    v = dict.fromkeys(p.joint_names, 0.0)
     now_ns = 0
     loops = JointLoops(
-        p, v.update, lambda: now_ns, {joint: first_guess(p.of_joint(joint)) for joint in p.joints},
+        p, v.update, lambda: now_ns,
+        {joint: first_guess(p.of_joint(joint)) for joint in p.joint_names},
         SampleCounter(sample_s), dict(v),
     )
     references, positions = [], []
     for k in range(round(DURATION_S / sample_s)):
         now_ns = round((1.0 + k * sample_s) * 1e9)
         references.append([
-            swing(k * sample_s, i, AMPLITUDE, PERIOD_S) for i in range(len(p.joints))
+            swing(k * sample_s, i, AMPLITUDE, PERIOD_S) for i in range(len(p.joint_names))
         ])
         positions.append(arm.links)
-        loops.take_references(dict(zip(p.joints, references[-1], strict=True)))
-        y = dict(zip(p.joints, arm.encoders(), strict=True))
+        loops.take_references(dict(zip(p.joint_names, references[-1], strict=True)))
+        y = dict(zip(p.joint_names, arm.encoders(), strict=True))
         loops.answer(JointOutputs(y, now_ns, now_ns, now_ns, k, numbered=False))
-        arm.move_to([RESOLUTION * round(v[joint] / RESOLUTION) for joint in p.joints])
+        arm.move_to([RESOLUTION * round(v[joint] / RESOLUTION) for joint in p.joint_names])
         arm.advance(sample_s)
-    delay = loops.by_name[p.joints[0]].core.structure.delay
+    delay = loops.by_name[p.joint_names[0]].core.structure.delay
     first = len(positions) // 2
     where, wanted = np.array(positions[first:]), np.array(references[first - delay:-delay])
     tip = [

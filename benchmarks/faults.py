@@ -92,7 +92,7 @@ def play(seed: int) -> Result:
         warnings.simplefilter('ignore')
         sequence = Sequence(seed)
         p = sequence.p
-        loop = f'{p.get_str("estimator.law")}, {p.get_str("structure")}'
+        loop = f'{p.estimator.law}, {p.structure}'
         try:
             findings = sequence.run()
         except Exception as error:

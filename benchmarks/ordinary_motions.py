@@ -222,7 +222,7 @@ def run_case(case: Case) -> Result:
                       f'broke off: {error}')
     ms = 1e3 * (time.process_time() - began) / len(y_m)
     # A constant that is added to u moves both crossings.
-    found = judged(run, p.get_float('input_disturbance') / backlash['backlash.m'])
+    found = judged(run, p.input_disturbance / backlash['backlash.m'])
     return _result(case, y_m, found, ms)
 
 

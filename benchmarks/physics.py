@@ -42,7 +42,7 @@ from reporting import ROOT, machine, markdown_table, parallel, processors, text_
 from tqdm import tqdm
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.tools.config import parse_setting
 
 DOCUMENT = ROOT / 'docs' / 'physics.md'

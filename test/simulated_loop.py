@@ -69,7 +69,7 @@ class SimulatedLoop:
             driver.outputs = [
                 each for output in driver.outputs for each in self.fault(driver.tick, output)
             ]
-            y_m = driver.reference(driver.tick * self.p.get_float('sample_period'))
+            y_m = driver.reference(driver.tick * self.p.sample_period)
             self.controller.run(y_m if self.referred else None)
             if self.deaf():
                 driver.actuator.v = before

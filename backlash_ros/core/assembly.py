@@ -75,8 +75,8 @@ def build_state_model(p: Parameters) -> StateModel:
 def first_guess(p: Parameters) -> Estimate:
     """The estimates that estimator.initial names."""
     return Estimate(
-        p.get_float('estimator.initial.m'), p.get_float('estimator.initial.c_r'),
-        p.get_float('estimator.initial.c_l'), p.get_float('proportional.f'),
+        p.estimator.initial.m, p.estimator.initial.c_r,
+        p.estimator.initial.c_l, p.proportional.f,
     )
 
 
@@ -100,15 +100,15 @@ def build_controller(
     check_model(build_model(p))
     _check_first_guess(p)
     check_last_commands(p)
-    period = p.get_float('sample_period')
+    period = p.sample_period
     inverse = BacklashInverse(
-        p.get_float('inverse.direction_band'), p.get_float('inverse.take_up_rate') * period
+        p.inverse.direction_band, p.inverse.take_up_rate * period
     )
     _check_structure(p)
     executor = executor or InlineExecutor()
-    estimator = ESTIMATORS[p.get_str('estimator.law')](p, estimate or known_before(p), executor)
+    estimator = ESTIMATORS[p.estimator.law](p, estimate or known_before(p), executor)
     return AdaptiveController(
-        estimator, build_structure(p), inverse, build_limits(p), p.get_bool('plant.adapt'),
+        estimator, build_structure(p), inverse, build_limits(p), p.plant.adapt,
         _serial(p), executor,
     )
 
@@ -117,7 +117,7 @@ def _serial(p: Parameters) -> SerialPlant | None:
     actuator = build_actuator(p)
     if actuator is None:
         return None
-    return SerialPlant(actuator, build_state_model(p), p.get_float('estimator.output_noise_std'))
+    return SerialPlant(actuator, build_state_model(p), p.estimator.output_noise_std)
 
 
 def _commanded_model(p: Parameters) -> StateModel:
@@ -130,11 +130,11 @@ def _commanded_model(p: Parameters) -> StateModel:
 
 def build_structure(p: Parameters) -> Structure:
     """The linear part alone."""
-    return STRUCTURES[p.get_str('structure')](p)
+    return STRUCTURES[p.structure](p)
 
 
 def _check_structure(p: Parameters) -> None:
-    law, structure = p.get_str('estimator.law'), p.get_str('structure')
+    law, structure = p.estimator.law, p.structure
     if not law_fits(law, structure):
         raise ParameterError(
             'structure', structure, f'must be {ONLY_IN[law]} for estimator.law: {law}',
@@ -146,18 +146,18 @@ def _check_first_guess(p: Parameters) -> None:
     bounds = _bounds(p)
     for name in ('m', 'c_r', 'c_l'):
         low, high = getattr(bounds, name)
-        value = p.get_float(f'estimator.initial.{name}')
+        value = getattr(p.estimator.initial, name)
         if not low <= value <= high:
             raise ParameterError(
                 f'estimator.initial.{name}', value, f'must lie within [{low:g}, {high:g}]',
                 f'change it or estimator.bounds.{name}',
             )
-    c_r, c_l = p.get_float('estimator.initial.c_r'), p.get_float('estimator.initial.c_l')
+    c_r, c_l = p.estimator.initial.c_r, p.estimator.initial.c_l
     if c_l > c_r:
         raise ParameterError(
             'estimator.initial.c_l', c_l, f'must be <= estimator.initial.c_r={c_r!r}'
         )
-    low, high = p.get_pair('proportional.bounds')
+    low, high = p.proportional.bounds
     if low >= high:
         raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')
 
@@ -167,24 +167,24 @@ def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
 
     with_reference: whether the parameters of the reference are those in use.
     """
-    frequency = p.get_float('frequency') if with_reference else None
-    return model_warnings(build_model(p), p.get_float('sample_period'), frequency)
+    frequency = p.frequency if with_reference else None
+    return model_warnings(build_model(p), p.sample_period, frequency)
 
 
 def build_limits(p: Parameters) -> Limits:
     """Limits of v per sample."""
-    period = p.get_float('sample_period')
+    period = p.sample_period
     return Limits(
-        p.get_float('control.min'), p.get_float('control.max'),
-        p.get_float('control.rate_max') * period,
-        p.get_float('control.acceleration_max') * period**2,
+        p.control.min, p.control.max,
+        p.control.rate_max * period,
+        p.control.acceleration_max * period**2,
     )
 
 
 def _bounds(p: Parameters) -> Bounds:
     return Bounds(
-        p.get_pair('estimator.bounds.m'), p.get_pair('estimator.bounds.c_r'),
-        p.get_pair('estimator.bounds.c_l'),
+        p.estimator.bounds.m, p.estimator.bounds.c_r,
+        p.estimator.bounds.c_l,
     )
 
 
@@ -200,43 +200,43 @@ def _bounds_around_zero(p: Parameters) -> Bounds:
 
 def _reconstruction(p: Parameters) -> InputReconstruction:
     return InputReconstruction(
-        build_model(p), p.get_float('estimator.output_noise_std'), p.get_int('estimator.lag'),
+        build_model(p), p.estimator.output_noise_std, p.estimator.lag,
         LITTLE_SMOOTHING,
     )
 
 
 def _moving_horizon(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     observer = None
-    if p.get_str('structure') != 'proportional':
+    if p.structure != 'proportional':
         given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
         observer = FixedBacklash(
-            given, build_state_model(p), p.get_float('estimator.output_noise_std'),
+            given, build_state_model(p), p.estimator.output_noise_std,
             DOUBT,
         )
     return MovingHorizon(
-        initial, _bounds(p), build_state_model(p), p.get_float('estimator.output_noise_std'),
-        p.get_float('estimator.input_noise_std'), p.get_triple('estimator.drift_std'),
-        p.get_float('sample_period'), p.get_float('plant.uncertainty'), observer, executor,
+        initial, _bounds(p), build_state_model(p), p.estimator.output_noise_std,
+        p.estimator.input_noise_std, p.estimator.drift_std,
+        p.sample_period, p.plant.uncertainty, observer, executor,
     )
 
 
 def _lms(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     return NormalisedLms(
-        initial, _bounds_around_zero(p), p.get_pair('proportional.bounds'), _reconstruction(p),
-        p.get_float('lms.step'), p.get_float('lms.step_f'),
+        initial, _bounds_around_zero(p), p.proportional.bounds, _reconstruction(p),
+        p.lms.step, p.lms.step_f,
     )
 
 
 def _printed(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     return PrintedLaw(
-        initial, _bounds_around_zero(p), p.get_pair('proportional.bounds'), _reconstruction(p)
+        initial, _bounds_around_zero(p), p.proportional.bounds, _reconstruction(p)
     )
 
 
 def _fixed(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     return FixedBacklash(
-        initial, build_state_model(p), p.get_float('estimator.output_noise_std'),
-        p.get_float('fixed.doubt'),
+        initial, build_state_model(p), p.estimator.output_noise_std,
+        p.fixed.doubt,
     )
 
 
@@ -248,8 +248,8 @@ def law_fits(law: str, structure: str) -> bool:
 def _gradient(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     blocks = build_four_blocks(p)
     return GradientEstimator(
-        initial, _bounds_around_zero(p), blocks, p.get_float('gradient.step'),
-        p.get_float('estimator.output_noise_std'),
+        initial, _bounds_around_zero(p), blocks, p.gradient.step,
+        p.estimator.output_noise_std,
     )
 
 
@@ -265,20 +265,20 @@ def build_four_blocks(p: Parameters) -> FourBlocks:
     """The gains of `pole_placement`, placed where those of `tracking` put the poles of G."""
     state = _commanded_model(p)
     model = state.transfer_function
-    weight = p.get_float('tracking.input_weight') * power_gain(model, np.pi / 10.0)
+    weight = p.tracking.input_weight * power_gain(model, np.pi / 10.0)
     gains = lq_gains(state, weight)
     closed = np.real(np.poly(state.a - np.outer(state.b, gains.state)))
-    return place_poles(model, closed, p.get_float('pole_placement.filter_pole'))
+    return place_poles(model, closed, p.pole_placement.filter_pole)
 
 
 def _tracking(p: Parameters) -> Structure:
     weights = Weights(
-        p.get_float('tracking.input_weight'), p.get_float('tracking.integral_weight'),
-        p.get_int('tracking.preview'),
+        p.tracking.input_weight, p.tracking.integral_weight,
+        p.tracking.preview,
     )
     return Tracking(
-        design(_commanded_model(p), weights), weights, p.get_float('inverse.caution'),
-        p.get_float('estimator.output_noise_std'),
+        design(_commanded_model(p), weights), weights, p.inverse.caution,
+        p.estimator.output_noise_std,
     )
 
 

@@ -53,9 +53,9 @@ def load_estimate(p: Parameters) -> Estimate | None:
     `fixed` takes what any other one has learned. Files of the time before the law was saved serve
     the laws that know deviations if they hold some.
     """
-    if not p.get_bool('estimates.load'):
+    if not p.estimates.load:
         return None
-    name = p.get_str('estimates.file')
+    name = p.estimates.file
     if not name:
         raise ParameterError('estimates.file', '', 'must name a file for estimates.load: true')
     try:
@@ -84,7 +84,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
         raise ParameterError(
             'estimates.file', name, 'holds constants that were given, not learned', 'delete it'
         )
-    law = p.get_str(LAW)
+    law = p.estimator.law
     if isinstance(key, dict) and LAW not in key and law != FIXED:
         if law in WITHOUT_DEVIATIONS or not estimate.learned:
             raise ParameterError(
@@ -110,7 +110,7 @@ def _checked(name: str, estimate: Estimate, p: Parameters) -> Estimate:
         if not isfinite(getattr(estimate, part)):
             raise ParameterError('estimates.file', name, f'has no finite {part}', 'delete it')
     for part in ('m', 'c_r', 'c_l'):
-        low, high = p.get_pair(f'estimator.bounds.{part}')
+        low, high = getattr(p.estimator.bounds, part)
         if not low <= getattr(estimate, part) <= high:
             raise ParameterError(
                 'estimates.file', name,

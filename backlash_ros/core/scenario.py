@@ -19,20 +19,20 @@ from backlash_ros.core.reference.signal import ReferenceSignal
 
 def build_model(p: Parameters) -> TransferFunction:
     """G(z), and the delay between control and its effect as poles at 0."""
-    delay = (0.0,) * p.get_int('control.delay_samples')
+    delay = (0.0,) * p.control.delay_samples
     return TransferFunction(
-        p.get_floats('plant.numerator'), p.get_floats('plant.denominator') + delay
+        p.plant.numerator, p.plant.denominator + delay
     )
 
 
 def build_actuator(p: Parameters) -> Actuator | None:
     """What lies between control and applied_control; None where nothing does."""
-    numerator = p.get_floats('actuator.numerator')
-    denominator = p.get_floats('actuator.denominator')
+    numerator = p.actuator.numerator
+    denominator = p.actuator.denominator
     if not (numerator or denominator):
         return None
     return Actuator(
-        TransferFunction(numerator, denominator, 'actuator'), p.get_pair('actuator.wind_up')
+        TransferFunction(numerator, denominator, 'actuator'), p.actuator.wind_up
     )
 
 
@@ -41,18 +41,18 @@ def build_true_model(p: Parameters) -> TransferFunction:
 
     Raises ParameterError where that G(z) cannot be altered as truth.* asks.
     """
-    delay = p.get_int('truth.delay_samples')
+    delay = p.truth.delay_samples
     if delay < 0:
-        delay = p.get_int('control.delay_samples')
-    numerator, denominator = p.get_floats('truth.numerator'), p.get_floats('truth.denominator')
+        delay = p.control.delay_samples
+    numerator, denominator = p.truth.numerator, p.truth.denominator
     base = TransferFunction(
-        numerator or p.get_floats('plant.numerator'),
-        denominator or p.get_floats('plant.denominator'),
+        numerator or p.plant.numerator,
+        denominator or p.plant.denominator,
         'truth' if numerator or denominator else 'plant',
     )
     altered = altered_plant(base, Alteration(
-        p.get_float('truth.scale_frequency'), p.get_float('truth.scale_damping'),
-        p.get_float('truth.extra_lag') / p.get_float('sample_period'),
+        p.truth.scale_frequency, p.truth.scale_damping,
+        p.truth.extra_lag / p.sample_period,
     ))
     return delayed(altered, delay)
 
@@ -60,21 +60,21 @@ def build_true_model(p: Parameters) -> TransferFunction:
 def build_plant(p: Parameters) -> SimulatedPlant:
     """The simulated plant with its hidden backlash."""
     backlash = Backlash(
-        p.get_float('backlash.m'), p.get_float('backlash.c_r'), p.get_float('backlash.c_l'),
-        p.get_float('backlash.initial_u'),
+        p.backlash.m, p.backlash.c_r, p.backlash.c_l,
+        p.backlash.initial_u,
     )
     imperfections = Imperfections(
-        p.get_float('output_noise_std'),
-        p.get_float('output_quantum'),
-        p.get_float('input_disturbance'),
-        p.get_float('truth.walk_std'),
-        p.get_triple('backlash.rate'),
-        p.get_float('backlash.jump_time'),
-        p.get_triple('backlash.jump'),
+        p.output_noise_std,
+        p.output_quantum,
+        p.input_disturbance,
+        p.truth.walk_std,
+        p.backlash.rate,
+        p.backlash.jump_time,
+        p.backlash.jump,
     )
-    rng = np.random.default_rng(p.get_int('seed'))
+    rng = np.random.default_rng(p.seed)
     return SimulatedPlant(
-        build_true_model(p), backlash, p.get_float('sample_period'), rng, imperfections,
+        build_true_model(p), backlash, p.sample_period, rng, imperfections,
         build_actuator(p),
     )
 
@@ -82,12 +82,12 @@ def build_plant(p: Parameters) -> SimulatedPlant:
 def build_reference(p: Parameters) -> ReferenceSignal:
     """y_m(t); reads the file for waveform: file."""
     return ReferenceSignal(
-        p.get_str('waveform'),
-        p.get_float('amplitude'),
-        p.get_float('frequency'),
-        p.get_float('bias'),
-        p.get_float('frequency_start'),
-        p.get_float('sweep_time'),
-        p.get_float('sample_period'),
+        p.waveform,
+        p.amplitude,
+        p.frequency,
+        p.bias,
+        p.frequency_start,
+        p.sweep_time,
+        p.sample_period,
         read_reference_file(p),
     )

@@ -63,7 +63,7 @@ class CheckDriverNode(ProcessNode):
         super().__init__(EXECUTABLE, parameters_of=CONTROLLER)
         build_controller(self.settings)
         self._options = options
-        self._period = self.settings.get_float('sample_period')
+        self._period = self.settings.sample_period
         self._limits = (
             drive_range(self.settings, options.amplitude, options.rate) if options.drive else None
         )
@@ -160,7 +160,7 @@ class CheckDriverNode(ProcessNode):
 
     def _v_at_start(self) -> float:
         """The v that acts before the drive, 0 where nobody says it."""
-        initial = self.settings.get_float('control.initial')
+        initial = self.settings.control.initial
         known = initial if plausible(initial) else None
         reported = [message.value for message in self._heard.applied[-1:]]
         if reported and plausible(reported[0]):
@@ -181,7 +181,7 @@ class CheckDriverNode(ProcessNode):
         """Listen for the duration, and drive."""
         begin = looked = time.monotonic()
         end = begin + self._options.duration + (0.0 if self._limits is None else SETTLE_S)
-        patience = max(self.settings.get_float('timeout.plant_output'), 10.0 * self._period)
+        patience = max(self.settings.timeout.plant_output, 10.0 * self._period)
         while not self.stopping:
             executor.spin_once(timeout_sec=LOOK_S)
             now = time.monotonic()

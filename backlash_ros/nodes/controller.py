@@ -64,7 +64,7 @@ class ControllerNode(ManagedNode):
         super().__init__(CONTROLLER)
         p = self.settings
         _check_style(p)
-        for joint in p.joints:
+        for joint in p.joint_names:
             # Whatever is wrong with the parameters ends the process before it takes part in
             # anything.
             own = p.of_joint(joint)
@@ -72,7 +72,7 @@ class ControllerNode(ManagedNode):
             for warning in warnings_of(own, with_reference=False):
                 self.log.warning(f'{joint}: {warning}' if joint else warning)
         self.loops: JointLoops | None = None  # None while unconfigured
-        self._lockstep = p.get_bool('lockstep')
+        self._lockstep = p.lockstep
         # A fit that shared the process of the loop would hold up its commands.
         self._executor: Executor = (
             InlineExecutor() if self._lockstep else WorkerExecutor(WORKER_MODULES)
@@ -82,7 +82,7 @@ class ControllerNode(ManagedNode):
         self._io = DriverIo(self, p)
         # Whoever waits for the others begins with them; who does not may have been restarted.
         self._set_up(
-            p, from_zero=not self._lockstep and p.get_int('wait_for_subscribers') > 0
+            p, from_zero=not self._lockstep and p.wait_for_subscribers > 0
         )
         self._saved_at = time.monotonic()
         self._queues: tuple[deque[Any], deque[Any], deque[Any]] = (deque(), deque(), deque())
@@ -95,16 +95,17 @@ class ControllerNode(ManagedNode):
         )
         self._told_rivals = self._rivals.found
         self._commands_of_rivals: Subscription | None = None  # heard while standing down
-        self._steps = StepPublisher(self, p.joints)
+        self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         self._reference = self._io.listen_to_references(
             self._on_reference, KEPT if self._lockstep else 1
         )
         # The first command begins with what the driver reports, even if it is not learned from.
-        self._reports = None if self._lockstep else Reports(self, self._io, p.joints)
+        self._reports = None if self._lockstep else Reports(self, self._io, p.joint_names)
         self.joints += [
             Joint(self, joint, p.of_joint(joint), self._io, self._reports,
-                  self._reference.qos_profile, speaks=joint == p.joints[0]) for joint in p.joints
+                  self._reference.qos_profile, speaks=joint == p.joint_names[0])
+            for joint in p.joint_names
         ]
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
@@ -116,18 +117,18 @@ class ControllerNode(ManagedNode):
         if not self._lockstep:
             self.create_timer(0.05, self._look_for_silence, clock=self.steady_clock)
         self._announce()
-        if p.get_bool('autostart'):
+        if p.autostart:
             self.start()
 
     def _announce(self) -> None:
         """Say in the log what the node is about."""
         p, to, name = self.settings, self._io.topics, self.resolve_topic_name
-        period = p.get_float('sample_period')
-        joints = f'joints {", ".join(p.joints)}: ' if p.joints[0] else ''
+        period = p.sample_period
+        joints = f'joints {", ".join(p.joint_names)}: ' if p.joint_names[0] else ''
         self.log.info(
             f'started: {joints}{name(to.output)} and {name(to.reference)} in, {name(to.control)} '
             f'out, sample_period {period:g} s ({1.0 / period:.4g} Hz); '
-            + (f'waits for {to.reference} and {to.output}' if p.get_bool('autostart')
+            + (f'waits for {to.reference} and {to.output}' if p.autostart
                else 'autostart is false: waits for '
                     f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
         )
@@ -178,7 +179,7 @@ class ControllerNode(ManagedNode):
 
     def _knows_rivals(self) -> bool:
         """Whether no controller of this machine has still to be found that may be in charge."""
-        return self._rivals.complete or self._live.parameters.get_str('on_rival') == 'warn'
+        return self._rivals.complete or self._live.parameters.on_rival == 'warn'
 
     def _await_loop(self) -> None:
         """Listen to plant_output as soon as everybody is there."""
@@ -197,7 +198,7 @@ class ControllerNode(ManagedNode):
             # Before a ramp: whoever stops this process may not wait for its end.
             self._save()
             self._last_commands.send_all(
-                loops, p.get_str('on_stop'), p.get_float('timeout.ramp'), self._diagnose
+                loops, p.on_stop, p.timeout.ramp, self._diagnose
             )
             for joint in self.joints:
                 joint.model.publish(loops.by_name[joint.name])
@@ -222,7 +223,7 @@ class ControllerNode(ManagedNode):
 
     def _conditions_of_start(self) -> list[Callable[[], bool]]:
         """What has to be there before plant_output is listened to, for that starts the loop."""
-        wanted = max(self.settings.get_int('wait_for_subscribers'), int(self._lockstep))
+        wanted = max(self.settings.wait_for_subscribers, int(self._lockstep))
         if not wanted:
             return []
         return [
@@ -237,7 +238,7 @@ class ControllerNode(ManagedNode):
         # Whoever is activated twice before everybody is there has two that wait.
         if self._driver is None:
             self._rivals.look()
-            kept = kept_outputs(self.settings.get_float('sample_period'))
+            kept = kept_outputs(self.settings.sample_period)
             self._driver = self._io.listen(self._on_output, min(kept, DEPTH))
             emit('ready')
 
@@ -342,8 +343,8 @@ class ControllerNode(ManagedNode):
 
     def _set_up(self, p: Parameters, from_zero: bool) -> None:
         """Take up what follows from the sample period."""
-        period = p.get_float('sample_period')
-        self._together = p.get_bool('io.together')
+        period = p.sample_period
+        self._together = p.io.together
         self._post_command_sleep_s, self._period_ns = POST_COMMAND_SLEEP * period, period * 1e9
         self._refine_budget_s = REFINE_SHARE * period
         self._counter = SampleCounter(period, from_zero)
@@ -351,7 +352,7 @@ class ControllerNode(ManagedNode):
     def _mind_rivals(self) -> None:
         """Stand down or command again, as on_rival says, and tell of it."""
         found = self._rivals.found
-        on_rival = self._live.parameters.get_str('on_rival')
+        on_rival = self._live.parameters.on_rival
         stand_down = on_rival == 'stand_down' and not self._rivals.came_first
         changing = [loop for loop in self.configured if loop.standing_down != stand_down]
         if changing and stand_down:
@@ -389,12 +390,12 @@ class ControllerNode(ManagedNode):
             ]
             for loop in ending:
                 loop.give_up()
-            on_timeout = self._live.parameters.get_str('on_timeout')
+            on_timeout = self._live.parameters.on_timeout
             self._last_commands.begin(loops, ending, on_timeout)
             self._diagnose()
 
     def _save_now_and_then(self) -> None:
-        period = self._live.parameters.get_float('estimates.save_period')
+        period = self._live.parameters.estimates.save_period
         if period > 0.0 and time.monotonic() > self._saved_at + period:
             self._saved_at = time.monotonic()
             self._save()
@@ -412,15 +413,15 @@ class ControllerNode(ManagedNode):
 
 def _check_style(p: Parameters) -> None:
     """Raise ParameterError where the messages of io.style cannot carry what is asked for."""
-    style = p.get_str('io.style')
-    if p.get_bool('lockstep') and style != 'native':
+    style = p.io.style
+    if p.lockstep and style != 'native':
         raise ParameterError('lockstep', True, 'needs io.style: native')
-    if p[JOINTS] and style == 'native':
+    if p.joint_names and style == 'native':
         raise ParameterError(
             'io.style', style, 'has messages for one joint only',
             'set joint_state_topic or ros2_control',
         )
-    if style == 'joint_state_topic' and not (p[JOINTS] or p['io.joint']):
+    if style == 'joint_state_topic' and not (p.joint_names or p.io.joint):
         raise ParameterError(JOINTS, (), 'is empty', f'name them, io.style is {style}')
 
 

@@ -54,12 +54,12 @@ class PlantNode(ProcessNode):
         super().__init__(PLANT)
         p = self.settings
         self._plant = build_plant(p)
-        self._sample_period = p.get_float('sample_period')
-        self._lockstep = p.get_bool('lockstep')
-        self._samples = p.get_int('samples')
-        self._loss = p.get_float('output_loss')
+        self._sample_period = p.sample_period
+        self._lockstep = p.lockstep
+        self._samples = p.samples
+        self._loss = p.output_loss
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
-        self._loss_rng = np.random.default_rng([p.get_int('seed'), 1])
+        self._loss_rng = np.random.default_rng([p.seed, 1])
         self._started = False
         self._held = HeldControl()  # times of arrival on the monotonic clock
         self._heard = False  # a first v has come
@@ -88,7 +88,7 @@ class PlantNode(ProcessNode):
             f'started: {name(topics.CONTROL)} in, {name(outputs)} out, '
             f'sample_period {self._sample_period:g} s ({1.0 / self._sample_period:.4g} Hz)'
             + (f'; waits for {wanted} subscribers of {outputs}' if (
-                wanted := p.get_int('wait_for_subscribers')) else '')
+                wanted := p.wait_for_subscribers) else '')
         )
         self.call_when(
             self._has_listeners, self._start, f'subscribers of {topics.PLANT_OUTPUT}'
@@ -112,10 +112,10 @@ class PlantNode(ProcessNode):
     def _take_up(self, p: Parameters) -> None:
         plant = build_plant(p)
         plant.go_on_from(self._plant)
-        self._plant, self._loss = plant, p.get_float('output_loss')
+        self._plant, self._loss = plant, p.output_loss
 
     def _has_listeners(self) -> bool:
-        wanted = self.settings.get_int('wait_for_subscribers')
+        wanted = self.settings.wait_for_subscribers
         # One of several is a recorder, which wants to hear everything.
         recorders = int(wanted > 1)
         if self._truth.listeners < recorders or self._applied.get_subscription_count() < recorders:

@@ -63,16 +63,16 @@ class RecorderNode(ProcessNode):
     def __init__(self) -> None:
         super().__init__(RECORDER)
         p = self.settings
-        self._lockstep = p.get_bool('lockstep')
+        self._lockstep = p.lockstep
         self._now_ns = 0  # simulated time
         self._bag: Bag | None = None
         self._diagnostics: DiagnosticsPublisher | None = None
         self.failure = ''  # why the recording has stopped before its time
         self._channels: list[Channel] = []
         self._progress = Progress()
-        if p.get_str('bag'):
-            self._open_bag(p.get_str('bag'), p.get_str('storage'))
-            self.log.info(f"started: records to {p.get_str('bag')} ({p.get_str('storage')})")
+        if p.bag:
+            self._open_bag(p.bag, p.storage)
+            self.log.info(f'started: records to {p.bag} ({p.storage})')
         else:
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
@@ -86,7 +86,7 @@ class RecorderNode(ProcessNode):
             # A G that was learned before this recorder came belongs into the bag as well.
             qos: QoSProfile | int = KEPT if topic == topics.MODEL else DEPTH
             subscription = self._record(topic, message_type, qos)
-            if p.get_bool('wait_for_publishers') and topic in wanted:
+            if p.wait_for_publishers and topic in wanted:
                 needed.append(subscription)
         if self._lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, DEPTH)

@@ -44,8 +44,8 @@ class ReferenceNode(ProcessNode):
         self._signal = build_reference(p)
         self._offset_s = 0.0  # keeps the phase where the frequency changes
         self._newest = 0  # sample that was published last
-        self._sample_period = p.get_float('sample_period')
-        self._lockstep = p.get_bool('lockstep')
+        self._sample_period = p.sample_period
+        self._lockstep = p.lockstep
         self._started = False
         self._io = DriverIo(self, p)
         self._counter = SampleCounter(self._sample_period)
@@ -55,7 +55,7 @@ class ReferenceNode(ProcessNode):
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, KEPT if self._lockstep else DEPTH
         )
-        listeners = p.get_int('wait_for_subscribers')
+        listeners = p.wait_for_subscribers
         self._pace = ReferencePace(
             self._sample_period, begins_with_output=listeners > 0, now_s=time.monotonic(),
             own_clock=not self._io.simulated_time,
@@ -64,7 +64,7 @@ class ReferenceNode(ProcessNode):
         name = self.resolve_topic_name
         self.log.info(
             f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
-            f'{p.get_str("waveform")}, sample_period {self._sample_period:g} s'
+            f'{p.waveform}, sample_period {self._sample_period:g} s'
             + (f'; waits for {listeners} subscribers of {topics.REFERENCE}' if listeners else '')
         )
         self.call_when(
@@ -127,7 +127,7 @@ class ReferenceNode(ProcessNode):
 
     def _tells_of_samples(self, message: DiagnosticArray) -> bool:
         """Whether the controller of this loop has used any."""
-        loop = self.settings.get_str('io.joint') or self.resolve_topic_name(self._io.topics.control)
+        loop = self.settings.io.joint or self.resolve_topic_name(self._io.topics.control)
         return any(
             value.key == SAMPLES and value.value != '0'
             for status in message.status if status.hardware_id == loop for value in status.values

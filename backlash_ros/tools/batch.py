@@ -19,7 +19,8 @@ from scipy.special import chdtri
 from tqdm import tqdm
 
 from backlash_ros.core.parameters import Parameters, check_names, check_value
-from backlash_ros.core.parameters.table import BY_NAME, Value
+from backlash_ros.core.parameters.parameter import Value
+from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples
@@ -120,7 +121,7 @@ def make_jobs(
         changed = parameters.replaced(change)
         samples = number_of_samples(changed, duration)
         build_closed_loop(changed)
-        own = [changed.get_int('seed')] if 'seed' in change else seeds
+        own = [changed.seed] if 'seed' in change else seeds
         jobs += [Job(dict(changed.replaced({'seed': seed})), samples) for seed in own]
     return jobs
 

@@ -87,13 +87,13 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
 
     Raises InputError unless the duration is a whole number of sample periods, at least one.
     """
-    if duration is None and parameters.get_int('samples') > 0:
-        return parameters.get_int('samples')
+    if duration is None and parameters.samples > 0:
+        return parameters.samples
     if duration is None:
         duration = DEFAULT_DURATION_S
     if not 0.0 < duration < inf:
         raise InputError(f'--duration={duration!r} must be finite and > 0')
-    period = parameters.get_float('sample_period')
+    period = parameters.sample_period
     samples = round(duration / period)
     if samples < 1 or abs(duration / period - samples) > WHOLE_TOLERANCE * samples:
         raise InputError(

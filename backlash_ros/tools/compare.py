@@ -67,7 +67,7 @@ class Result:
 
 def contenders(scenario: Parameters) -> list[Contender]:
     """The loops to compare, from the paper's to the one without a backlash."""
-    m, c_r, c_l = (scenario.get_float(f'backlash.{name}') for name in ('m', 'c_r', 'c_l'))
+    m, c_r, c_l = (getattr(scenario.backlash, name) for name in ('m', 'c_r', 'c_l'))
     paper = {'structure': 'proportional'}
     tracks = {'structure': 'tracking'}
     return [
@@ -122,10 +122,10 @@ def _parameters(contender: Contender, scenario: Parameters) -> Parameters:
         changed = changed.replaced({'estimates.load': False})  # they belong to another law
     if not contender.follows:
         return changed
-    z = np.exp(1j * scenario.get_float('frequency') * scenario.get_float('sample_period'))
+    z = np.exp(1j * scenario.frequency * scenario.sample_period)
     gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
     return changed.replaced({
-        name: gain * scenario.get_float(name) for name in ('amplitude', 'bias')
+        name: gain * getattr(scenario, name) for name in ('amplitude', 'bias')
     })
 
 
@@ -142,7 +142,7 @@ def _measure(contender: Contender, parameters: Parameters, samples: int) -> Resu
     if contender.follows:
         tracking = moving_rms(run.column('y') - delayed_reference(run, delay), window)
         gapless = run_loop(build_closed_loop(parameters.replaced({
-            **_NO_GAP, **_fixed(parameters.get_float('backlash.m'), 0.0, 0.0), 'fixed.doubt': 0.0,
+            **_NO_GAP, **_fixed(parameters.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
         })), samples)
         error, best = (delayed_tracking_error_rms(each, delay, since) for each in (run, gapless))
         penalty = None if error is None or best is None else error - best
@@ -175,12 +175,12 @@ def comparison_document(
         *('| ' + ' | '.join(row(result)) + ' |' for result in results), '',
     ]
     lines += [f'- {result.contender.name}: {result.note}.' for result in results if result.note]
-    noise = scenario.get_float('output_noise_std')
+    noise = scenario.output_noise_std
     lines += [
-        f'Scenario: the plant of the configuration, m = {scenario.get_float("backlash.m"):g}, '
-        f'c_r = {scenario.get_float("backlash.c_r"):g}, '
-        f'c_l = {scenario.get_float("backlash.c_l"):g}, '
-        f'{scenario.get_str("waveform")} at {scenario.get_float("frequency"):g} rad/s, '
+        f'Scenario: the plant of the configuration, m = {scenario.backlash.m:g}, '
+        f'c_r = {scenario.backlash.c_r:g}, '
+        f'c_l = {scenario.backlash.c_l:g}, '
+        f'{scenario.waveform} at {scenario.frequency:g} rad/s, '
         f'noise on y with standard deviation {noise:g}. Written by `compare --out docs/results`; '
         'do not edit.',
         '',

@@ -19,16 +19,14 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.joints import entry_of, split
+from backlash_ros.core.parameters.parameter import Parameter, Value
 from backlash_ros.core.parameters.table import (
     BRINGUP,
     BY_NAME,
     CONTROLLER,
     JOINTS,
-    NODE_WIDE,
     NODES,
     PARAMETERS,
-    Parameter,
-    Value,
 )
 from backlash_ros.tools.cli import InputError
 
@@ -190,7 +188,7 @@ def read_configuration(
     axes = file.axes
     for setting in parsed:
         if setting.name == 'axes':
-            axes = Parameters({'axes': setting.value}).get_strs('axes')
+            axes = Parameters({'axes': setting.value}).axes
     named = axes or file.joints
     for setting in parsed:
         if setting.axis and setting.axis not in named:
@@ -254,7 +252,7 @@ def read_parameter_file(path: Path) -> ParameterFile:
         joints: list[str] = []
         for of_section in values.values():
             # What is wrong with the values of a joint, all values together tell.
-            joints += Parameters({JOINTS: of_section.get(JOINTS, ())}).get_strs(JOINTS)
+            joints += Parameters({JOINTS: of_section.get(JOINTS, ())}).joints
         return ParameterFile(path, tuple(
             _read_section(name, of_section, joints) for name, of_section in values.items()
         ))
@@ -377,10 +375,10 @@ def write_config(parameters: Parameters, path: Path) -> None:
     common = [p for p in PARAMETERS if p.used_by != (BRINGUP,) and parameters[p.name] != ()]
     own = [p for p in PARAMETERS if p not in common and parameters[p.name] != p.default]
     of_all = _tree(parameters, common)
-    for joint in parameters.get_strs(JOINTS):
+    for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)
         of_all[joint] = _tree(of_joint, [
-            p for p in common if CONTROLLER in p.used_by and p.name not in NODE_WIDE
+            p for p in common if CONTROLLER in p.used_by and not p.per_node
             and of_joint[p.name] != parameters[p.name]
         ])
     document = {EVERY_NODE: {'ros__parameters': of_all}}

@@ -14,7 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from backlash_ros.core.parameters.table import BY_NAME, Value
+from backlash_ros.core.parameters.parameter import Value
+from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.runs.analysis import (

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
@@ -104,7 +104,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     if 'seed' in swept and options.seeds is not None:
         raise InputError('--seeds and --sweep seed=... exclude each other')
     changes = batch.combinations(sweeps)
-    first = parameters.get_int('seed')
+    first = parameters.seed
     seeds = range(first, first + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
     _refuse_bad(options.out)

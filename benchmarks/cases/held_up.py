@@ -59,7 +59,7 @@ class HeldUpProcesses:
     """One run of both. load: how often they wait, 0 for an idle machine; reports: of v applied."""
 
     def __init__(self, p: Parameters, load: float, seed: int, reports: bool) -> None:
-        self.period = p.get_float('sample_period')
+        self.period = p.sample_period
         self._load, self._random = load, Random(seed)
         self._reports: deque[tuple[float, int]] | None = deque() if reports else None
         self._now = 0.0

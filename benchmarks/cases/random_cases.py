@@ -85,7 +85,7 @@ def uncertain_case(seed: int) -> Case:
     case, samples_per_period = _without_noise(seed, below_corners=True)
     p = case.parameters
     numerator, denominator = altered(
-        np.array(p.get_floats('plant.numerator')), np.array(p.get_floats('plant.denominator')),
+        np.array(p.plant.numerator), np.array(p.plant.denominator),
         _off(np.random.default_rng([seed, 21])),
     )
     p = p.replaced({
@@ -177,7 +177,7 @@ def altered(numerator: Array, denominator: Array, logs: Array) -> tuple[Array, A
 
 def bound_of(p: Parameters, v: Array) -> Array:
     """Relative Cramér-Rao bounds of (m, c_r, c_l) for v (N,), with what is known of G; (3,)."""
-    truth = p.get_float('backlash.m'), p.get_float('backlash.c_r'), p.get_float('backlash.c_l')
+    truth = p.backlash.m, p.backlash.c_r, p.backlash.c_l
     model = build_true_model(p)
     numerator, denominator = model.numerator, model.denominator
 
@@ -194,9 +194,9 @@ def bound_of(p: Parameters, v: Array) -> Array:
         numerator,
         denominator,
         truth,
-        p.get_float('output_noise_std'),
-        u0=p.get_float('backlash.initial_u'),
-        effects=effects if p.get_float('plant.uncertainty') else None,
+        p.output_noise_std,
+        u0=p.backlash.initial_u,
+        effects=effects if p.plant.uncertainty else None,
     )
     return np.asarray(bound / np.abs(truth))
 

@@ -90,13 +90,13 @@ def following_jobs(scale: float) -> list[Case]:
     for seed in range(round(40 * scale)):
         case = random_case(seed)
         p = case.parameters
-        z = np.exp(1j * p.get_float('frequency') * p.get_float('sample_period'))
-        gain = abs(np.polyval(p.get_floats('plant.numerator'), z)
-                   / np.polyval(p.get_floats('plant.denominator'), z))
+        z = np.exp(1j * p.frequency * p.sample_period)
+        gain = abs(np.polyval(p.plant.numerator, z)
+                   / np.polyval(p.plant.denominator, z))
         # A reference of the estimation for y.
         cases.append(Case('random', {**p, 'structure': 'tracking',
-                                     'amplitude': float(gain) * p.get_float('amplitude')},
-                          p.get_int('tracking.preview') + 8 * case.samples // 3))
+                                     'amplitude': float(gain) * p.amplitude},
+                          p.tracking.preview + 8 * case.samples // 3))
     return cases
 
 
@@ -125,7 +125,7 @@ def _run(case: Case, change: Mapping[str, Any]) -> tuple[float, Any, Array] | No
         values = {**case.changes, **change}
         if case.y_m:
             file = Path(folder) / 'y_m.csv'
-            period = Parameters(values).get_float('sample_period')
+            period = Parameters(values).sample_period
             rows = (f'{k * period:.6f},{value:.9g}' for k, value in enumerate(case.y_m))
             file.write_text('\n'.join(['t,y_m', *rows]))
             values |= {'waveform': 'file', 'file': str(file)}
@@ -136,9 +136,9 @@ def _run(case: Case, change: Mapping[str, Any]) -> tuple[float, Any, Array] | No
             run = loop.run(case.samples)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return None
-    b, a = np.array(p.get_floats('plant.numerator')), np.array(p.get_floats('plant.denominator'))
+    b, a = np.array(p.plant.numerator), np.array(p.plant.denominator)
     y = lfilter(np.append(np.zeros(len(a) - len(b)), b), a, run.column('u'))
-    delay, begin = p.get_int('tracking.preview'), round(SETTLED_S / p.get_float('sample_period'))
+    delay, begin = p.tracking.preview, round(SETTLED_S / p.sample_period)
     begin = min(max(begin, delay), case.samples // 2)
     wanted = run.column('y_m')[begin - delay:case.samples - delay]
     return min(rms(y[begin:] - wanted) / max(rms(wanted), 1e-12), 1e3), run, np.asarray(y)

@@ -54,11 +54,11 @@ class Outcome:
 def run_job(job: Job) -> Outcome:
     """Simulate; a run that breaks off is a result as well."""
     p = Parameters(job.changes)
-    period = p.get_float('sample_period')
+    period = p.sample_period
     loop = build_closed_loop(p)
     if job.coasts is not None:
         loop.plant = CoastingLoad(  # type: ignore[assignment]
-            build_plant(p).backlash, period, quantum=p.get_float('output_quantum'), **job.coasts)
+            build_plant(p).backlash, period, quantum=p.output_quantum, **job.coasts)
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             run = loop.run(round(job.seconds / period) + 1)
@@ -66,13 +66,13 @@ def run_job(job: Job) -> Outcome:
         return Outcome(job.group, None)
     error, bound = _beside_bound(p, run, job.marks_s)
     return Outcome(
-        job.group, judged(run, p.get_float('input_disturbance') / p.get_float('backlash.m')),
+        job.group, judged(run, p.input_disturbance / p.backlash.m),
         error, bound, _follows(p, run),
     )
 
 
 def _follows(p: Parameters, run: Any) -> float:
-    delay = p.get_int('tracking.preview') if p.get_str('structure') == 'tracking' else 0
+    delay = p.tracking.preview if p.structure == 'tracking' else 0
     y, y_m = run.column('y'), run.column('y_m')
     half = len(y) // 2
     wanted = y_m[half - delay:len(y) - delay]
@@ -80,8 +80,8 @@ def _follows(p: Parameters, run: Any) -> float:
 
 
 def _beside_bound(p: Parameters, run: Any, marks_s: Sequence[float]) -> tuple[Array, Array]:
-    truth = p.get_float('backlash.m'), p.get_float('backlash.c_r'), p.get_float('backlash.c_l')
-    period = p.get_float('sample_period')
+    truth = p.backlash.m, p.backlash.c_r, p.backlash.c_l
+    period = p.sample_period
     index = np.rint(run.column('t') / period).astype(int)
     errors, bounds = [], []
     for mark in (round(mark / period) for mark in marks_s):
@@ -91,9 +91,9 @@ def _beside_bound(p: Parameters, run: Any, marks_s: Sequence[float]) -> tuple[Ar
         # A lost sample leaves the command before it in force.
         v = run.column('v')[np.searchsorted(index, np.arange(mark), side='right') - 1]
         bounds.append(cramer_rao(
-            v, np.array(p.get_floats('plant.numerator')),
-            np.array(p.get_floats('plant.denominator')), truth, p.get_float('output_noise_std'),
-            np.isin(np.arange(mark + 1), index), p.get_float('backlash.initial_u'),
+            v, np.array(p.plant.numerator),
+            np.array(p.plant.denominator), truth, p.output_noise_std,
+            np.isin(np.arange(mark + 1), index), p.backlash.initial_u,
         ))
     return np.array(errors).reshape(-1, 3), np.array(bounds).reshape(-1, 3)
 
@@ -226,7 +226,7 @@ def run_random(job: tuple[str, int]) -> RandomOutcome:
     case: Case = random_case(seed) if kind != RANDOM_KINDS[2] else uncertain_case(seed)
     p = case.parameters
     if kind == RANDOM_KINDS[1]:
-        noise = 1e-4 * p.get_float('output_noise_std')
+        noise = 1e-4 * p.output_noise_std
         p = p.replaced({'output_noise_std': noise, 'estimator.output_noise_std': noise})
     try:
         run = build_closed_loop(p).run(case.samples + 1)

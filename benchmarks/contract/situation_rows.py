@@ -123,8 +123,8 @@ class Found:
         assert self.parameters is not None
         p, std = self.parameters, self.json['std']
         return Estimate(
-            p.get_float('estimator.initial.m'), p.get_float('estimator.initial.c_r'),
-            p.get_float('estimator.initial.c_l'), p.get_float('proportional.f'),
+            p.estimator.initial.m, p.estimator.initial.c_r,
+            p.estimator.initial.c_l, p.proportional.f,
             *(max(std[name], 1e-6 * abs(self.json['gap'])) for name in ('m', 'c_r', 'c_l')),
         )
 

@@ -36,7 +36,7 @@ class Controller:
 
     def restart(self, inherited: Estimate | None, v: float | None) -> None:
         """Another process takes over. v: control.initial, None where it is not set."""
-        self._counter = SampleCounter(self.p.get_float('sample_period'), from_zero=False)
+        self._counter = SampleCounter(self.p.sample_period, from_zero=False)
         self._configure(inherited, v)
         self.active = True
 
@@ -64,7 +64,7 @@ class Controller:
         loop = self.loop
         if loop.last is None or loop.standing_down:
             return
-        for v in loop.last_commands(self.p.get_str('on_stop')):
+        for v in loop.last_commands(self.p.on_stop):
             loop.send(v)
             if v == loop.zero:
                 break
@@ -90,10 +90,10 @@ class Controller:
             return
         for i, output in enumerate(outputs):
             self._answer(output, behind=i + 1 < len(outputs))
-        timeout = self.p.get_float('timeout.plant_output') / self.p.get_float('sample_period')
+        timeout = self.p.timeout.plant_output / self.p.sample_period
         if not loop.silent and 0.0 < timeout < driver.tick - self.heard:
             loop.give_up()
-            self._ramp = loop.last_commands(self.p.get_str('on_timeout'))
+            self._ramp = loop.last_commands(self.p.on_timeout)
         v_next = next(self._ramp, None)
         if v_next is not None:
             loop.send(v_next)

@@ -86,7 +86,7 @@ class Sequence:
         if without is Without.ERROR_OF_G:
             self.p = self.p.replaced({'truth.scale_frequency': 1.0})
         if without is Without.TOLD_NOISE:
-            noise = self.p.get_float('output_noise_std')
+            noise = self.p.output_noise_std
             self.p = self.p.replaced({'estimator.output_noise_std': noise})
         p = self.p
         self.actuator = Actuator()
@@ -117,7 +117,7 @@ class Sequence:
         self.controller = Controller(p, self.driver, inherited, self._sent, self._answered)
         if v is not None:
             self.controller.restart(inherited, v)
-        told(f'{p.get_str("estimator.law")}, {p.get_str("structure")}, truth {self.truth}')
+        told(f'{p.estimator.law}, {p.structure}, truth {self.truth}')
 
     def run(self) -> Findings:
         """Play the sequence."""
@@ -211,8 +211,8 @@ class Sequence:
         rng, p = self.rng, self.controller.p
         changes: dict[str, object] = {}
         for name in ('control.min', 'control.max', 'control.rate_max'):
-            if isfinite(p.get_float(name)):
-                changes[name] = self.p.get_float(name) * float(rng.uniform(0.3, 1.5))
+            if isfinite(float(p[name])):
+                changes[name] = float(self.p[name]) * float(rng.uniform(0.3, 1.5))
         if changes:
             self._told(f'    {changes}')
             self.controller.take_up(p.replaced(changes))
@@ -222,11 +222,11 @@ class Sequence:
         scale = float(10.0 ** rng.uniform(-1.0, 1.0))
         changes: list[dict[str, object]] = [
             {'tracking.input_weight': 1e-2 * scale}, {'inverse.caution': scale},
-            {'inverse.direction_band': 0.01 * scale * self.p.get_float('backlash.m')},
+            {'inverse.direction_band': 0.01 * scale * self.p.backlash.m},
             {'lms.step': min(scale, 1.9)}, {'inverse.take_up_rate': 100.0 * scale},
         ]
         if 'estimator.output_noise_std' in self.controller.loop.core.estimator.RETUNED:
-            noise = p.get_float('output_noise_std')
+            noise = p.output_noise_std
             changes.append({'estimator.output_noise_std': noise * scale})
         change = changes[int(rng.integers(len(changes)))]
         self._told(f'    {change}')
@@ -270,7 +270,7 @@ class Sequence:
             value * float(self.rng.uniform(0.5, 2.0)) for value in self.truth
         )
         gap = c_r - c_l
-        return Estimate(m, c_r, c_l, self.p.get_float('proportional.f'),
+        return Estimate(m, c_r, c_l, self.p.proportional.f,
                         1e-3 * m, 1e-3 * gap, 1e-3 * gap)
 
     # What is watched.
@@ -302,12 +302,12 @@ class Sequence:
         self._bound.note(step, renewed, self._v_before)
         move = abs(v - self._v_before)
         # Through the four blocks u_d answers at once to what y has done meanwhile.
-        goes_on = renewed and self.p.get_str('structure') != 'pole_placement'
+        goes_on = renewed and self.p.structure != 'pole_placement'
         # A v that was led to zero meanwhile starts from there.
         goes_on = goes_on and self._v_before == self._v_answered
         if goes_on and self._last is not None:
             self._judge_first(step, self._last, move)
-        if self.p.get_str('structure') == 'proportional':
+        if self.p.structure == 'proportional':
             self._uninterrupted = Uninterrupted(self.controller.loop.core)
         self._moves += 1
         self._usual = max(self._usual, move)
@@ -323,7 +323,7 @@ class Sequence:
         if self._uninterrupted is not None:
             loop, p = self.controller.loop, self.controller.p
             asked = self._uninterrupted.command(
-                step, loop.core, p.get_float('inverse.direction_band')
+                step, loop.core, p.inverse.direction_band
             )
             if abs(v - asked) > rounding:
                 self.findings.jumps.append(f'{where} to {v:.6g}, uninterrupted to {asked:.6g}')
@@ -351,7 +351,7 @@ class Sequence:
         kind = found.wrong if e.learned else found.wrong_without
         if e.learned and self._foreign:
             kind = found.wrong_inherited
-        elif e.learned and self.p.get_float('truth.scale_frequency') != 1.0:
+        elif e.learned and self.p.truth.scale_frequency != 1.0:
             kind = found.wrong_uncertain
         kind.append(
             f'sample {self.driver.tick}, {off:.2g} times what is allowed: '
@@ -380,9 +380,9 @@ def _truth(p: Parameters) -> tuple[float, float, float]:
     """m, c_r, c_l as the controller may know them: the gain at rest of the true G is part of m."""
     ratio = _gain_at_rest(build_true_model(p)) / _gain_at_rest(build_model(p))
     return (
-        p.get_float('backlash.m') * ratio,
-        p.get_float('backlash.c_r'),
-        p.get_float('backlash.c_l'),
+        p.backlash.m * ratio,
+        p.backlash.c_r,
+        p.backlash.c_l,
     )
 
 

@@ -83,7 +83,7 @@ class Driver:
     def __post_init__(self) -> None:
         self.plant = build_plant(self.p)
         self.reference: Callable[[float], float] = build_reference(self.p)
-        self.period_ns = round(self.p.get_float('sample_period') * 1e9)
+        self.period_ns = round(self.p.sample_period * 1e9)
 
     @property
     def time_ns(self) -> int:

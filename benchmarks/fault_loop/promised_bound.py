@@ -29,9 +29,9 @@ class PromisedBound:
     """
 
     def __init__(self, p: Parameters) -> None:
-        self._p, self._structure = p, p.get_str('structure')
-        self._weights = {p.get_float('tracking.input_weight')}  # with which u_d was asked for
-        self._noise = p.get_float('estimator.output_noise_std')  # largest that was told
+        self._p, self._structure = p, p.structure
+        self._weights = {p.tracking.input_weight}  # with which u_d was asked for
+        self._noise = p.estimator.output_noise_std  # largest that was told
         # Largest |u_d| while nothing was known, and after: beyond what was handed over.
         self._u_d = {False: 0.0, True: 0.0}
         self._handed_over = 0.0  # of the v with which the loop went on: its share of u_d, or |v|
@@ -44,8 +44,8 @@ class PromisedBound:
 
     def take_up(self, p: Parameters) -> None:
         """Live parameters have changed."""
-        self._weights.add(p.get_float('tracking.input_weight'))
-        self._noise = max(self._noise, p.get_float('estimator.output_noise_std'))
+        self._weights.add(p.tracking.input_weight)
+        self._noise = max(self._noise, p.estimator.output_noise_std)
 
     def note(self, step: ControlStep, renewed: bool, v_before: float) -> None:
         """Take in an answer.
@@ -85,11 +85,11 @@ class PromisedBound:
         p = self._p
         if self._structure == 'proportional':
             f = max(
-                abs(p.get_float('proportional.f')), *map(abs, p.get_pair('proportional.bounds'))
+                abs(p.proportional.f), *map(abs, p.proportional.bounds)
             )
-            bounds = (p.get_pair(f'estimator.bounds.{name}') for name in ('c_r', 'c_l'))
+            bounds = (getattr(p.estimator.bounds, name) for name in ('c_r', 'c_l'))
             c = max(map(abs, chain(*bounds)))
-            return (p.get_float('amplitude') + f * c) / (1.0 - LARGEST_F_OVER_M)
+            return (p.amplitude + f * c) / (1.0 - LARGEST_F_OVER_M)
         if not known:
             return TWICE * (1.0 + LARGEST_IN_ACQUISITION) * asked
         return TWICE * (asked + LARGEST_FEEDBACK * max(asked, self._called_for()))
@@ -102,7 +102,7 @@ class PromisedBound:
         model = build_state_model(p)
         gains = (
             feedback_around(model, Weights(
-                weight, p.get_float('tracking.integral_weight'), p.get_int('tracking.preview'),
+                weight, p.tracking.integral_weight, p.tracking.preview,
             ), 1.0).gain for weight in self._weights
         )
         return TOLERANCE * self._noise * max(float(np.linalg.norm(gain)) for gain in gains)
@@ -110,7 +110,7 @@ class PromisedBound:
     def _asked(self) -> float:
         """Largest |u_d| of a loop that knows a plant without a gap, for the same references."""
         known = self._p.replaced({
-            'estimator.law': 'fixed', 'estimator.initial.m': self._p.get_float('backlash.m'),
+            'estimator.law': 'fixed', 'estimator.initial.m': self._p.backlash.m,
             'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
             'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'output_noise_std': 0.0,
             'control.min': -inf, 'control.max': inf, 'control.rate_max': inf,

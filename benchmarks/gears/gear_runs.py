@@ -28,7 +28,7 @@ from backlash_ros.core.identification.identification import (
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.tools.identify.identified_file import (
     as_estimate,
     identified_parameters,
@@ -266,7 +266,7 @@ def close_loop(
 
 def uncompensated(gear: Gear, parameters: Parameters, motion: str) -> Run:
     """The loop that takes the gap for 0."""
-    m = parameters.get_float('estimator.initial.m')
+    m = parameters.estimator.initial.m
     controller = constant(parameters, m, 0.0, 0.0, DOUBT)
     return close_loop(gear, controller, motion, False, CONSTANT_PERIODS, CONSTANT_FIRST)
 

@@ -85,7 +85,7 @@ class Driver:
         # be those of the driver.
         self._executor = make_executor(self._node, print)
         self._plant, self._reference = build_plant(parameters), build_reference(parameters)
-        self._period = parameters.get_float('sample_period')
+        self._period = parameters.sample_period
         self._v = self._v_before = 0.0
         self._v_came_at = 0.0
         self._answered_at: float | None = None

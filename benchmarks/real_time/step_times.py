@@ -38,9 +38,9 @@ class Sampled:
 
     def __init__(self, parameters: Parameters, skip: int = 0) -> None:
         self._loop = build_closed_loop(parameters)
-        self._amplitude = parameters.get_float('amplitude')
-        self._frequency = parameters.get_float('frequency')
-        self._period = parameters.get_float('sample_period')
+        self._amplitude = parameters.amplitude
+        self._frequency = parameters.frequency
+        self._period = parameters.sample_period
         self._applied: tuple[float, ...] = ()
         self._sample = 0
         self.refined = 0.0  # time of the newest call of refine [s]

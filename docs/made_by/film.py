@@ -71,7 +71,7 @@ def run_loops() -> Films:
     parameters = identified(gear, encoder=False).parameters
     assert parameters is not None
     unknown = parameters.replaced({'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0})
-    without = constant(parameters, parameters.get_float('estimator.initial.m'), 0.0, 0.0)
+    without = constant(parameters, parameters.estimator.initial.m, 0.0, 0.0)
     runs = [
         close_loop(gear, controller, 'sine', periods=PERIODS + 1)
         for controller in (without, build_controller(unknown))

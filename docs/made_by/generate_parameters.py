@@ -5,7 +5,8 @@ from __future__ import annotations
 from math import isfinite
 from pathlib import Path
 
-from backlash_ros.core.parameters.table import PARAMETERS, Parameter, as_yaml
+from backlash_ros.core.parameters.parameter import Parameter, as_yaml
+from backlash_ros.core.parameters.table import PARAMETERS
 
 PAGE = Path(__file__).resolve().parents[1] / 'reference' / 'parameters.md'
 HEAD = """# Parameters

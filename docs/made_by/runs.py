@@ -44,7 +44,7 @@ def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: st
         Path(config) if config else None, [f'{name}={value}' for name, value in settings]
     )
     loop = build_closed_loop(parameters)
-    record = run_loop(loop, round(duration / parameters.get_float('sample_period')))
+    record = run_loop(loop, round(duration / parameters.sample_period))
     learned = loop.controller.adopted
     model = build_model(parameters) if learned is None else learned.transfer_function
     return Run(parameters, record, loop.controller.structure.delay, model)

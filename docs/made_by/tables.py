@@ -54,8 +54,8 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def plant_facts() -> str:
     """What G(z) of the example is like."""
     p = simulate(SECONDS).parameters
-    model = TransferFunction(p.get_floats('plant.numerator'), p.get_floats('plant.denominator'))
-    period, frequency = p.get_float('sample_period'), p.get_float('frequency')
+    model = TransferFunction(p.plant.numerator, p.plant.denominator)
+    period, frequency = p.sample_period, p.frequency
     gain = abs(model.response(np.exp(1j * np.array([frequency * period])))[0])
     poles = sorted(np.abs(model.poles), reverse=True)
     return markdown(('of G(z)', 'value', 'and therefore'), (
@@ -64,7 +64,7 @@ def plant_facts() -> str:
         ('zeros', ', '.join(f'{zero.real:.3f}' for zero in sorted(model.zeros, key=abs)),
          'one outside the unit circle: u cannot be had by running 1/G forwards in time'),
         (f'gain at {frequency:g} rad/s', f'{gain:.4f}',
-         f'with u_d ≈ y_m, y swings by about ±{gain * p.get_float("amplitude"):.2f}, not by ±10'),
+         f'with u_d ≈ y_m, y swings by about ±{gain * p.amplitude:.2f}, not by ±10'),
     ))
 
 
@@ -175,7 +175,7 @@ def _crossing_errors(run: RunRecord) -> str:
 
 
 def _response_errors(model: TransferFunction, true: TransferFunction, p: Parameters) -> str:
-    z = np.exp(2j * np.pi * np.array(RESPONSE_HZ) * p.get_float('sample_period'))
+    z = np.exp(2j * np.pi * np.array(RESPONSE_HZ) * p.sample_period)
     return ', '.join(map(_percent, model.response(z) / true.response(z) - 1.0))
 
 

@@ -260,7 +260,7 @@ def test_what_a_controller_publishes_is_what_layouts_show_and_latecomers_hear(
         for dimension in models[0].layout.dim:
             fields[dimension.label] = list(models[0].data[first:first + dimension.size])
             first += dimension.size
-        assert from_fields(fields).numerator == Parameters({}).get_floats('plant.numerator')
+        assert from_fields(fields).numerator == Parameters({}).plant.numerator
         driver.rest()
         present = dict(driver.probe.node.get_topic_names_and_types())
         heard: dict[str, list[Any]] = {}

@@ -38,7 +38,7 @@ def last_commands(
 def check_last_commands(p: Parameters) -> None:
     """Raise ParameterError for a ramp without a slope."""
     for name in ('on_stop', 'on_timeout'):
-        if p.get_str(name) == 'ramp' and p.get_float('control.rate_max') == inf:
+        if p[name] == 'ramp' and p.control.rate_max == inf:
             raise ParameterError(
                 name, 'ramp', 'needs a finite control.rate_max', 'set it, or take hold or zero'
             )

@@ -36,10 +36,10 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
     """
     excursion = inf if amplitude is None else amplitude
     low, high = (
-        max(p.get_float('control.min'), -excursion),
-        min(p.get_float('control.max'), excursion),
+        max(p.control.min, -excursion),
+        min(p.control.max, excursion),
     )
-    speed = min(p.get_float('control.rate_max'), inf if rate is None else rate)
+    speed = min(p.control.rate_max, inf if rate is None else rate)
     for name, value in (('control.min', low), ('control.max', high)):
         if abs(value) == inf:
             raise ParameterError(

@@ -140,7 +140,7 @@ def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
     swing = 0.0 if record is None else float(np.ptp(record.v))
     if record is None or swing == 0.0:
         return _only(BACKLASH, 'v stood still', 'run the controller, or check_driver --drive')
-    model = TransferFunction(p.get_floats('plant.numerator'), p.get_floats('plant.denominator'))
+    model = TransferFunction(p.plant.numerator, p.plant.denominator)
     fit = _fit(model, record, p)
     if isnan(fit.evidence):
         return _only(
@@ -172,10 +172,10 @@ def _fit(
     model: TransferFunction, record: Record, p: Parameters, more_delay: int = MORE_DELAY,
 ) -> RecordFit:
     """Fit with any delay that the driver may have, or with the expected one alone."""
-    expected = p.get_int('control.delay_samples')
+    expected = p.control.delay_samples
     return fit_record(
-        record.v, record.y, model, p.get_float('plant.uncertainty'),
-        p.get_float('estimator.output_noise_std'),
+        record.v, record.y, model, p.plant.uncertainty,
+        p.estimator.output_noise_std,
         delays=range(expected + more_delay + 1) if more_delay else (expected,),
     )
 
@@ -194,13 +194,13 @@ def not_judged(subject: str, when: str) -> Finding:
 
 def _odd(fit: RecordFit, lag: int, p: Parameters) -> bool:
     """Whether a delay that nobody announced came out together with what is not noise."""
-    noisy = fit.noise_std > NOISIER * p.get_float('estimator.output_noise_std')
+    noisy = fit.noise_std > NOISIER * p.estimator.output_noise_std
     return noisy and fit.correlation > COLOURED and _delay(fit, lag, p).mark == WRONG
 
 
 def _mismatch(fit: RecordFit, other: float | None, p: Parameters) -> tuple[str, str]:
     """Say how badly G predicts y, and whether the same poles at another period [s] would."""
-    period = p.get_float('sample_period')
+    period = p.sample_period
     if other is not None:
         return f'is off by far, and less so for a sample period of {other:.3g} s', (
             f'G(z) looks made for a sample period of about {other:.3g} s: discretise it with '
@@ -230,11 +230,11 @@ def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None
         return None
     # Of those that fit alike the one that is least off.
     _, ratio = min(other[1:] for other in others if other[0] > best - SURE)
-    return p.get_float('sample_period') / ratio
+    return p.sample_period / ratio
 
 
 def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
-    expected = p.get_int('control.delay_samples')
+    expected = p.control.delay_samples
     if report_use(p) is ReportUse.ALWAYS:
         lag = 0  # the report already has it
     found = fit.delay + lag
@@ -256,7 +256,7 @@ def _sign(fit: RecordFit, p: Parameters) -> Finding:
     if not fit.doubts:
         values += [('c_r', fit.c_r, fit.std_c_r), ('c_l', fit.c_l, fit.std_c_l)]
     for name, value, std in values:
-        low, high = p.get_pair(f'estimator.bounds.{name}')
+        low, high = getattr(p.estimator.bounds, name)
         slack = 3.0 * std + BOUND_SLACK * abs(value)
         if not low - slack <= value <= high + slack:
             return Finding(
@@ -271,7 +271,7 @@ def _model(fit: RecordFit, p: Parameters) -> Finding:
     """Say how far G is off where it was learned to be another one: the loop learns it too."""
     found = f'predicts {fit.predicted:.1%} of the motion of y'
     if fit.model is not fit.nominal:
-        period = p.get_float('sample_period')
+        period = p.sample_period
         errors = ', '.join(
             f'{error:.1%} at {frequency / (2.0 * pi * period):.2g} Hz'
             for frequency, error in zip(
@@ -283,7 +283,7 @@ def _model(fit: RecordFit, p: Parameters) -> Finding:
 
 
 def _noise(fit: RecordFit, p: Parameters) -> Finding:
-    given = p.get_float('estimator.output_noise_std')
+    given = p.estimator.output_noise_std
     found = f'deviation {fit.noise_std:.2g}; estimator.output_noise_std says {given:.2g}'
     if fit.noise_std <= NOISIER * given:
         return Finding(NOISE, FITS, found)

@@ -44,14 +44,14 @@ def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Finding]:
         return found
     if wrong:
         return found + _hidden(MESSAGE_SUBJECTS + MOTION_SUBJECTS, wrong[0])
-    timing = timing_of(heard, p.get_float('sample_period'))
+    timing = timing_of(heard, p.sample_period)
     if timing is None:
         rate = Finding(
             'rate', WRONG, f'{len(heard.outputs)} samples heard, {FEWEST_SAMPLES} are needed',
             'see that plant_output is published without pause; raise --duration',
         )
         return [*found, rate, *_hidden(MESSAGE_SUBJECTS[1:] + MOTION_SUBJECTS, 'rate')]
-    found += message_findings(heard, timing, p.get_float('sample_period'))
+    found += message_findings(heard, timing, p.sample_period)
     wrong = [f.subject for f in found if f.mark == WRONG and f.subject in NEEDED_FOR_MOTION]
     if wrong:
         return found + _hidden(MOTION_SUBJECTS, wrong[0])

@@ -245,10 +245,10 @@ class MovingHorizon(Law):
 
     def retune(self, p: Parameters) -> None:
         """Take another first guess of the noise, the walk and the drift; what was learned stays."""
-        drift = np.array(p.get_triple('estimator.drift_std')) * p.get_float('sample_period')**0.5
+        drift = np.array(p.estimator.drift_std) * p.sample_period**0.5
         self._setup = replace(
-            self._setup, walk_std=p.get_float('estimator.input_noise_std'), drift=drift,
-            noise_std=max(p.get_float('estimator.output_noise_std'), SMALLEST_NOISE),
+            self._setup, walk_std=p.estimator.input_noise_std, drift=drift,
+            noise_std=max(p.estimator.output_noise_std, SMALLEST_NOISE),
         )
 
     def close(self) -> None:

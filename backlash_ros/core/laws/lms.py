@@ -44,7 +44,7 @@ class NormalisedLms(LaggedLaw):
 
     def retune(self, p: Parameters) -> None:
         """Take up new steps."""
-        self.step, self.step_f = p.get_float('lms.step'), p.get_float('lms.step_f')
+        self.step, self.step_f = p.lms.step, p.lms.step_f
 
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k) and learn from the sample that the reconstruction has reached."""

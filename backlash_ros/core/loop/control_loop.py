@@ -23,7 +23,7 @@ from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.phase import Event, Phase, after
 from backlash_ros.core.loop.report_use import report_use
 from backlash_ros.core.loop.sample_counter import Arrival, Output, SampleCounter
-from backlash_ros.core.parameters import NOISE, Parameters
+from backlash_ros.core.parameters import Parameters
 
 STILL_BAND = 6.0  # standard deviations of the noise on y within which it stands still
 # Live parameters that only a new structure takes up.
@@ -49,9 +49,9 @@ class ControlLoop:
         reports: Callable[[], Iterable[tuple[float, int]]] = tuple,
         executor: Executor | None = None,
     ) -> None:
-        self.statistics = LoopStatistics(STILL_BAND * p.get_float(NOISE))
+        self.statistics = LoopStatistics(STILL_BAND * p.estimator.output_noise_std)
         self.counter = counter
-        self.commands = CommandHistory(p.get_float('sample_period'), report_use(p))
+        self.commands = CommandHistory(p.sample_period, report_use(p))
         self.y_m = nan  # the newest one
         self.v, self.knows_v = v or 0.0, v is not None
         self.phase = Phase.BEGINS
@@ -59,7 +59,7 @@ class ControlLoop:
         self.last: ControlStep | None = None
         self.heard_at: float | None = None  # on the steady clock [s]
         self._p, self._send, self._now_ns, self._reports = p, send, now_ns, reports
-        self._lockstep = p.get_bool('lockstep')
+        self._lockstep = p.lockstep
         self._missing = 0  # outputs since the newest one that was used
         self._unsent = 0  # those of them that were never published
         self._restarted = False  # whether sender or clock restarted since then
@@ -141,7 +141,7 @@ class ControlLoop:
         reported = self.commands.newest_report(stamp_ns)
         # A report is about the interval before it, which a command in it outdates: one that was
         # heard, or, while waiting outputs are answered, an own one.
-        period_ns = self._p.get_float('sample_period') * 1e9
+        period_ns = self._p.sample_period * 1e9
         commanded_ns = max(self._other_ns, self.commands.newest_ns)
         if isfinite(reported) and stamp_ns > commanded_ns + period_ns:
             self.go_on_from(self.core.command_of(reported))
@@ -254,8 +254,8 @@ class ControlLoop:
         before, self._p = self._p, p
         core = self.core
         core.limits = build_limits(p)
-        core.inverse.set_band(p.get_float('inverse.direction_band'))
-        core.inverse.take_up = p.get_float('inverse.take_up_rate') * p.get_float('sample_period')
+        core.inverse.set_band(p.inverse.direction_band)
+        core.inverse.take_up = p.inverse.take_up_rate * p.sample_period
         core.estimator.retune(p)
         if any(p[name] != before[name] for name in OF_THE_STRUCTURE):
             structure = build_structure(p)
@@ -294,10 +294,10 @@ class ControlLoop:
 
     def _interrupt_if_long(self) -> None:
         """Begin with a new core where there is too much to step over."""
-        timeout = self._p.get_float('timeout.plant_output')
+        timeout = self._p.timeout.plant_output
         too_long = self._missing > LONGEST_GAP or (
             not self._lockstep
-            and 0.0 < timeout < self._missing * self._p.get_float('sample_period')
+            and 0.0 < timeout < self._missing * self._p.sample_period
         )
         if self.silent or self._restarted or (too_long and self.phase is Phase.RUNS):
             self.statistics.interruptions += 1

@@ -33,7 +33,7 @@ class JointLoops:
             joint: ControlLoop(
                 p.of_joint(joint), partial(self._commands.__setitem__, joint), now_ns,
                 before[joint], counter, (v or {}).get(joint), partial(reports, joint), executor,
-            ) for joint in p.joints
+            ) for joint in p.joint_names
         }
 
     def answer(

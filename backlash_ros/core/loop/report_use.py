@@ -28,14 +28,14 @@ def report_use(p: Parameters) -> ReportUse:
     With control.delay_samples a driver may report v before or after that delay: auto leaves it
     alone then. In lockstep every v is applied at once.
     """
-    use = ReportUse(p.get_str('estimator.use_applied_control'))
-    delayed = use is ReportUse.AUTO and p.get_int('control.delay_samples') > 0
-    return ReportUse.NEVER if delayed or p.get_bool('lockstep') else use
+    use = ReportUse(p.estimator.use_applied_control)
+    delayed = use is ReportUse.AUTO and p.control.delay_samples > 0
+    return ReportUse.NEVER if delayed or p.lockstep else use
 
 
 def awaited_reports(p: Parameters) -> int:
     """How many outputs may stay without an answer while the driver may yet report its v."""
-    return min(AWAITED_REPORTS, max(int(AWAITED_S / p.get_float('sample_period')), 1))
+    return min(AWAITED_REPORTS, max(int(AWAITED_S / p.sample_period), 1))
 
 
 class ReportTrust:

@@ -6,13 +6,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import PurePath
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import (
-    BY_NAME,
-    CONTROLLER,
-    JOINTS,
-    NODE_WIDE,
-    Parameter,
-)
+from backlash_ros.core.parameters.parameter import Parameter
+from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER, JOINTS
 
 MODEL, FILE = 'plant.denominator', 'estimates.file'
 # A joint of which nobody has said what it is like: v = y_m, within its limits.
@@ -58,7 +53,8 @@ def values_of(
 ) -> dict[str, object]:
     """Values of one joint by the names of the table; raises ParameterError."""
     for name, value in own.items():
-        if name in NODE_WIDE or (name in BY_NAME and CONTROLLER not in BY_NAME[name].used_by):
+        entry = BY_NAME.get(name)
+        if entry is not None and (entry.per_node or CONTROLLER not in entry.used_by):
             raise ParameterError(
                 f'{joint}.{name}', value, 'is not for one joint alone', f'set {name}'
             )

@@ -18,9 +18,9 @@ def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
 
     Empty for any other waveform. Raises ParameterError, naming the line.
     """
-    if parameters.get_str('waveform') != 'file':
+    if parameters.waveform != 'file':
         return ()
-    name, period = parameters.get_str('file'), parameters.get_float('sample_period')
+    name, period = parameters.file, parameters.sample_period
     if not name:
         raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
     try:

@@ -76,13 +76,13 @@ class ClosedLoop:
 
 def build_closed_loop(p: Parameters) -> ClosedLoop:
     """The loop of the given parameters; the seed also draws which outputs are lost."""
-    loss = p.get_float('output_loss')
-    rng = np.random.default_rng([p.get_int('seed'), 1])
+    loss = p.output_loss
+    rng = np.random.default_rng([p.seed, 1])
     return ClosedLoop(
         build_controller(p),
         build_plant(p),
         build_reference(p),
-        p.get_float('sample_period'),
+        p.sample_period,
         build_model(p),
         lambda: loss > 0.0 and float(rng.random()) < loss,
     )

@@ -7,7 +7,7 @@ from math import isfinite
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.report_use import awaited_reports
 from backlash_ros.core.loop.sample_counter import Output
-from backlash_ros.core.parameters import Parameters, missing_limits
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.control.reports import Reports
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.spin import ProcessNode
@@ -31,7 +31,7 @@ class FirstCommand:
         """The v that acts as far as this node can know, None if it cannot."""
         if self.before is not None:
             return self.before
-        initial = p.get_float('control.initial')
+        initial = p.control.initial
         # In lockstep there is the simulated plant alone, which begins at 0.
         return initial if isfinite(initial) and self._reports is not None else None
 
@@ -39,7 +39,7 @@ class FirstCommand:
         """Whether it is known from which v the first command goes on, or waiting is in vain."""
         if self._io.is_simulated:
             return True
-        if missing := missing_limits(p):
+        if missing := p.missing_limits:
             self._warn_once(
                 f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
                 'bears: set them'

@@ -45,12 +45,12 @@ class Joint:
         self.reference_at: float | None = None
         self.model = ModelPublisher(node, name)
         self.first_command = FirstCommand(node, io, reports, name)
-        self.saver = EstimateSaver(p.get_str('estimates.file'))
+        self.saver = EstimateSaver(p.estimates.file)
         self._node, self._io = node, io
         self._told: Status | None = None  # the newest one that /diagnostics has
         self._diagnosis = Diagnosis(node, io, name, output_qos(p, DEPTH), reference_qos)
         self._diagnostics = DiagnosticsPublisher(
-            node, p.get_str('io.joint') or io.publisher.topic_name, part=name
+            node, p.io.joint or io.publisher.topic_name, part=name
         )
 
     def begin(self, loop: ControlLoop, before: Estimate) -> None:
@@ -77,14 +77,14 @@ class Joint:
     def follow(self, step: ControlStep, was_silent: bool) -> bool:
         """Tell of a step; returns whether there is something new to say in /diagnostics."""
         assert self.loop is not None
-        self.model.follow(self.loop, self.p.get_float('sample_period'))
+        self.model.follow(self.loop, self.p.sample_period)
         news = was_silent or step.estimate.status != self._told
         self._told = step.estimate.status
         return news
 
     def is_overdue(self) -> bool:
         """Whether its driver has been silent for too long, and that is new."""
-        loop, timeout = self.loop, self.p.get_float('timeout.plant_output')
+        loop, timeout = self.loop, self.p.timeout.plant_output
         return loop is not None and loop.heard_at is not None \
             and loop.phase in (Phase.BEGINS, Phase.RUNS) \
             and 0.0 < timeout < time.monotonic() - loop.heard_at
@@ -96,7 +96,7 @@ class Joint:
         if loop is not None and p[NOISE] != self.p[NOISE] \
                 and NOISE not in loop.core.estimator.RETUNED:
             raise ParameterError(
-                NOISE, p[NOISE], f'is not taken up live by {p.get_str("estimator.law")}',
+                NOISE, p[NOISE], f'is not taken up live by {p.estimator.law}',
                 'clean the node up, set it, and configure again',
             )
 
@@ -106,7 +106,7 @@ class Joint:
         if self.loop is not None:
             self.loop.take_up(p)
         else:
-            self.saver.file = p.get_str('estimates.file')
+            self.saver.file = p.estimates.file
 
     def save(self) -> Future[str] | None:
         """Begin to save the estimates; None where there is nothing worth it, or nowhere to."""

@@ -27,7 +27,7 @@ class LastCommandSender:
 
     @property
     def _step_s(self) -> float:
-        return max(self._node.settings.get_float('sample_period'), SHORTEST_STEP_S)
+        return max(self._node.settings.sample_period, SHORTEST_STEP_S)
 
     def begin(self, loops: JointLoops, ending: Iterable[ControlLoop], action: str) -> None:
         """Send those of some loops from a timer while the node goes on."""

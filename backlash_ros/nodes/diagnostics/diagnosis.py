@@ -70,14 +70,14 @@ class Diagnosis:
         if status != Status.INCONSISTENT:
             self._consistent_at = time.monotonic()
         gap = loop.estimate.c_r - loop.estimate.c_l
-        timeout = p.get_float('timeout.reference')
+        timeout = p.timeout.reference
         # Hardware on topics falls silent where all joints are where they belong.
-        needed = not (p.get_bool('lockstep') or self._io.in_joint_space)
+        needed = not (p.lockstep or self._io.in_joint_space)
         overdue = reference_at_s is not None and needed \
             and 0.0 < timeout < time.monotonic() - reference_at_s
         control = io.topics.control
         return LoopFigures(
-            p.get_float('sample_period'),
+            p.sample_period,
             publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
             publishers_of(
                 node, io.topics.reference, io.topics.reference_type, self._reference_qos
@@ -87,16 +87,16 @@ class Diagnosis:
             status=status, inconsistent_s=time.monotonic() - self._consistent_at,
             law=loop.core.estimator.report, adapting=loop.adapting,
             given=was_given(loop.estimate),
-            silent_s=p.get_float('timeout.plant_output') if loop.silent else 0.0,
-            on_timeout=p.get_str('on_timeout'),
+            silent_s=p.timeout.plant_output if loop.silent else 0.0,
+            on_timeout=p.on_timeout,
             referred=isfinite(loop.y_m),
             reference_silent_s=timeout if overdue else 0.0,
             # In lockstep the outputs come as fast as the machine goes.
-            intervals_s=(nan, nan, nan) if p.get_bool('lockstep') else statistics.intervals_s(),
-            period=UNKNOWN_PERIOD if p.get_bool('lockstep') else loop.counter.sender.newest(),
+            intervals_s=(nan, nan, nan) if p.lockstep else statistics.intervals_s(),
+            period=UNKNOWN_PERIOD if p.lockstep else loop.counter.sender.newest(),
             repeats_stamps=io.repeats_stamps,
             # Stamps of simulated time have nothing to do with the time of arrival.
-            age_s=nan if p.get_bool('lockstep') or io.simulated_time else statistics.age_s(),
+            age_s=nan if p.lockstep or io.simulated_time else statistics.age_s(),
             still=statistics.still,
             v_swing=statistics.still_swing,
             gap=gap if loop.estimate.learned else nan,
@@ -108,7 +108,7 @@ class Diagnosis:
         if io.skipped[self._joint] < ABSENT:
             return []
         text = (
-            f'{io.topics.output} has no {p.get_str("io.field")} of joint {p.get_str("io.joint")!r} '
+            f'{io.topics.output} has no {p.io.field} of joint {p.io.joint!r} '
             f'but {io.seen}: set io.joint, io.field'
         )
         return [Finding(Level.ERROR, 'joint', text[:LONGEST_TEXT])]

@@ -17,17 +17,11 @@ from rclpy.parameter import Parameter as RosParameter
 from backlash_ros.core.parameters import Parameters, check_value
 from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
 from backlash_ros.core.parameters.joints import entry_of
-from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS, Parameter, Value
+from backlash_ros.core.parameters.parameter import Parameter, Value
+from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
 
 # Declared by rclpy itself in every node.
 ROS_OWN = {'use_sim_time', 'start_type_description_service'}
-
-
-# What decides on the topics and the life of a node stays as it was at its start.
-FIXED = (
-    'autostart', 'estimator.use_applied_control', 'io.best_effort', 'io.command', 'io.field',
-    'io.joint', 'io.style', 'io.together', 'joints', 'lockstep', 'wait_for_subscribers',
-)
 
 
 def declare_parameters(
@@ -35,7 +29,7 @@ def declare_parameters(
 ) -> Parameters:
     """Declare what the table says this executable uses; return the complete, checked set.
 
-    reconfigurable: whether all but the FIXED ones may change while the node is unconfigured.
+    reconfigurable: whether all but the fixed ones may change while the node is unconfigured.
     Raises ParameterError for what rclpy would ignore (a given name that nobody declares) or refuse.
     """
     # rclpy has no other way to ask for all names that were given.
@@ -48,7 +42,7 @@ def declare_parameters(
         # Of a joint's own parameters those that were given: all of them would be hundreds.
         values |= {
             name: parameters.of_joint(joint)[own] for name in given
-            for joint, _, own in [name.partition('.')] if joint in parameters.joints
+            for joint, _, own in [name.partition('.')] if joint in parameters.joint_names
         }
     node.declare_parameters('', [
         (name, _declarable(name, value), ParameterDescriptor()) for name, value in values.items()
@@ -84,12 +78,14 @@ def describe(
     parameter: Parameter, name: str, reconfigurable: bool = False,
 ) -> ParameterDescriptor:
     """What tools like rqt and `ros2 param describe` show."""
-    changes = parameter.live or (reconfigurable and parameter.name not in FIXED)
+    changes = parameter.live or (reconfigurable and not parameter.fixed)
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     descriptor = ParameterDescriptor(
         name=name, type=_ros_parameter(name, parameter.default).type_.value,
         description=parameter.description + unit,
-        additional_constraints=_constraints(parameter), read_only=not changes,
+        additional_constraints='one of ' + ', '.join(parameter.choices) if parameter.choices
+        else parameter.rules,
+        read_only=not changes,
     )
     if isfinite(parameter.low) and isfinite(parameter.high):
         if isinstance(parameter.default, float):
@@ -148,7 +144,7 @@ def _given_value(parameter: RosParameter) -> object:
     if parameter.value is not None:
         return parameter.value
     declared = entry_of(parameter.name)
-    if declared is not None and (declared.names or declared.may_be_empty):
+    if declared is not None and (declared.names or declared.default == ()):
         return ()
     raise ParameterError(
         parameter.name, UNTOLD, 'has no value', 'give it one or leave it out'
@@ -176,13 +172,3 @@ def _ros_parameter(name: str, value: Value) -> RosParameter:
         )
     return RosParameter(name, value=_declarable(name, value))
 
-
-def _constraints(parameter: Parameter) -> str:
-    if parameter.choices:
-        return 'one of ' + ', '.join(parameter.choices)
-    rules = []
-    if isfinite(parameter.low):
-        rules.append(f'{">" if parameter.above else ">="} {parameter.low:g}')
-    if isfinite(parameter.high):
-        rules.append(f'<= {parameter.high:g}')
-    return ' and '.join(rules)

@@ -17,7 +17,6 @@ from std_msgs.msg import Float64, Float64MultiArray
 from backlash_ros import topics
 from backlash_ros.core.loop.sample_counter import JointOutputs
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import JOINTS
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.number_message import message_with, number_of
 from backlash_ros.nodes.runtime.spin import ProcessNode
@@ -54,11 +53,11 @@ STYLES = {
 
 def driver_topics(p: Parameters) -> DriverTopics:
     """The topics and types that io.style, io.command and joints ask for."""
-    found = STYLES[p.get_str('io.style')]
-    if p.get_str('io.style') == 'joint_state_topic':
-        if p.get_str('io.command') == 'array':
+    found = STYLES[p.io.style]
+    if p.io.style == 'joint_state_topic':
+        if p.io.command == 'array':
             found = found._replace(control=topics.JOINT_COMMANDS, control_type=Float64MultiArray)
-    elif p[JOINTS]:
+    elif p.joint_names:
         found = found._replace(
             reference_type=JointState, applied=topics.APPLIED_JOINT_COMMANDS,
             applied_type=JointState,
@@ -68,7 +67,7 @@ def driver_topics(p: Parameters) -> DriverTopics:
 
 def output_qos(p: Parameters, depth: int) -> QoSProfile:
     """How y is listened to."""
-    best_effort = p.get_bool('io.best_effort')
+    best_effort = p.io.best_effort
     return QoSProfile(depth=depth, reliability=(
         ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
     ))
@@ -84,14 +83,14 @@ class DriverIo:
     """
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
-        self.skipped, self.seen = dict.fromkeys(p.joints, 0), ''
+        self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
         self.repeats_stamps = False
         self._header_ns = self._number = 0  # of the newest message with a joint
         self._node, self._p = node, p
         self.topics = driver_topics(p)
-        self._field = p.get_str('io.field')
-        self._joints = p.joints
-        self._called = {joint: joint or p.get_str('io.joint') for joint in p.joints}
+        self._field = p.io.field
+        self._joints = p.joint_names
+        self._called = {joint: joint or p.io.joint for joint in p.joint_names}
         self._joint_of = {called: joint for joint, called in self._called.items()}
         # On simulated time the stamps of the middleware, which are real time, say nothing.
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
@@ -118,7 +117,7 @@ class DriverIo:
     @property
     def in_joint_space(self) -> bool:
         """Whether v is where the joint is to go, in the unit of y."""
-        return self._p.get_str('io.style') == 'joint_state_topic'
+        return self._p.io.style == 'joint_state_topic'
 
     def now_ns(self) -> int:
         """Time on the clock of the stamps."""

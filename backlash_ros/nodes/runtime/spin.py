@@ -28,7 +28,8 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import PARAMETERS, as_yaml
+from backlash_ros.core.parameters.parameter import as_yaml
+from backlash_ros.core.parameters.table import PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.runtime.declare import changed_values, declare_parameters
 from backlash_ros.nodes.runtime.forced_exit import exit_at_the_latest

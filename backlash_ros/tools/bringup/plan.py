@@ -11,7 +11,7 @@ from math import inf
 from pathlib import Path
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
-from backlash_ros.core.parameters import Parameters, missing_limits
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import LARGEST_PORT
@@ -41,17 +41,17 @@ class AxisPlan:
     @property
     def samples(self) -> int:
         """Samples of the whole run, 0 for a run without end."""
-        return self.parameters.get_int('samples')
+        return self.parameters.samples
 
     @property
     def sample_period(self) -> float:
         """T [s]."""
-        return self.parameters.get_float('sample_period')
+        return self.parameters.sample_period
 
     @property
     def joints(self) -> tuple[str, ...]:
         """The joints of its controller, empty where it has a single, nameless one."""
-        return self.parameters.get_strs('joints')
+        return self.parameters.joints
 
     @property
     def bag(self) -> Path:
@@ -66,7 +66,7 @@ class AxisPlan:
     @property
     def driver(self) -> str:
         """Command of what stands in the place of the simulated plant, empty for nothing."""
-        return self.parameters.get_str('driver')
+        return self.parameters.driver
 
     @property
     def has_driver(self) -> bool:
@@ -81,7 +81,7 @@ class AxisPlan:
     @property
     def is_managed(self) -> bool:
         """Whether somebody else activates the controller."""
-        return not self.parameters.get_bool('autostart')
+        return not self.parameters.autostart
 
     @property
     def patient_processes(self) -> tuple[str, ...]:
@@ -133,14 +133,14 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     if len(names) > MOST_AXES:
         raise InputError(f'{len(names)} axes are too many for one machine: at most {MOST_AXES}')
     parameters = {name: _parameters(configuration, name, options) for name in names}
-    if options.unlimited and not any(values.get_str('driver') for values in parameters.values()):
+    if options.unlimited and not any(values.driver for values in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
     live_port = options.live_port if options.live_port is not None else 0 if options.live else None
     if live_port is not None and not 0 <= live_port <= LARGEST_PORT:
         raise InputError(f'--live-port={live_port}: must be from 0 (a free one) to {LARGEST_PORT}')
     _check_files(parameters)
     for name, values in parameters.items():
-        for joint in values.joints:
+        for joint in values.joint_names:
             where = ': '.join(filter(None, ('bringup', name, joint)))
             print_warnings(where, values.of_joint(joint))
         if options.out is not None and (options.out / name / BAG).exists():
@@ -167,24 +167,24 @@ def _parameters(
         parameters = configuration.of_controller(axis)
         endless = options.duration == inf
         parameters = parameters.replaced({
-            'lockstep': options.lockstep or parameters.get_bool('lockstep'),
+            'lockstep': options.lockstep or parameters.lockstep,
             'samples': 0 if endless else number_of_samples(parameters, options.duration),
             **({} if options.driver is None else {'driver': options.driver}),
         })
         parameters = _with_driver(axis, parameters)
-        driver = parameters.get_str('driver')
-        for joint in parameters.joints if driver and not options.unlimited else ():
-            missing = missing_limits(parameters.of_joint(joint))
+        driver = parameters.driver
+        for joint in parameters.joint_names if driver and not options.unlimited else ():
+            missing = parameters.of_joint(joint).missing_limits
             if missing:
                 raise ParameterError(
                     f'{joint}.{missing[0]}' if joint else missing[0],
-                    parameters.of_joint(joint).get_float(missing[0]),
+                    parameters.of_joint(joint)[missing[0]],
                     'is no limit, and a driver moves an actuator',
                     f'set {", ".join(missing)}, or give --unlimited',
                 )
-        if bag := parameters.get_str('bag'):
+        if bag := parameters.bag:
             raise ParameterError('bag', bag, 'is made by bringup', 'choose its folder with --out')
-        for joint in parameters.joints:
+        for joint in parameters.joint_names:
             build_controller(parameters.of_joint(joint))
         build_reference(parameters)
         if not driver:
@@ -197,13 +197,13 @@ def _parameters(
 
 def _with_driver(axis: str, parameters: Parameters) -> Parameters:
     """The set with the name of the axis in the command of its driver; raises ParameterError."""
-    text = parameters.get_str('driver').strip()
+    text = parameters.driver.strip()
     mark = '{axis}'
     try:
         shlex.split(text)
     except ValueError as error:
         raise ParameterError('driver', text, 'is not a command', str(error)) from None
-    if text and parameters.get_bool('lockstep'):
+    if text and parameters.lockstep:
         raise ParameterError(
             'driver', text, 'excludes lockstep', 'a real plant does not wait for its control'
         )
@@ -223,7 +223,7 @@ def _check_files(parameters: Mapping[str, Parameters]) -> None:
     name = 'estimates.file'
     users: dict[str, str] = {}
     for axis, values in parameters.items():
-        file = values.get_str(name)
+        file = values.estimates.file
         if file and users.setdefault(file, axis) != axis:
             raise ParameterError(
                 name, file, f'is the file of {users[file]} and of {axis}',
@@ -268,7 +268,7 @@ def _module(name: str) -> tuple[str, ...]:
 
 
 def _node(axis: AxisPlan, node: str, environment: Mapping[str, str]) -> ProcessPlan:
-    lockstep = axis.parameters.get_bool('lockstep')
+    lockstep = axis.parameters.lockstep
     if node == 'recorder':
         # In YAML, whatever stands in the path.
         bag = str(axis.bag).replace("'", "''") if axis.record else ''
@@ -287,7 +287,7 @@ def _node(axis: AxisPlan, node: str, environment: Mapping[str, str]) -> ProcessP
     return ProcessPlan(
         axis.process_name(node), tuple(command), axis.logs / f'{node}.log', environment, axis.name,
         # The controller may end with a ramp, and then saves what it has learned.
-        grace_s=axis.parameters.get_float('timeout.ramp') if node == 'controller' else 0.0,
+        grace_s=axis.parameters.timeout.ramp if node == 'controller' else 0.0,
     )
 
 

@@ -77,7 +77,7 @@ class AxisProgress:
     @property
     def deadline(self) -> float:
         """When the last sample must have come, on the monotonic clock [s]."""
-        if self.plan.samples == 0 or self.plan.parameters.get_bool('lockstep'):
+        if self.plan.samples == 0 or self.plan.parameters.lockstep:
             return inf
         return self.began + self.plan.samples * self.plan.sample_period + LATE_DEADLINE_S
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.options import FAILED, OptionParser, positive
 from backlash_ros.tools.cli import (
     Span,

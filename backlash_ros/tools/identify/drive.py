@@ -25,7 +25,7 @@ from backlash_ros.core.identification.identification import (
     identifying,
 )
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.middleware.installed import ROS_MISSING, ros_is_missing
 from backlash_ros.options import BAD_INPUT

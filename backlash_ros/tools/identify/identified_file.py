@@ -16,15 +16,8 @@ from backlash_ros.core.identification.least_response import known_up_to
 from backlash_ros.core.identification.uncertainty import response
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import (
-    BRINGUP,
-    BY_NAME,
-    PARAMETERS,
-    PLANT,
-    RECORDER,
-    Parameter,
-    Value,
-)
+from backlash_ros.core.parameters.parameter import Parameter, Value
+from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PARAMETERS, PLANT, RECORDER
 from backlash_ros.tools.config import ANY, EVERY_NODE, yaml_value
 
 LEAST_DEVIATION = 1e-6  # relative: a deviation of 0 would say that a constant was given
@@ -87,8 +80,8 @@ def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
     """What a controller may begin with, as if it had learned it itself."""
     least = LEAST_DEVIATION * max(found.gap, abs(found.c_r), abs(found.c_l))
     return Estimate(
-        found.m, parameters.get_float('estimator.initial.c_r'),
-        parameters.get_float('estimator.initial.c_l'), parameters.get_float('proportional.f'),
+        found.m, parameters.estimator.initial.c_r,
+        parameters.estimator.initial.c_l, parameters.proportional.f,
         max(found.std['m'], LEAST_DEVIATION * found.m), max(found.std['c_r'], least),
         max(found.std['c_l'], least),
     )

@@ -21,7 +21,7 @@ from backlash_ros.core.identification.identification import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.identify.identified_file import (

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import Value
+from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.options import OptionParser
 from backlash_ros.tools.cli import (
     InputError,
@@ -121,7 +121,7 @@ def _logged(
         effective_parameters(options.config, axis=options.axis), options.settings
     ).replaced({'estimator.use_applied_control': 'true'})
     record = read_record(
-        path, parameters.get_float('sample_period'), span, columns=options.columns
+        path, parameters.sample_period, span, columns=options.columns
     )
     for text in (record.timing, *record.notes):
         print(f'{EXECUTABLE}: {text}', file=sys.stderr)

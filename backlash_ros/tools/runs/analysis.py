@@ -85,9 +85,9 @@ def control_error(run: RunRecord) -> Array:
 
 def reference_period(parameters: Parameters | None) -> float | None:
     """Period of y_m [s]; None where it has none or is not known."""
-    if parameters is None or parameters.get_str('waveform') not in PERIODIC:
+    if parameters is None or parameters.waveform not in PERIODIC:
         return None
-    return 2.0 * pi / parameters.get_float('frequency')
+    return 2.0 * pi / parameters.frequency
 
 
 def interesting_parts(run: RunRecord, parameters: Parameters | None) -> tuple[Part, Part]:
@@ -122,11 +122,11 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
     samples = compared_samples(run)
     compared = run.column('t') < (samples - 0.5) * run.sample_period
     window = max(round((reference_period(parameters) or 1.0) / run.sample_period), 1)
-    own = parameters.get_str('estimator.law')
+    own = parameters.estimator.law
     e = control_error(run)[compared]
     traces = [LawTrace(own, run.column('t')[compared], e, moving_rms(e, window), True)]
     for law in ESTIMATORS:
-        if law == own or not law_fits(law, parameters.get_str('structure')):
+        if law == own or not law_fits(law, parameters.structure):
             continue
         try:
             loop = build_closed_loop(parameters.replaced({

@@ -28,7 +28,7 @@ def read_run(
     if not path.exists():
         raise InputError(f'{path}: does not exist')
     parameters = _parameters(path, config, axis)
-    period = parameters.get_float('sample_period') if parameters else None
+    period = parameters.sample_period if parameters else None
     bag = find_bag(path)
     if bag is not None:
         return replace(read_bag(bag, period, span, axis), parameters=parameters)

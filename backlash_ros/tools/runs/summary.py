@@ -40,8 +40,8 @@ def summarise(
         for name in BACKLASH
     }
     return {
-        'estimator': parameters.get_str('estimator.law') if parameters else None,
-        'structure': parameters.get_str('structure') if parameters else None,
+        'estimator': parameters.estimator.law if parameters else None,
+        'structure': parameters.structure if parameters else None,
         'samples': run.samples,
         'sample_period': run.sample_period,
         'lost_samples': run.lost_samples,
@@ -68,9 +68,9 @@ def _beginning(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
         return {**first, 'from': None}
     guess = first_guess(parameters)
     guessed = all(first[name] == getattr(guess, name) for name in BACKLASH)
-    loaded = parameters.get_bool('estimates.load') and not guessed
+    loaded = parameters.estimates.load and not guessed
     return {
-        **first, 'from': parameters.get_str('estimates.file') if loaded else 'estimator.initial',
+        **first, 'from': parameters.estimates.file if loaded else 'estimator.initial',
     }
 
 

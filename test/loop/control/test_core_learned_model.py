@@ -59,7 +59,7 @@ def test_before_anything_is_learned_the_told_model_stands_without_deviations() -
     loop = build_closed_loop(MOTOR)
     found = learned(loop)
     assert (found.numerator, found.denominator) == (
-        MOTOR.get_floats('plant.numerator'), MOTOR.get_floats('plant.denominator'))
+        MOTOR.plant.numerator, MOTOR.plant.denominator)
     assert all(map(isnan, (*found.response_std, found.noise_ratio, found.unexplained)))
 
 
@@ -67,7 +67,7 @@ def test_what_was_learned_is_as_sure_as_it_says() -> None:
     p = MOTOR.replaced({'truth.scale_frequency': 1.1, 'output_noise_std': 2e-3})
     found = build_closed_loop(p).run(1200).learned
     assert found is not None
-    assert found.denominator != p.get_floats('plant.denominator')
+    assert found.denominator != p.plant.denominator
     z = np.exp(2j * np.pi * np.array(FREQUENCIES))
     gain = [build_true_model(p).response(np.ones(1, complex)), build_model(p).response(
         np.ones(1, complex))]
@@ -85,7 +85,7 @@ def test_the_structure_gets_a_finer_model_than_the_fit_needs() -> None:
     loop.run(1600)
     adopted = loop.controller.adopted
     assert adopted is not None
-    z = np.exp(1j * p.get_float('sample_period') * np.array([4.0, 8.0, 16.0]))
+    z = np.exp(1j * p.sample_period * np.array([4.0, 8.0, 16.0]))
     true, one = build_true_model(p), np.ones(1, complex)
 
     def off(model: TransferFunction) -> float:
@@ -109,8 +109,8 @@ def test_fields_hold_all(numbers: list[float], delay: int) -> None:
 
 def test_wrong_sign_is_told_until_there_is_an_estimate() -> None:
     turned = {
-        'truth.numerator': [-b for b in MOTOR.get_floats('plant.numerator')],
-        'truth.denominator': list(MOTOR.get_floats('plant.denominator')),
+        'truth.numerator': [-b for b in MOTOR.plant.numerator],
+        'truth.denominator': list(MOTOR.plant.denominator),
     }
     loop = build_closed_loop(MOTOR.replaced(turned))
     assert not report(loop).wrong_sign

@@ -54,7 +54,7 @@ def simulate(p: Parameters, samples: int, y_m: np.ndarray | None = None) -> RunR
 
 def error(p: Parameters, samples: int = 500) -> float:
     value = delayed_tracking_error_rms(
-        simulate(p, samples), p.get_int('tracking.preview'), since=2.0
+        simulate(p, samples), p.tracking.preview, since=2.0
     )
     assert value is not None
     return value
@@ -131,7 +131,7 @@ def test_slow_crossing_of_the_gap_leaves_the_loop_stable(law: str, take_up: floa
 def test_law_without_deviations_is_compensated_once_it_tracks() -> None:
     p = tracking(estimator__law='lms')
     error_of_lms = delayed_tracking_error_rms(
-        simulate(p, 1500), p.get_int('tracking.preview'), since=10.0
+        simulate(p, 1500), p.tracking.preview, since=10.0
     )
     assert error_of_lms is not None
     assert error_of_lms < 0.02

@@ -63,7 +63,7 @@ def run_with_search_at(search_at: Callable[[int], bool], samples: int) -> Estima
     p = Parameters({'output_noise_std': 1e-3, 'seed': 3})
     controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
     for k in range(samples):
-        step = controller.step(plant.measure(), reference(k * p.get_float('sample_period')))
+        step = controller.step(plant.measure(), reference(k * p.sample_period))
         if search_at(k):
             controller.refine()
         plant.step(step.v)

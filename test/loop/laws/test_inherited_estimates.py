@@ -19,7 +19,7 @@ class Loop:
 
     def __init__(self, p: Parameters) -> None:
         self.plant, self._reference = build_plant(p), build_reference(p)
-        self._period = p.get_float('sample_period')
+        self._period = p.sample_period
 
     def run(
         self, controller: AdaptiveController, samples: int, deaf: int = 0,

@@ -77,14 +77,14 @@ def test_numbers_are_those_of_the_actuator(result: Path) -> None:
 def test_the_file_is_a_complete_configuration(result: Path) -> None:
     parameters = effective_parameters(result / 'identified.yaml')
     numbers = json.loads((result / 'identified.json').read_text())
-    assert parameters.get_floats('plant.denominator') == pytest.approx(numbers['denominator'])
-    assert parameters.get_int('control.delay_samples') == numbers['delay_samples']
-    assert parameters.get_float('plant.uncertainty') == numbers['uncertainty']
+    assert parameters.plant.denominator == pytest.approx(numbers['denominator'])
+    assert parameters.control.delay_samples == numbers['delay_samples']
+    assert parameters.plant.uncertainty == numbers['uncertainty']
     # What was given stays, but for the plant that is simulated.
-    assert parameters.get_float('control.rate_max') == 40.0
-    assert parameters.get_str('on_stop') == 'zero'
-    assert parameters.get_float('backlash.m') == 0.5
-    assert parameters.get_float('input_disturbance') == 0.0
+    assert parameters.control.rate_max == 40.0
+    assert parameters.on_stop == 'zero'
+    assert parameters.backlash.m == 0.5
+    assert parameters.input_disturbance == 0.0
     build_controller(parameters)
 
 
@@ -260,4 +260,4 @@ def test_an_axis_gets_a_file_of_its_own(
     assert 'choose it, like --axis x' in capsys.readouterr().err
     assert main([*given, '--axis', 'z']) == 0
     found = effective_parameters(tmp_path / 'out' / 'identified.yaml', axis='z')
-    assert found.get_float('control.max') == 5.0
+    assert found.control.max == 5.0

@@ -39,7 +39,7 @@ def test_saved_estimate_comes_back_to_the_last_bit(
 ) -> None:
     p = parameters(tmp_path_factory.mktemp('saved') / 'estimates.json')
     estimate = Estimate(m, c_r, c_l, f, std, std, std)
-    save_estimate(Path(p.get_str('estimates.file')), estimate, p)
+    save_estimate(Path(p.estimates.file), estimate, p)
     loaded = load_estimate(p)
     assert loaded is not None
     assert (loaded.m, loaded.c_r, loaded.c_l, loaded.f) == (m, c_r, c_l, f)
@@ -163,7 +163,7 @@ def test_a_first_guess_is_not_worth_saving() -> None:
 
 def test_whoever_builds_a_controller_begins_with_what_was_known(tmp_path: Path) -> None:
     p = parameters(tmp_path / 'estimates.json')
-    save_estimate(Path(p.get_str('estimates.file')), LEARNED, p)
+    save_estimate(Path(p.estimates.file), LEARNED, p)
     assert build_controller(p).estimator.estimate.c_r == LEARNED.c_r
     run = build_closed_loop(p).run(30)
     assert run.column('c_l')[0] == LEARNED.c_l
@@ -171,9 +171,9 @@ def test_whoever_builds_a_controller_begins_with_what_was_known(tmp_path: Path) 
     loop = ControlLoop(p, lambda v: None, lambda: 0, None, SampleCounter(0.01))
     assert loop.estimate.m == LEARNED.m
     loop.reset()
-    assert loop.estimate.m == p.get_float('estimator.initial.m')
+    assert loop.estimate.m == p.estimator.initial.m
     assert summarise(run, p)['began_with'] == {
-        'm': 1.25, 'c_r': 2.5, 'c_l': -3.5, 'f': 0.2, 'from': p.get_str('estimates.file'),
+        'm': 1.25, 'c_r': 2.5, 'c_l': -3.5, 'f': 0.2, 'from': p.estimates.file,
     }
     plain = Parameters()
     began = summarise(build_closed_loop(plain).run(30), plain)['began_with']

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.parameters import Parameters, check_value
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import BY_NAME, PARAMETERS, Parameter
+from backlash_ros.core.parameters.parameter import Parameter
+from backlash_ros.core.parameters.table import BY_NAME, PARAMETERS
 
 NUMBERS = [p for p in PARAMETERS if isinstance(p.default, (int, float))
            and not isinstance(p.default, bool)]
@@ -173,9 +174,9 @@ def test_what_is_no_number_is_refused(parameter: Parameter, value: object) -> No
 
 def test_yaml_text_without_a_point_is_a_number() -> None:
     p = Parameters({'plant.numerator': ['1e-5', '4e-5', 1e-5], 'lms.step': '5e-1', 'seed': '7'})
-    assert p.get_floats('plant.numerator') == (1e-5, 4e-5, 1e-5)
-    assert p.get_float('lms.step') == 0.5
-    assert p.get_int('seed') == 7
+    assert p.plant.numerator == (1e-5, 4e-5, 1e-5)
+    assert p.lms.step == 0.5
+    assert p.seed == 7
 
 
 @pytest.mark.parametrize(
@@ -189,7 +190,7 @@ def test_list_is_taken_as_a_list_or_as_text(value: object) -> None:
 @pytest.mark.parametrize('value', [3.0, True, None, [], [True], ['x'], 'x', [nan], [[1.0]]],
                          ids=repr)
 def test_what_is_no_list_of_numbers_is_refused(parameter: Parameter, value: object) -> None:
-    if value == [] and parameter.may_be_empty:
+    if value == [] and parameter.default == ():
         assert Parameters({parameter.name: value})[parameter.name] == ()
         assert Parameters({parameter.name: '[]'})[parameter.name] == ()
     else:
@@ -213,7 +214,7 @@ def test_word_outside_the_choices_is_refused_and_they_are_listed(parameter: Para
 
 
 def test_former_name_of_the_default_law_is_accepted() -> None:
-    assert Parameters({'estimator.law': 'kalman'}).get_str('estimator.law') == 'moving_horizon'
+    assert Parameters({'estimator.law': 'kalman'}).estimator.law == 'moving_horizon'
 
 
 @named([p for p in PARAMETERS if isinstance(p.default, str)])
@@ -226,7 +227,7 @@ def test_word_that_may_be_true_or_false_is_taken_as_yaml_and_ros_read_it(
     parameter: Parameter,
 ) -> None:
     for given_value, word in ((True, 'true'), (False, 'false'), ('True', 'true')):
-        assert Parameters({parameter.name: given_value}).get_str(parameter.name) == word
+        assert Parameters({parameter.name: given_value})[parameter.name] == word
     for value in (1, 0.0, None, 'yes', ['true']):
         refusal_of(parameter.name, value)
 
@@ -234,7 +235,7 @@ def test_word_that_may_be_true_or_false_is_taken_as_yaml_and_ros_read_it(
 @named([p for p in PARAMETERS if isinstance(p.default, bool)])
 def test_flag_is_true_or_false(parameter: Parameter) -> None:
     for given_value, flag in ((True, True), ('False', False), ('true', True)):
-        assert Parameters({parameter.name: given_value}).get_bool(parameter.name) is flag
+        assert Parameters({parameter.name: given_value})[parameter.name] is flag
     for value in (1, 0.0, 'yes', None):
         assert 'must be true or false' in refusal_of(parameter.name, value)
 
@@ -280,7 +281,7 @@ def test_set_of_parameters_is_complete_and_keeps_what_is_not_changed() -> None:
     assert len(p) == len(PARAMETERS)
     assert set(p) == set(BY_NAME)
     changed = p.replaced({'seed': 9})
-    assert (changed.get_float('lms.step'), changed.get_int('seed')) == (0.5, 9)
-    assert p.get_int('seed') == BY_NAME['seed'].default
+    assert (changed.lms.step, changed.seed) == (0.5, 9)
+    assert p.seed == BY_NAME['seed'].default
     with pytest.raises(ParameterError, match='did you mean seed'):
         p.replaced({'sed': 9})

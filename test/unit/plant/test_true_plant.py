@@ -121,7 +121,7 @@ def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() 
     )
     assert_equal(build_model(p), build_model(known), 0.0)
     denominator = p.replaced({'truth.numerator': [], 'truth.denominator': [1.0, -2.8, 2.7, -0.9]})
-    assert build_true_model(denominator).numerator.max() == max(p.get_floats('plant.numerator'))
+    assert build_true_model(denominator).numerator.max() == max(p.plant.numerator)
 
 
 def test_bad_truth_is_named_as_such() -> None:

@@ -194,8 +194,8 @@ def test_one_axis_alone_can_be_taken_from_the_file(tmp_path: Path) -> None:
     (axis,) = plan.axes
     assert axis.name == 'tilt'
     assert [path.name for path in tmp_path.iterdir()] == ['tilt']
-    values = [axis.parameters.get_float(f'backlash.{name}') for name in ('m', 'c_r', 'c_l')]
-    assert (*values, axis.parameters.get_float('frequency')) == (0.8, 1.0, -2.0, 9.0)
+    values = [axis.parameters[f'backlash.{name}'] for name in ('m', 'c_r', 'c_l')]
+    assert (*values, axis.parameters.frequency) == (0.8, 1.0, -2.0, 9.0)
     processes = [process for stage in plan_processes(plan, None) for process in stage]
     assert [process.name for process in processes] == [
         'tilt/plant', 'tilt/reference', 'tilt/controller', 'tilt/recorder',

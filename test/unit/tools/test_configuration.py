@@ -41,7 +41,7 @@ def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() ->
     exact = Parameters().replaced({'plant.uncertainty': 0.0})
     assert example == {name: exact[name] for name in example}
     assert effective_parameters(None) == exact
-    assert Parameters().get_float('plant.uncertainty') > 0.0
+    assert Parameters().plant.uncertainty > 0.0
 
 
 @pytest.mark.parametrize('path', SHIPPED, ids=lambda path: path.name)

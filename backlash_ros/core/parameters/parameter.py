@@ -1,0 +1,202 @@
+"""What is declared of a parameter, and the check of a value against it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from functools import partial
+from math import inf, isfinite, isinf, isnan
+from re import compile as pattern
+from typing import Any, TypeVar, get_args, get_type_hints
+
+from backlash_ros.core.parameters.errors import ParameterError
+
+Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
+Group = TypeVar('Group')
+
+LARGEST = 1e100  # squares, and products of two, still are numbers
+NAMESPACE = pattern(r'[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # a name that ROS takes for one
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter: its default gives its type, low and high hold for each element of a list.
+
+    above: low itself is excluded. choices: the allowed words. aliases: former words among them,
+    each with the one that it stands for. used_by: executables that read it. live: may change in a
+    running node. fixed: may not even change in a controller that is unconfigured. per_node: a
+    controller with several joints has it once. length: how many elements a list must have, None
+    for any. names: a list of names instead of numbers.
+    """
+
+    name: str
+    default: Value
+    description: str
+    unit: str = ''
+    low: float = -inf
+    high: float = inf
+    above: bool = False
+    choices: tuple[str, ...] = ()
+    aliases: tuple[tuple[str, str], ...] = ()
+    used_by: tuple[str, ...] = ('controller',)
+    live: bool = False
+    fixed: bool = False
+    per_node: bool = False
+    length: int | None = None
+    names: bool = False
+
+    @property
+    def infinite(self) -> bool:
+        """Whether inf is allowed: it means "no limit", or "not known"."""
+        return isinstance(self.default, float) and isinf(self.default)
+
+    @property
+    def rules(self) -> str:
+        """The bounds in words, empty without any."""
+        sign = '>' if self.above else '>='
+        return ' and '.join(
+            ([f'{sign} {self.low:g}'] if isfinite(self.low) else [])
+            + ([f'<= {self.high:g}'] if isfinite(self.high) else [])
+        )
+
+
+def option(default: Any, description: str, unit: str = '', **rules: Any) -> Any:
+    """The field of a group that declares a parameter. rules: fields of Parameter."""
+    declare = partial(Parameter, default=default, description=description, unit=unit, **rules)
+    return field(default=default, metadata={'declare': declare})
+
+
+def declared_in(group: type[Any], prefix: str = '') -> Iterator[Parameter]:
+    """The parameters of a group and of the groups in it; lists are described by their type."""
+    types = get_type_hints(group)
+    for each in fields(group):
+        name = prefix + each.name
+        if 'declare' in each.metadata:
+            elements = get_args(types[each.name])
+            yield each.metadata['declare'](
+                name=name, names=str in elements,
+                length=len(elements) if elements and ... not in elements else None,
+            )
+        else:
+            yield from declared_in(types[each.name], f'{name}.')
+
+
+def filled(group: type[Group], values: Mapping[str, Value], prefix: str = '') -> Group:
+    """A group with the values of its parameters, given by their names."""
+    untyped: Any = group
+    return group(**{
+        each.name: values[prefix + each.name] if 'declare' in each.metadata
+        else filled(type(each.default), values, f'{prefix}{each.name}.')
+        for each in fields(untyped)
+    })
+
+
+def as_yaml(value: Value) -> str:
+    """A value as it stands in a YAML file or after -p NAME:=."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return '[' + ', '.join(map(as_yaml, value)) + ']'
+    if isinstance(value, str):
+        return value or "''"
+    if abs(value) == inf:
+        return '.inf' if value > 0 else '-.inf'
+    return f'{value:g}' if isinstance(value, float) and value == float(f'{value:g}') else str(value)
+
+
+def check_value(parameter: Parameter, value: object) -> Value:
+    """Return value in the type of the parameter; raises ParameterError."""
+    default = parameter.default
+    if isinstance(default, bool):
+        return _flag(parameter, value)
+    if isinstance(default, str):
+        return _word(parameter, value)
+    if isinstance(default, tuple):
+        return check_names_of(parameter, value) if parameter.names else _reals(parameter, value)
+    number = _real(parameter, value)
+    if not isinstance(default, int):
+        return number
+    if number != int(number):
+        raise ParameterError(parameter.name, value, 'must be a whole number')
+    # Beyond 2^53 the detour over a float would lose digits.
+    return value if isinstance(value, int) else int(number)
+
+
+def _flag(parameter: Parameter, value: object) -> bool:
+    if isinstance(value, str) and value.lower() in ('true', 'false'):
+        return value.lower() == 'true'
+    if not isinstance(value, bool):
+        raise ParameterError(parameter.name, value, 'must be true or false')
+    return value
+
+
+def _word(parameter: Parameter, value: object) -> str:
+    if 'true' in parameter.choices and isinstance(value, (bool, str)):
+        value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
+    if not isinstance(value, str):
+        raise ParameterError(parameter.name, value, 'must be a text')
+    if parameter.choices and value not in parameter.choices:
+        raise ParameterError(
+            parameter.name, value, 'must be one of ' + ', '.join(parameter.choices)
+        )
+    return dict(parameter.aliases).get(value, value)
+
+
+def check_names_of(parameter: Parameter, value: object) -> tuple[str, ...]:
+    """Return a list of names; raises ParameterError."""
+    if isinstance(value, str):
+        value = [name.strip() for name in value.strip('[] ').split(',') if name.strip()]
+    if not isinstance(value, Iterable) or isinstance(value, Mapping):
+        raise ParameterError(parameter.name, value, 'must be a list of names')
+    names = list(value)
+    for name in names:
+        if not isinstance(name, str) or not NAMESPACE.fullmatch(name) or names.count(name) > 1:
+            raise ParameterError(
+                parameter.name, names, 'must be a list of names',
+                'each once, of letters, digits and single _, a letter first; quote true, on, ...',
+            )
+    return tuple(names)
+
+
+def _reals(parameter: Parameter, value: object) -> tuple[float, ...]:
+    if isinstance(value, str):
+        listed = value.strip('[] ')
+        value = listed.split(',') if listed else []
+    if isinstance(value, (bool, int, float)) or not isinstance(value, Iterable):
+        raise ParameterError(parameter.name, value, 'must be a list of numbers')
+    numbers = tuple(_real(parameter, element) for element in value)
+    if parameter.length is not None and len(numbers) != parameter.length:
+        raise ParameterError(
+            parameter.name, list(numbers), f'must have {parameter.length} numbers'
+        )
+    if not numbers and parameter.default != ():
+        raise ParameterError(parameter.name, [], 'must have at least one number')
+    return numbers
+
+
+def _real(parameter: Parameter, value: object) -> float:
+    if isinstance(value, str):
+        # YAML 1.1 reads 1e-5 (no point, no sign) as a text, and tools of ROS 2 send .inf as one.
+        try:
+            value = float(value.replace('.inf', 'inf'))
+        except ValueError:
+            raise ParameterError(parameter.name, value, 'must be a number') from None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise ParameterError(parameter.name, value, 'must be a number')
+    try:
+        number = float(value)
+    except OverflowError:
+        raise ParameterError(parameter.name, '...', 'is too large for a number') from None
+    if isnan(number) or not (isfinite(number) or parameter.infinite):
+        raise ParameterError(parameter.name, number, 'must be finite')
+    if isfinite(number) and abs(number) > LARGEST:
+        raise ParameterError(
+            parameter.name, number, f'must be within ±{LARGEST:g}', 'choose another unit'
+        )
+    unit = f' [{parameter.unit}]' if parameter.unit else ''
+    if number < parameter.low or (parameter.above and number == parameter.low):
+        sign = '>' if parameter.above else '>='
+        raise ParameterError(parameter.name, number, f'must be {sign} {parameter.low:g}{unit}')
+    if number > parameter.high:
+        raise ParameterError(parameter.name, number, f'must be <= {parameter.high:g}{unit}')
+    return number

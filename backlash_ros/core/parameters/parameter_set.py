@@ -1,0 +1,94 @@
+"""A complete, checked set of parameter values, of one loop or of all joints of an arm."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from math import hypot, isinf, sqrt
+
+from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
+from backlash_ros.core.parameters.joints import check_joints, split, values_of
+from backlash_ros.core.parameters.parameter import Value, check_names_of, check_value, filled
+from backlash_ros.core.parameters.table import BY_NAME, JOINTS, NOISE, PARAMETERS, ParameterTree
+
+
+class Parameters(ParameterTree, Mapping[str, Value]):
+    """Values by group, `p.control.max`, and by flat name, `p['control.max']`.
+
+    joint_names: of the `joints`; a single loop without any is nameless. given: what is not left to
+    its default, as it was given.
+    """
+
+    joint_names: tuple[str, ...]
+    given: dict[str, object]
+    _values: dict[str, Value]
+    _of_joints: dict[str, Parameters]
+
+    def __init__(self, values: Mapping[str, object] | None = None) -> None:
+        """Take given values and the defaults of all others; raises ParameterError."""
+        given = dict(values or {})
+        joints = check_names_of(BY_NAME[JOINTS], given.get(JOINTS, ()))
+        shared, own = split(given, joints)
+        check_joints(joints)
+        check_names(shared, joints)
+        checked = {
+            p.name: check_value(p, shared[p.name]) if p.name in shared else p.default
+            for p in PARAMETERS
+        }
+        tree = filled(ParameterTree, checked)
+        if NOISE not in shared:
+            # Whoever simulates noise means the estimator to know it, unless told otherwise.
+            simulated = hypot(tree.output_noise_std, tree.output_quantum / sqrt(12.0))
+            checked[NOISE] = max(tree.estimator.output_noise_std, simulated)
+            tree = filled(ParameterTree, checked)
+        # Frozen: not by assignment.
+        vars(self).update(
+            vars(tree), _values=checked, given=given, joint_names=joints or ('',),
+            _of_joints={joint: _of_joint(joint, shared, own[joint]) for joint in joints},
+        )
+
+    def of_joint(self, joint: str) -> Parameters:
+        """Those of one of the `joints`, or of the only one, which may be nameless."""
+        return self._of_joints[joint] if self._of_joints else self
+
+    def __getitem__(self, name: str) -> Value:
+        return self._values[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def replaced(self, changes: Mapping[str, object]) -> Parameters:
+        """A new set with some values changed, defaults staying defaults; raises ParameterError."""
+        return Parameters({**self.given, **changes})
+
+    @property
+    def missing_limits(self) -> list[str]:
+        """Names of the limits of v that are infinite."""
+        limits = {
+            'control.min': self.control.min, 'control.max': self.control.max,
+            'control.rate_max': self.control.rate_max,
+        }
+        return [name for name, limit in limits.items() if isinf(limit)]
+
+
+def check_names(names: Iterable[str], joints: Iterable[str] = ()) -> None:
+    """Raise ParameterError for the first unknown name, naming the nearest valid one."""
+    for name in names:
+        if name not in BY_NAME:
+            valid = [*BY_NAME, *(f'{joint}.{own}' for joint in joints for own in BY_NAME)]
+            near = difflib.get_close_matches(name, valid, n=1, cutoff=0.0)[0]
+            raise ParameterError(name, UNTOLD, 'is not a parameter', f'did you mean {near}?')
+
+
+def _of_joint(
+    joint: str, shared: Mapping[str, object], own: Mapping[str, object],
+) -> Parameters:
+    try:
+        return Parameters(values_of(joint, shared, own))
+    except ParameterError as error:
+        if error.name in own:
+            raise error.under(joint) from None
+        raise
