@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from math import nan
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +29,7 @@ from backlash_ros.core.driver_check.findings import (
     UNKNOWN,
     WRONG,
     Heard,
+    Message,
     graph_findings,
 )
 from backlash_ros.core.driver_check.gentle_drive import (
@@ -78,154 +81,145 @@ def test_nothing_is_judged_from_the_mixture_of_two_publishers() -> None:
     assert not all_fit(findings)
 
 
-def test_a_wrong_sample_period_hides_what_follows_from_it() -> None:
-    found = faults(heard_from_driver(), sample_period=0.05)
-    assert subjects(found) == ['rate']
-    assert 'set sample_period' in found[0].cure
-    assert '25 Hz' in found[0].found
+LATE_NS = int(0.7 * PERIOD_S * 1e9)
 
 
-@pytest.mark.parametrize('made_for', [0.004, 0.2])
-def test_a_model_made_for_another_period_is_recognised(made_for: float) -> None:
-    numerator, denominator = model(made_for)
-    found = faults(
-        heard_from_driver(), plant__numerator=numerator, plant__denominator=denominator
-    )
-    assert subjects(found) == ['G(z)']
-    assert f'about {made_for:g} s' in found[0].cure
+def shifted(messages: list[Message], stamp_ns: int, received_ns: int) -> list[Message]:
+    return [m._replace(stamp_ns=m.stamp_ns + stamp_ns, received_ns=m.received_ns + received_ns)
+            for m in messages]
 
 
-def test_lost_samples_are_counted_by_number_and_by_time() -> None:
-    for renumber in (False, True):
-        heard = heard_from_driver()
-        kept = [m for k, m in enumerate(heard.outputs) if k % 10 != 5]
-        if renumber:
-            kept = [m._replace(number=k + 1) for k, m in enumerate(kept)]
-        heard.outputs = kept
-        found = faults(heard)
-        assert subjects(found) == ['lost samples']
-        assert found[0].found == '20 of 200 samples'
+def with_outputs(change: Callable[[list[Message]], list[Message]]) -> Heard:
+    """What is heard of a good driver, but for this change of its outputs."""
+    heard = heard_from_driver()
+    heard.outputs = change(heard.outputs)
+    return heard
 
 
-def test_a_driver_that_falls_silent_loses_samples() -> None:
+def some_lost(outputs: list[Message]) -> list[Message]:
+    return [m for k, m in enumerate(outputs) if k % 10 != 5]
+
+
+def twice(outputs: list[Message]) -> list[Message]:
+    return [m._replace(stamp_ns=m.stamp_ns + i * 1000, number=2 * m.number + i)
+            for m in outputs for i in (0, 1)]
+
+
+def bad_values(bad: float) -> Heard:
+    return with_outputs(lambda sent: [
+        m._replace(value=bad) if k % 10 == 7 else m for k, m in enumerate(sent)
+    ])
+
+
+def fallen_silent() -> Heard:
     heard = heard_from_driver()
     heard.end_ns += int(10 * PERIOD_S * 1e9)
-    assert subjects(faults(heard)) == ['lost samples']
+    return heard
 
 
-def test_samples_that_come_twice_are_told() -> None:
+def late_now_and_then() -> Heard:
     heard = heard_from_driver()
-    heard.outputs = [
-        m._replace(stamp_ns=m.stamp_ns + i * 1000, number=2 * m.number + i)
-        for m in heard.outputs for i in (0, 1)
-    ]
-    (found,) = faults(heard)
-    assert found.subject == 'repeated samples'
-    assert 'came twice' in found.found
+    for sent in (heard.outputs, heard.controls):
+        sent[5::10] = shifted(sent[5::10], LATE_NS, LATE_NS)
+    return heard
+
+
+def with_controls(value: float | None) -> Heard:
+    heard = heard_from_driver()
+    heard.controls = [m._replace(value=value) for m in heard.controls if value is not None]
+    return heard
+
+
+def reports_with_holes() -> Heard:
+    heard = heard_from_driver(report=True)
+    del heard.applied[::4]
+    return heard
+
+
+NUMERATOR, DENOMINATOR = model(0.004)
+SLOW_NUMERATOR, SLOW_DENOMINATOR = model(0.2)
+
+
+@pytest.mark.parametrize(('heard', 'changes', 'subject', 'told'), [
+    (heard_from_driver, {'sample_period': 0.05}, 'rate', ['25 Hz', 'set sample_period']),
+    (heard_from_driver, {'plant__numerator': NUMERATOR, 'plant__denominator': DENOMINATOR},
+     'G(z)', ['about 0.004 s']),
+    (heard_from_driver,
+     {'plant__numerator': SLOW_NUMERATOR, 'plant__denominator': SLOW_DENOMINATOR},
+     'G(z)', ['about 0.2 s']),
+    (lambda: with_outputs(some_lost), {}, 'lost samples', ['20 of 200 samples']),
+    (lambda: with_outputs(
+        lambda sent: [m._replace(number=k + 1) for k, m in enumerate(some_lost(sent))]
+    ), {}, 'lost samples', ['20 of 200 samples']),
+    (fallen_silent, {}, 'lost samples', []),
+    (lambda: with_outputs(twice), {}, 'repeated samples', ['came twice']),
+    (lambda: bad_values(nan), {}, 'values', ['20 on plant_output']),
+    (lambda: bad_values(1e300), {}, 'values', ['20 on plant_output']),
+    (late_now_and_then, {}, 'jitter', []),
+    (lambda: with_outputs(lambda sent: [m._replace(received_ns=m.stamp_ns - 10**9) for m in sent]),
+     {}, 'clock', ['synchronise']),
+    (lambda: heard_from_driver(delay=1), {}, 'reaction delay', ['set control.delay_samples: 1']),
+    (lambda: heard_from_driver(delay=5), {}, 'reaction delay', ['set control.delay_samples: 5']),
+    (lambda: heard_from_driver(delay=2, report=True), {}, 'reaction delay',
+     ['set control.delay_samples: 2']),
+    (lambda: heard_from_driver(report=True, limit=3.5), {'estimator__use_applied_control': False},
+     'applied_control', ['estimator.use_applied_control: true']),
+    (heard_from_driver, {'estimator__use_applied_control': True}, 'applied_control', []),
+    (lambda: heard_from_driver(sign=-1.0), {}, 'sign and units', ['m would be -1.3']),
+    (lambda: heard_from_driver(sign=180.0 / np.pi),
+     {'estimator__bounds__m': [0.5, 3.0], 'estimator__output_noise_std': 0.1}, 'sign and units',
+     ['m would be 74']),
+    (lambda: heard_from_driver(reach=0.15), {}, 'backlash', ['wider than the gap']),
+    (lambda: heard_from_driver(rising=True), {}, 'backlash', ['both directions']),
+    (lambda: with_controls(None), {}, 'backlash', ['--drive']),
+    (lambda: with_controls(0.0), {}, 'backlash', ['--drive']),
+    (Heard, {}, 'rate', []),
+    (lambda: heard_from_driver(samples=30), {}, 'backlash', []),
+])
+def test_a_fault_of_the_driver_is_the_only_one_told_with_its_figure_and_its_cure(
+    heard: Callable[[], Heard], changes: dict[str, object], subject: str, told: list[str],
+) -> None:
+    found = faults(heard(), **changes)
+    assert subjects(found) == [subject]
+    assert all(words in f'{found[0].found} {found[0].cure}' for words in told)
+
+
+@pytest.mark.parametrize(('heard', 'changes'), [
+    ({'delay': 5}, {'control__delay_samples': 5}),
+    ({'delay': 2, 'report': True}, {'control__delay_samples': 2}),
+    ({'delay': 2, 'report': True}, {'estimator__use_applied_control': True}),
+    ({'report': True, 'limit': 3.5}, {'estimator__use_applied_control': 'true'}),
+    ({'report': True, 'limit': 3.5}, {'estimator__use_applied_control': 'auto'}),
+])
+def test_what_the_parameters_announce_is_no_fault(
+    heard: dict[str, Any], changes: dict[str, object],
+) -> None:
+    assert faults(heard_from_driver(**heard), **changes) == []
 
 
 def test_a_timer_that_catches_up_is_not_taken_for_a_relay() -> None:
-    heard = heard_from_driver()
     # After every twentieth sample the timer was late and makes up for it at once.
-    heard.outputs = [
+    heard = with_outputs(lambda sent: [
         m._replace(stamp_ns=m.stamp_ns - int(0.9 * PERIOD_S * 1e9)) if k % 20 == 19 else m
-        for k, m in enumerate(heard.outputs)
-    ]
+        for k, m in enumerate(sent)
+    ])
     found = next(f for f in faults(heard) if f.subject == 'repeated samples')
     assert 'right after the one before' in found.found
     assert 'catching up' in found.cure
 
 
 def test_a_sensor_slower_than_the_driver_is_told() -> None:
-    heard = heard_from_driver()
-    heard.outputs = [
-        m._replace(value=heard.outputs[k - k % 2].value) for k, m in enumerate(heard.outputs)
-    ]
-    found = faults(heard, estimator__output_noise_std=0.1)
-    assert 'repeated samples' in subjects(found)
-
-
-@pytest.mark.parametrize('bad', [nan, 1e300])
-def test_values_that_are_no_numbers_are_told_and_left_out(bad: float) -> None:
-    heard = heard_from_driver()
-    heard.outputs[7::10] = [m._replace(value=bad) for m in heard.outputs[7::10]]
-    found = faults(heard)
-    assert subjects(found) == ['values']
-    assert '20 on plant_output' in found[0].found
-
-
-def test_jitter_is_told_where_samples_come_a_period_late_now_and_then() -> None:
-    heard = heard_from_driver()
-    late = int(0.7 * PERIOD_S * 1e9)
-    for sent in (heard.outputs, heard.controls):
-        sent[5::10] = [
-            m._replace(stamp_ns=m.stamp_ns + late, received_ns=m.received_ns + late)
-            for m in sent[5::10]
-        ]
-    assert subjects(faults(heard)) == ['jitter']
-
-
-def test_clocks_that_disagree_hide_what_follows_from_them() -> None:
-    heard = heard_from_driver()
-    heard.outputs = [m._replace(received_ns=m.stamp_ns - 10**9) for m in heard.outputs]
-    found = faults(heard)
-    assert subjects(found) == ['clock']
-    assert 'synchronise' in found[0].cure
-
-
-@pytest.mark.parametrize('delay', [1, 5])
-def test_a_delay_is_told_in_samples_and_accepted_when_announced(delay: int) -> None:
-    heard = heard_from_driver(delay=delay)
-    found = faults(heard)
-    assert subjects(found) == ['reaction delay']
-    assert f'set control.delay_samples: {delay}' in found[0].cure
-    assert faults(heard, control__delay_samples=delay) == []
-
-
-def test_a_delay_before_applied_control_counts_as_one() -> None:
-    heard = heard_from_driver(delay=2, report=True)
-    found = faults(heard)
-    assert subjects(found) == ['reaction delay']
-    assert 'set control.delay_samples: 2' in found[0].cure
-    assert faults(heard, control__delay_samples=2) == []
-    assert faults(heard, estimator__use_applied_control=True) == []
-
-
-def test_a_limit_inside_the_driver_asks_for_applied_control() -> None:
-    heard = heard_from_driver(report=True, limit=3.5)
-    found = faults(heard, estimator__use_applied_control=False)
-    assert subjects(found) == ['applied_control']
-    assert 'estimator.use_applied_control: true' in found[0].cure
-    for use in ('true', 'auto'):
-        assert faults(heard, estimator__use_applied_control=use) == []
-
-
-def test_applied_control_that_is_asked_for_and_missing_is_told() -> None:
-    found = faults(heard_from_driver(), estimator__use_applied_control=True)
-    assert subjects(found) == ['applied_control']
-    assert faults(heard_from_driver()) == []
+    heard = with_outputs(lambda sent: [
+        m._replace(value=sent[k - k % 2].value) for k, m in enumerate(sent)
+    ])
+    assert 'repeated samples' in subjects(faults(heard, estimator__output_noise_std=0.1))
 
 
 @pytest.mark.parametrize('use', ['auto', 'true'])
 def test_applied_control_that_leaves_samples_out_is_told(use: str) -> None:
-    heard = heard_from_driver(report=True)
-    del heard.applied[::4]
-    found = faults(heard, estimator__use_applied_control=use)
+    found = faults(reports_with_holes(), estimator__use_applied_control=use)
     assert subjects(found)[0] == 'applied_control'
     assert 'comes with 75% of the samples' in found[0].found
-
-
-def test_a_wrong_sign_is_told_and_nothing_else() -> None:
-    found = faults(heard_from_driver(sign=-1.0))
-    assert subjects(found) == ['sign and units']
-    assert 'm would be -1.3' in found[0].found
-
-
-def test_wrong_units_show_as_a_slope_out_of_bounds() -> None:
-    found = faults(heard_from_driver(sign=180.0 / np.pi), estimator__bounds__m=[0.5, 3.0],
-                   estimator__output_noise_std=0.1)
-    assert subjects(found) == ['sign and units']
-    assert 'm would be 74' in found[0].found
 
 
 def test_noise_larger_than_announced_is_measured() -> None:
@@ -233,34 +227,6 @@ def test_noise_larger_than_announced_is_measured() -> None:
     assert subjects(found) == ['noise on y']
     measured = float(found[0].cure.split(': ')[1])
     assert measured == pytest.approx(5e-4, rel=0.2)
-
-
-def test_v_that_stays_within_the_gap_shows_nothing() -> None:
-    found = faults(heard_from_driver(reach=0.15))
-    assert subjects(found) == ['backlash']
-    assert 'wider than the gap' in found[0].cure
-
-
-def test_v_on_one_side_of_the_gap_does_not_identify_it() -> None:
-    found = faults(heard_from_driver(rising=True))
-    assert subjects(found) == ['backlash']
-    assert 'both directions' in found[0].cure
-
-
-def test_v_at_rest_or_unknown_asks_for_motion() -> None:
-    silent = heard_from_driver()
-    silent.controls = []
-    resting = heard_from_driver()
-    resting.controls = [m._replace(value=0.0) for m in resting.controls]
-    for heard in (silent, resting):
-        found = faults(heard)
-        assert subjects(found) == ['backlash']
-        assert '--drive' in found[0].cure
-
-
-def test_too_few_samples_say_so() -> None:
-    assert subjects(faults(Heard())) == ['rate']
-    assert subjects(faults(heard_from_driver(samples=30))) == ['backlash']
 
 
 @pytest.mark.parametrize('ratio', [0.8, 1.2])
