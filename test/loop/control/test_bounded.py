@@ -169,39 +169,6 @@ def test_a_loop_that_nothing_is_asked_of_moves_u_d_no_further_than_its_doubts_al
             handed_over *= FADING
 
 
-def driven(structure: Structure, inverse: BacklashInverse, slopes: list[float]) -> list[float]:
-    """v of a loop with a moving reference, with these m of a law that has learned nothing yet."""
-    source = Told()
-    v = []
-    for k, m in enumerate(slopes):
-        estimate = Estimate(m, 1.0, -1.0, 0.0)
-        inputs = ControlInput(sin(0.1 * k), 0.0, estimate, source)
-        v.append(structure.control(inputs, inverse).v)
-    return v
-
-
-def test_v_goes_on_from_where_it_is_though_another_slope_has_led_it_there() -> None:
-    inverse, before, structure = (
-        BacklashInverse(), structure_named('tracking'), structure_named('tracking'),
-    )
-    driven(before, inverse, [100.0] * 30)
-    structure.go_on_from(before, state_known=False)
-    inverse.start_from(50.0)  # somebody else has
-    v = driven(structure, inverse, [0.2] * 10)
-    assert v[0] == 50.0
-    assert max(np.diff([abs(x) for x in v])) <= 0.0
-
-
-def test_another_design_inverts_the_slope_that_was_in_use() -> None:
-    inverse, before, structure = (
-        BacklashInverse(), structure_named('tracking'), structure_named('tracking'),
-    )
-    v = driven(before, inverse, [1.0, *[100.0] * 29])
-    structure.go_on_from(before)
-    onward = driven(structure, inverse, [100.0])
-    assert abs(onward[0] - v[-1]) <= 2.0 * abs(v[-1] - v[-2])
-
-
 numbers = st.floats(-1e6, 1e6)
 events = st.one_of(
     st.tuples(st.just('sample'), numbers, st.floats(-50.0, 50.0), st.integers(0, 3)),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from math import isnan
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -55,14 +53,6 @@ def test_a_model_without_its_delay_is_the_same_with_it(
     assert again.delay == 1 or again.denominator[-1] != 0.0
 
 
-def test_before_anything_is_learned_the_told_model_stands_without_deviations() -> None:
-    loop = build_closed_loop(MOTOR)
-    found = learned(loop)
-    assert (found.numerator, found.denominator) == (
-        MOTOR.plant.numerator, MOTOR.plant.denominator)
-    assert all(map(isnan, (*found.response_std, found.noise_ratio, found.unexplained)))
-
-
 def test_what_was_learned_is_as_sure_as_it_says() -> None:
     p = MOTOR.replaced({'truth.scale_frequency': 1.1, 'output_noise_std': 2e-3})
     found = build_closed_loop(p).run(1200).learned
@@ -77,23 +67,6 @@ def test_what_was_learned_is_as_sure_as_it_says() -> None:
     assert np.all(off <= 3.0 * np.array(found.response_std))
     assert found.noise_ratio == pytest.approx(2.0, rel=0.1)
     assert 0.0 <= found.unexplained < 0.05
-
-
-def test_the_structure_gets_a_finer_model_than_the_fit_needs() -> None:
-    p = MOTOR.replaced({'structure': 'tracking', 'truth.scale_frequency': 1.03})
-    loop = build_closed_loop(p)
-    loop.run(1600)
-    adopted = loop.controller.adopted
-    assert adopted is not None
-    z = np.exp(1j * p.sample_period * np.array([4.0, 8.0, 16.0]))
-    true, one = build_true_model(p), np.ones(1, complex)
-
-    def off(model: TransferFunction) -> float:
-        gain = true.response(one) / model.response(one)
-        return float(np.abs(gain * model.response(z) / true.response(z) - 1.0).max())
-
-    assert off(adopted.transfer_function) < 0.05 * off(loop.told)
-    assert loop.controller.estimator.learned_model is adopted
 
 
 @given(st.lists(st.floats(-5.0, 5.0), min_size=1, max_size=4), st.integers(0, 5))

@@ -213,22 +213,6 @@ def test_a_design_is_made_again_where_its_worker_died() -> None:
     assert 300 <= swapped.learner.adopted_at < 700
 
 
-def test_replay_is_what_the_structure_would_have_done() -> None:
-    model = StateModel(motor())
-    for integral_weight in (0.0, 1e-3):
-        weights = Weights(1e-2, integral_weight, 12)
-        chosen = design(model, weights)
-        r = np.cumsum(np.random.default_rng(2).standard_normal(150))
-        gains, x, q = chosen.gains, model.equilibrium * r[0], 0.0
-        for k in range(150 - 12 - 1):
-            u = -gains.state @ x - gains.integral * q - gains.preview @ r[k:k + 13]
-            q += r[k] - model.c * x[0]
-            x = model.a @ x + model.b * u
-        replayed, q_replayed = chosen.replayed(r, 200)
-        assert replayed == pytest.approx(x.tolist(), rel=1e-9)
-        assert q_replayed == pytest.approx(q, rel=1e-9, abs=1e-9)
-
-
 def redesigned(
     told: TransferFunction, better: TransferFunction, weights: Weights,
 ) -> TrackingDesign | None:

@@ -53,13 +53,6 @@ def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band
     assert error < 0.5 * noise + 1e-6
 
 
-@pytest.mark.parametrize('initial_u', [-0.05, 0.0, 0.03])
-@pytest.mark.parametrize('band', [0.0, 1e-3])
-def test_v_engages_once_where_the_engaged_side_is_unknown(initial_u: float, band: float) -> None:
-    v, _ = moved(slow(1.0), inverse__direction_band=band, backlash__initial_u=initial_u)
-    assert turns(v, 0.5 * GAP) <= 1
-
-
 def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
     rng = np.random.default_rng(3)
     asked = [np.zeros(200)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -49,26 +48,6 @@ def test_a_command_that_was_heard_last_is_where_v_goes_on() -> None:
 
 def test_a_newer_report_says_what_the_driver_made_of_it() -> None:
     assert abs(first_command(heard_at=5, reported_at=7) + 4.0) <= MOVE
-
-
-def test_own_commands_of_the_same_moment_outdate_a_report() -> None:
-    # The driver's clock is set among outputs that have waited, and are answered all at once.
-    sent: list[float] = []
-    now_ns = [0]
-    p = Parameters({'control.min': -10.0, 'control.max': 10.0, 'control.rate_max': 100.0 * MOVE})
-    loop = ControlLoop(
-        p, sent.append, lambda: now_ns[0], None, SampleCounter(0.01, from_zero=False), 0.0,
-    )
-    set_ns = 100 * PERIOD_NS
-    now_ns[0] = set_ns + 12 * PERIOD_NS
-    loop.take_reference(30.0)
-    for k in range(1, 12):
-        stamp_ns = k * PERIOD_NS + (set_ns if k > 9 else 0)
-        loop.take_applied(0.0, stamp_ns - 1)
-        loop.answer(Output(0.0, stamp_ns, stamp_ns, stamp_ns, k))
-    assert loop.statistics.interruptions == 1
-    assert max(sent) > 2.0 * MOVE
-    assert max(abs(np.diff(sent))) <= MOVE * (1.0 + 1e-9)
 
 
 class SilentDriver:

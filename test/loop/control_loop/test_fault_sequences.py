@@ -8,7 +8,6 @@ from fault_loop.fault_controller import Controller
 from fault_loop.fault_sequences import Sequence
 from fault_loop.fault_world import Actuator, Driver, Sensor
 
-from backlash_ros.core.loop.sample_counter import KEPT_OUTPUTS
 from backlash_ros.core.parameters import Parameters
 
 PERIOD_NS = 10_000_000
@@ -62,14 +61,6 @@ def test_a_clock_that_is_set_is_an_interruption_or_taken_for_lost_outputs(
     world.run(100)
     assert world.statistics.interruptions == interruptions
     assert world.statistics.lost == lost
-
-
-def test_a_controller_that_was_held_up_answers_what_waits_and_counts_the_rest() -> None:
-    world = World()
-    world.run(100)
-    world.controller.stalled_until = 100 + 3 * KEPT_OUTPUTS // 4
-    world.run(50)
-    assert (world.statistics.used, world.statistics.lost) == (150, 0)
 
 
 def test_a_driver_that_is_restarted_is_an_interruption() -> None:

@@ -61,17 +61,6 @@ def test_a_silent_driver_brings_the_configured_command_and_a_return_without_a_ju
     world.check_sanity()
 
 
-def test_a_missing_reference_is_held() -> None:
-    world = SimulatedLoop()
-    world.learn()
-    world.referred = False
-    y_m = world.loop.y_m
-    world.run(100)
-    assert world.loop.y_m == y_m
-    assert world.loop.statistics.without_reference == 0
-    world.check_sanity()
-
-
 @pytest.mark.parametrize('share', [0.01, 0.1, 0.3])
 @pytest.mark.parametrize('published', [True, False])
 def test_lost_outputs_leave_the_estimates_within_5_percent(share: float, published: bool) -> None:
@@ -147,19 +136,6 @@ def test_lost_controls_that_nobody_reports_are_said_to_be_inconsistent() -> None
     world.run(300)
     assert Status.INCONSISTENT in {row.status for row in world.rows[-300:]}
     world.check_sanity()
-
-
-def test_reports_that_stop_are_given_up_and_the_loop_goes_on_learning() -> None:
-    world = SimulatedLoop(reports=True)
-    world.run(50)
-    assert world.loop.commands.uses_reports
-    world.driver.reports = False
-    world.run(50)
-    assert not world.loop.commands.uses_reports
-    missed = world.loop.commands.unreported
-    world.run(300)
-    assert world.error() < 0.02
-    assert world.loop.commands.unreported == missed
 
 
 @pytest.mark.parametrize('broken', ['sign', 'constant'])

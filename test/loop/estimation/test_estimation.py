@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import sin, sqrt
 
 import numpy as np
@@ -12,9 +11,8 @@ from contract.learning_rows import PAPER as EXACT
 from contract.learning_rows import Job, Outcome, run_job, run_random
 from scipy.special import chdtri
 
-from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.control.controller import Limits
-from backlash_ros.core.estimate import Estimate, Status
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
@@ -56,24 +54,6 @@ def test_random_plants_gaps_and_first_guesses_end_within_two_per_cent() -> None:
     kept = [r for r in results if r.relative <= 0.005 * r.over_bound]
     assert len(kept) >= 6
     assert [r for r in kept if r.relative > 0.02] == []
-
-
-def run_with_search_at(search_at: Callable[[int], bool], samples: int) -> Estimate:
-    """The estimate of a controller that has the time to search on at these samples alone."""
-    p = Parameters({'output_noise_std': 1e-3, 'seed': 3})
-    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
-    for k in range(samples):
-        step = controller.step(plant.measure(), reference(k * p.sample_period))
-        if search_at(k):
-            controller.refine()
-        plant.step(step.v)
-    return controller.estimator.estimate
-
-
-def test_search_that_has_to_wait_again_and_again_finds_the_gap() -> None:
-    estimate = run_with_search_at(lambda k: k % 5 == 0, 600)
-    assert estimate.status == Status.TRACKING
-    assert (estimate.m, estimate.c_r, estimate.c_l) == pytest.approx(TRUTH, rel=5e-3)
 
 
 def test_losing_a_fifth_of_y_costs_no_more_than_its_information() -> None:

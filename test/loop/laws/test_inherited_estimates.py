@@ -91,14 +91,3 @@ def test_driver_that_does_not_hear_v_at_first_spoils_nothing(structure: str, dea
     assert errors(after).max() < 0.06
     assert after[-1].status == Status.TRACKING
     assert errors(after[-1:])[0] < 0.01
-
-
-def test_what_was_learned_is_held_while_the_data_contradict_it() -> None:
-    p = Parameters({**EXACT, 'output_noise_std': 1e-3})
-    learned = Loop(p).run(build_controller(p), 400)[-1]
-    after = Loop(p).run(build_controller(p, learned), 300, deaf=300)
-    assert after[-1].status == Status.INCONSISTENT
-    # What fits before y has to move is learned from: it moves nothing by more than its deviation.
-    for name in ('m', 'c_r', 'c_l'):
-        held, std = getattr(learned, name), getattr(learned, f'std_{name}')
-        assert max(abs(getattr(e, name) - held) for e in after) < std

@@ -9,14 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from node_in_process import Bench, bench, look_for_silence
 from std_srvs.srv import Trigger
 
-from backlash_ros import topics
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.nodes.control import last_command_sender
 
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
@@ -97,18 +94,6 @@ def test_the_last_commands_are_as_on_stop_says(action: str) -> None:
             assert len(last) == 1
         else:
             assert last[-1] == 0.0
-
-
-def test_a_ramp_longer_than_it_may_last_stops_where_it_is() -> None:
-    slow = {'on_stop': 'ramp', 'control.rate_max': 20.0, 'timeout.ramp': 0.0}
-    with bench(**slow) as made:
-        made.run(100)
-        while abs(made.sent[-1]) < 2.0:
-            made.run(1)
-        before = made.sent[-1]
-        assert made.change(DEACTIVATE)
-        # One step at 20 per second.
-        assert abs(made.sent[-1]) == pytest.approx(abs(before) - 0.2)
 
 
 @pytest.mark.parametrize('action', ['hold', 'zero', 'ramp'])
@@ -201,24 +186,6 @@ def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(
             confirmed.set()
         made.wait_until(saved.done, 'the answer')
         assert saved.result().success
-
-
-def test_who_waits_hears_of_a_controller_throughout_its_last_ramp(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(last_command_sender, 'DIAGNOSTICS_PERIOD_S', 0.0)
-    with bench(**{'on_stop': 'ramp', 'control.rate_max': 20.0, 'timeout.ramp': 60.0}) as made:
-        heard = made.probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
-        made.run(100)
-        while abs(made.sent[-1]) < 2.0:
-            made.run(1)
-        made.wait_until(lambda: heard, 'diagnostics')
-        before, commands = len(heard), len(made.sent)
-        made.node.trigger_deactivate()
-        assert made.sent[-1] == 0.0
-        steps = len(made.sent) - commands
-        assert steps >= 10
-        made.wait_until(lambda: len(heard) >= before + steps - 1, 'a word at each step')
 
 
 def test_live_parameters_change_together_or_not_at_all() -> None:

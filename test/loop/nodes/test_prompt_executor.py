@@ -169,20 +169,6 @@ def test_a_guard_condition_of_another_thread_ends_a_long_wait(loop: Loop) -> Non
     assert called == [True]
 
 
-def test_an_exception_of_a_callback_reaches_the_caller(loop: Loop) -> None:
-    def fail(message: Float64) -> None:
-        raise RuntimeError(f'{message.data:g} is not wanted')
-
-    loop.node.create_subscription(Float64, 'number', fail, 10)
-    loop.say(3.0)
-    with pytest.raises(RuntimeError, match='3 is not wanted'):
-        loop.spin_until(lambda: False, 'the exception')
-    timer = loop.node.create_timer(0.001, lambda: 1 // 0)
-    with pytest.raises(ZeroDivisionError):
-        loop.spin_until(lambda: False, 'the exception of the timer')
-    loop.node.destroy_timer(timer)
-
-
 def test_what_may_wait_is_served_after_a_tick_and_not_before_one(fast_loop: Loop) -> None:
     ticked, calls = False, []
 

@@ -92,14 +92,6 @@ def test_results_are_those_of_a_computation_in_place(executor: WorkerExecutor) -
         assert result_of(channels[0]) == result_of(channels[1])
 
 
-def test_channels_do_not_mix(executor: WorkerExecutor) -> None:
-    channels = [executor.open() for _ in range(5)]
-    for number, channel in enumerate(channels):
-        channel.submit(operator.mul, number, 10)
-    channels[2].close()
-    assert [result_of(channels[i]) for i in (4, 3, 1, 0)] == [40, 30, 10, 0]
-
-
 def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(
     executor: WorkerExecutor,
 ) -> None:
@@ -183,18 +175,6 @@ def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(
         samples += 1
         assert executor.restarts == count
         assert executor.alive
-
-
-def test_a_job_that_kills_every_worker_is_lost_each_time(executor: WorkerExecutor) -> None:
-    channel = executor.open()
-    for _ in range(3):
-        channel.submit(os.abort)
-        failure = result_of(channel)
-        assert isinstance(failure, Failure)
-        assert failure.kind == LOST
-    channel.submit(operator.neg, 1)
-    assert result_of(channel) == -1
-    assert executor.restarts == 3
 
 
 @pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGINT])

@@ -14,7 +14,6 @@ from undrawn import leave_out
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import parting, replay
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.replay.command import main
 
@@ -51,22 +50,6 @@ def test_other_parameters_part_from_the_run_and_learn_from_its_v() -> None:
     assert parted.recorded != parted.replayed
     assert again.column('v').tolist() == run.column('v').tolist()
     assert again.column('c_r')[-1] == pytest.approx(3.0, rel=0.02)
-
-
-def test_what_the_driver_reports_is_learned_from() -> None:
-    """A driver that applies half of each command, and says so."""
-    parameters = Parameters({
-        'plant.uncertainty': 0.0, 'estimator.use_applied_control': True, **NOISY,
-    })
-    run = build_closed_loop(parameters).run(300)
-    rows = run.rows.copy()
-    rows[:, COLUMNS.index('v')] *= 2.0
-    commanded = RunRecord(rows, run.sample_period, 0)
-    reports = [[], *([float(v)] for v in run.column('v')[:-1])]
-    assert parting(run, replay(run, parameters, reports=reports)) is None
-    again = replay(commanded, parameters, reports=reports)
-    assert again.column('c_r')[-1] == pytest.approx(3.0, rel=0.01)
-    assert replay(commanded, parameters).column('c_r')[-1] > 4.0
 
 
 def test_a_row_without_numbers_is_refused() -> None:

@@ -17,7 +17,6 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.replay.command import main
-from backlash_ros.tools.runs.bag import read_reports
 from backlash_ros.tools.runs.source import read_run
 
 FLOAT = 'std_msgs/msg/Float64'
@@ -130,15 +129,3 @@ def test_without_its_reports_a_limiting_driver_is_learned_wrongly(
     told = capsys.readouterr()
     assert 'holds no applied_control: v is that of control' in told.err
     assert 'part from those of the run' in told.out
-
-
-def test_reports_are_told_apart_by_the_outputs_around_them(tmp_path: Path) -> None:
-    driver = LimitingDriver(Parameters(GIVEN), LIMIT)
-    run = driver.run()
-    reports = read_reports(driver.write(tmp_path, run) / 'bag', run.column('y'))
-    samples = np.round(run.column('t') / 0.01).astype(int)
-    assert [len(values) for values in reports] == [0, *np.diff(samples)]
-    applied = [value for _, topic, value in driver.messages if topic == topics.APPLIED_CONTROL]
-    assert [value for values in reports for value in values] == applied
-    # Where an output of the run is not in the bag, nobody knows what belongs to which interval.
-    assert read_reports(tmp_path / 'bag', np.append(run.column('y'), 7.0)) == []

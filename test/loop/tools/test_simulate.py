@@ -19,7 +19,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.tools import batch
 from backlash_ros.tools.batch import Outcome, Sweep, statistics
-from backlash_ros.tools.cli import InputError, number_of_samples
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.simulate import main
 
 NOISY = ['--set', 'output_noise_std=1e-3', '--set', 'estimator.law=lms']
@@ -144,16 +144,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(
 )
 def test_sweep_lists_values_as_in_yaml(text: str, expected: Sweep) -> None:
     assert batch.parse_sweep(text) == expected
-
-
-def test_length_comes_from_the_duration_or_the_parameter() -> None:
-    assert number_of_samples(Parameters(), None) == 1000
-    assert number_of_samples(Parameters({'samples': 30}), None) == 30
-    assert number_of_samples(Parameters({'samples': 30}), 0.2) == 20
-    coarse = Parameters({'sample_period': 0.1})
-    assert number_of_samples(coarse, 0.3) == 3  # 0.3 / 0.1 falls just short of 3
-    with pytest.raises(InputError, match='whole multiple'):
-        number_of_samples(coarse, 0.35)
 
 
 def outcome(error: float, settling: float | None, std: float = nan) -> Outcome:

@@ -7,7 +7,7 @@ from math import isfinite
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import NO_STATE, Play, signals, usual_plays
+from strategies import NO_STATE, Play, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M, Proportional
@@ -71,24 +71,6 @@ def test_v_satisfies_the_printed_inverse_at_the_same_time(
             or (abs(command.u_d - u_d_before) <= slack and command.v == v_before)
         )
         assert fits_printed
-        u_d_before, v_before = command.u_d, command.v
-
-
-@given(play=usual_plays(), share=st.floats(0.0, LARGEST_SHARE), signal=signals())
-def test_of_two_branches_that_agree_the_smaller_move_is_taken(
-    play: Play, share: float, signal: list[float],
-) -> None:
-    inverse = BacklashInverse()
-    estimate = estimate_of(play, share)
-    u_d_before, v_before = 0.0, 0.0
-    for y_m in signal:
-        command = control(y_m, estimate, inverse)
-        for c, sign in ((play.c_r, 1.0), (play.c_l, -1.0)):
-            solution = play.m * (y_m + estimate.f * c) / (play.m - estimate.f)
-            if sign * (solution - u_d_before) > 0.0:
-                other = abs(solution / play.m + c - v_before)
-                slack = tolerance(play, y_m, solution) / play.m
-                assert abs(command.v - v_before) <= other + slack
         u_d_before, v_before = command.u_d, command.v
 
 

@@ -8,7 +8,6 @@ from hypothesis import assume, given, settings
 from scipy import signal
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants
 
-from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.four_blocks import place_poles
@@ -80,11 +79,3 @@ def test_common_factor_of_numerator_and_denominator_is_refused() -> None:
     model = TransferFunction([1.0, -0.5], [1.0, -1.4, 0.45])
     with pytest.raises(ParameterError, match='common factors'):
         place_poles(model, np.array([1.0, -0.6, 0.09]), 0.3)
-
-
-def test_delay_is_that_of_a_slow_reference() -> None:
-    p = Parameters({'structure': 'pole_placement', 'estimator.law': 'gradient'})
-    controller = build_controller(p)
-    blocks = place_poles(PAPER, closed_of(p), 0.6)
-    y = answer(blocks.reference, np.arange(2000.0))
-    assert controller.structure.delay == round(1999.0 - float(y[-1]))

@@ -10,6 +10,7 @@ import pytest
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 # A position loop with a lag of 6 samples, whose wind-up is a third of the gap behind it.
 TRUE = Parameters({
@@ -66,6 +67,16 @@ def test_the_loop_goes_on_without_reports_from_where_the_command_takes_the_motor
     error, estimate = follow(TRUE, lambda k: k < last)
     assert (estimate.c_r, estimate.c_l) == pytest.approx((0.15, -0.1), rel=0.01)
     assert error < 0.025
+
+
+def test_lost_outputs_are_stepped_over() -> None:
+    loop = build_closed_loop(TRUE.replaced({
+        'output_loss': 0.2, 'tracking.input_weight': 0.1,
+    }))
+    record = loop.run(SAMPLES)
+    assert record.lost_samples > 100
+    y, t = record.column('y'), record.column('t')
+    assert np.abs(y[t > 2.0]).max() < 1.3
 
 
 def test_a_reading_that_is_none_does_not_move_the_motor() -> None:

@@ -148,18 +148,6 @@ def test_outliers_are_left_out_and_counted() -> None:
     assert fit.noise_std == pytest.approx(NOISE, rel=0.25)
 
 
-def test_unexplained_motion_is_told_and_widens_the_deviations() -> None:
-    v, y = record(800)
-    calm = of(v, y)
-    y = y + 0.02 * np.cumsum(np.random.default_rng(0).standard_normal(800))
-    rough = of(v, y)
-    assert calm.unexplained == 0.0
-    assert rough.unexplained > 0.02
-    assert rough.correlation > 0.3
-    assert rough.std_gap > 10.0 * calm.std_gap
-    assert abs(rough.gap - 1.8) <= 5.0 * rough.std_gap
-
-
 @pytest.mark.parametrize('seed', range(6))
 def test_one_side_alone_does_not_identify_the_gap(seed: int) -> None:
     v = np.linspace(0.0, 5.0, 400)

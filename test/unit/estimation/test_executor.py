@@ -74,12 +74,3 @@ def test_one_job_at_a_time_whose_result_is_told_once() -> None:
     assert channel.poll() == 5
     assert not channel.busy
     assert channel.poll() is None
-
-
-def test_a_job_may_come_to_nothing() -> None:
-    channel = InlineExecutor().open()
-    channel.submit(operator.pos, None)
-    failure = channel.poll()
-    assert isinstance(failure, Failure)
-    assert failure.kind == 'TypeError'
-    assert 'Traceback' in failure.text

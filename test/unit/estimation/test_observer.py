@@ -50,23 +50,6 @@ def test_gain_is_that_of_the_stationary_kalman_filter(name: str, ratio: float) -
     assert found.cov == pytest.approx(cov, rel=1e-2, abs=1e-3 * np.trace(cov))
 
 
-@pytest.mark.parametrize('name', sorted(MODELS))
-def test_steps_are_those_of_the_state_space(name: str) -> None:
-    model = MODELS[name]
-    rng = np.random.default_rng(1)
-    observer = Observer(model, NOISE)
-    x = rng.standard_normal(model.order)
-    observer.place(model.to_observer @ x, False)
-    gain = gain_of(model, RATIOS[len(RATIOS) // 2])
-    assert gain is not None
-    for u, innovation in rng.standard_normal((50, 2)):
-        x = model.a @ x + model.b * u
-        assert observer.predict(u) == pytest.approx(model.c * x[0], abs=1e-9)
-        observer.correct(innovation)
-        x = x + model.to_state @ gain.gain * innovation
-        assert observer.state == pytest.approx(x, abs=1e-9)
-
-
 def follow(observer: Observer, disturbance: float, samples: int, seed: int = 0) -> np.ndarray:
     """Errors of the prediction of y for a plant whose u is disturbed, settling now and then."""
     model = observer.model

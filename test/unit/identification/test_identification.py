@@ -117,15 +117,6 @@ def test_a_y_that_is_read_every_few_samples_alone_is_enough(every: int) -> None:
     assert found.std['gap'] < 0.02
 
 
-def test_slope_is_taken_out_of_the_gain_of_g() -> None:
-    v, y = record()
-    one = identify(v, y, PERIOD_S, QUICK)
-    tenth = identify(v, y, PERIOD_S, Options(QUICK.orders, QUICK.delays, slope=0.1))
-    assert tenth.m == 0.1
-    assert np.array(tenth.numerator) == pytest.approx(10.0 * np.array(one.numerator))
-    assert (tenth.gap, tenth.c_r) == (one.gap, one.c_r)
-
-
 @given(st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=60), st.floats(0.0, 8.0),
        st.floats(-12.0, 12.0))
 def test_play_output_of_a_record_is_that_of_the_operator(

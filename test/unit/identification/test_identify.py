@@ -207,20 +207,6 @@ def test_delays_of_single_samples_do_not_add_up_to_a_lost_one() -> None:
     assert found.y.tolist() == list(range(120))
 
 
-@pytest.mark.parametrize(('true', 'jitter', 'told'), [
-    (0.01, 0.2, 0.01), (0.0099992, 0.01, 0.0099992), (0.0099992, 0.3, 0.01),
-])
-def test_the_sample_period_has_the_digits_that_the_stamps_tell(
-    true: float, jitter: float, told: float,
-) -> None:
-    late = jitter * np.random.default_rng(1).random(1200)
-    at = ((np.arange(1200) + late) * true * 1e9).astype(np.int64)
-    found = from_messages({
-        topics.PLANT_OUTPUT: (at, np.arange(1200.0)), topics.CONTROL: (at, np.arange(1200.0)),
-    }, None)
-    assert found.sample_period == pytest.approx(told, rel=1e-5 if jitter < 0.1 else 1e-12)
-
-
 def test_a_span_is_cut_out(tmp_path: Path) -> None:
     from backlash_ros.tools.cli import Span
     v, y = record(400)

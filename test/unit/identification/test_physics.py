@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.txt)')
 
-from gear_physics import PRESETS, Gear, GearPhysics
+from gear_physics import PRESETS
 from gears import gear_runs
 
 from backlash_ros.core.estimate import Status
@@ -21,38 +21,6 @@ SERVO = PRESETS['servo']
 def identified() -> gear_runs.Identified:
     """The servo, identified from its limits alone."""
     return gear_runs.identified(SERVO, encoder=False)
-
-
-def test_motion_lost_behind_the_motor_is_gap_and_wind_up_of_the_gear() -> None:
-    v, motor, load = gear_runs.quasi_static(SERVO)
-    windup = 2.0 * SERVO.friction / SERVO.contact_stiffness
-    assert gear_runs.lost_motion(motor, load) == pytest.approx(SERVO.gap + windup, rel=0.01)
-    assert gear_runs.lost_motion(v, load) == pytest.approx(SERVO.lost_motion, rel=0.03)
-
-
-def test_load_rests_in_the_gap_by_friction_and_coasts_there_without() -> None:
-    def moved_in_gap(gear: Gear) -> float:
-        physics = GearPhysics(gear)
-        physics.data.qvel[1] = speed = 0.1
-        physics.advance(0.5 * gear.gap / speed)
-        return physics.load
-
-    # The way in which friction stops the load, speed^2 J / (2 friction), is a tenth of the gap.
-    slow = replace(SERVO, friction=0.1**2 * SERVO.total_inertia / (0.2 * SERVO.gap), viscous=0.0)
-    assert moved_in_gap(slow) == pytest.approx(0.1 * SERVO.gap, rel=0.1)
-    free = replace(SERVO, friction=0.0, viscous=0.0)
-    assert moved_in_gap(free) == pytest.approx(0.5 * SERVO.gap, rel=0.1)
-
-
-def test_arm_pulls_the_load_down() -> None:
-    gear = replace(SERVO, friction=0.0, viscous=0.0, arm_mass=0.1, stiffness=1e5, torque_limit=1e3)
-    physics = GearPhysics(gear)
-    physics.move_to(0.5)
-    for _ in range(40):
-        physics.advance(0.1)
-    torque = gear.arm_mass * 9.81 * gear.arm_length * np.sin(0.5)
-    below = 0.5 * gear.gap + torque / gear.contact_stiffness
-    assert 0.5 - physics.load == pytest.approx(below, rel=0.05)
 
 
 def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(

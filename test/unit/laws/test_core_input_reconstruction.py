@@ -45,27 +45,6 @@ def test_u_is_exact_after_the_lag_without_noise(model: TransferFunction) -> None
     assert np.abs(error(model)).max() < 1e-3
 
 
-@pytest.mark.parametrize(
-    ('numerator', 'denominator'),
-    [
-        pytest.param(PAPER_NUMERATOR, PAPER_DENOMINATOR, id='paper, zero at -3.73'),
-        pytest.param([0.1], [1.0, -0.9], id='first order'),
-        pytest.param([0.01], [1.0, -1.0], id='integrator'),
-        pytest.param([0.1, 0.2], [1.0, -1.2, 0.35], id='zero at -2'),
-        pytest.param([0.1, -0.2], [1.0, -1.2, 0.35], id='zero at +2'),
-        pytest.param([0.02], [1.0, -1.5, 0.7, 0.0, 0.0], id='delay of four samples'),
-        pytest.param([5e-5, 5e-5], [1.0, -2.0, 1.0], id='double integrator, zero at -1'),
-        pytest.param([0.1, 0.1], [1.0, -1.7, 0.7], id='integrator and lag, zero at -1'),
-        pytest.param([1.0, 1.0], [1.0, -0.5, 0.1], id='fast poles, zero at -1'),
-        pytest.param([0.1, 0.0, 0.1], [1.0, -0.5, 0.1, 0.0], id='zeros at +i and -i'),
-        pytest.param([1.0], np.poly([0.9, 0.8, 0.5, 0.3, 0.1]).tolist(), id='fifth order'),
-    ],
-)
-def test_u_is_exact_for_typical_plants(numerator: list[float], denominator: list[float]) -> None:
-    # A double zero on the unit circle is seen through a small floor of noise.
-    assert np.abs(error(TransferFunction(numerator, denominator))).max() < 1e-2
-
-
 @given(model=plants(), lost=st.sets(st.integers(100, 140), max_size=10))
 def test_lost_samples_do_not_put_it_out_of_step(model: TransferFunction, lost: set[int]) -> None:
     late = error(model, lost=tuple(lost), samples=600)[300:]

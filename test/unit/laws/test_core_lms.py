@@ -87,20 +87,6 @@ def test_error_shrinks_by_what_theory_says(play: Play, signal: list[float], step
         assert before - after >= fall - 1e-9 * (1.0 + before)
 
 
-@given(play=usual_plays(), signal=strokes())
-def test_nothing_is_learned_in_the_gap(play: Play, signal: list[float]) -> None:
-    for lesson in lessons(lms(), play, signal):
-        assert lesson.region != Region.GAP
-
-
-def test_short_way_back_within_the_gap_teaches_nothing() -> None:
-    """u goes on rising after it, and all the same it was held meanwhile."""
-    there_and_back = [*ramp(0.0, 20.0), 19.0, 18.0, 17.0, 18.0, 19.0, *ramp(20.0, 40.0)]
-    learned = lessons(lms(), PAPER, there_and_back)
-    assert len(learned) > 100
-    assert all(lesson.region == Region.RIGHT for lesson in learned)
-
-
 @settings(max_examples=20)
 @given(play=usual_plays(), step=st.floats(0.5, 1.5))
 def test_known_u_and_a_swing_beyond_the_gap_identify_all_three(play: Play, step: float) -> None:

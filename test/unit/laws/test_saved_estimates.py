@@ -82,14 +82,6 @@ def test_constants_that_are_given_are_never_saved_as_learned() -> None:
     assert not worth_saving(controller.estimator.estimate)
 
 
-def test_what_any_law_has_learned_may_be_taken_as_fixed(tmp_path: Path) -> None:
-    file = tmp_path / 'estimates.json'
-    save_estimate(file, LEARNED, parameters(file))
-    loaded = load_estimate(parameters(file, **{'estimator.law': 'fixed'}))
-    assert loaded is not None
-    assert loaded.m == LEARNED.m
-
-
 @pytest.mark.parametrize(('law', 'std', 'reason'), [
     ('kalman', 0.01, ''),
     ('kalman', 0.0, 'holds constants that were given'),

@@ -33,14 +33,6 @@ def test_each_joint_loses_its_gap_and_the_wind_up_of_its_servo() -> None:
     assert hysteresis(arm) == pytest.approx([arm.lost_motion(one) for one in JOINTS], rel=0.08)
 
 
-def test_weight_that_no_spring_carries_closes_the_gaps_of_the_joints_that_lift() -> None:
-    arm = ArmPhysics(balance=0.0)
-    arm.advance(1.0)
-    in_gap = np.abs(arm.motors - arm.links) / [0.5 * one.gap for one in JOINTS]
-    lifting = [one.name in ('shoulder', 'elbow', 'wrist_pitch') for one in JOINTS]
-    assert list(in_gap > 1.0) == lifting
-
-
 def test_tip_is_where_the_joints_put_it_and_encoders_have_twelve_bits() -> None:
     arm = ArmPhysics()
     arm.move_to([0.5, -0.3, 0.4, 0.2, -0.1, 0.3])
@@ -50,13 +42,3 @@ def test_tip_is_where_the_joints_put_it_and_encoders_have_twelve_bits() -> None:
     steps = np.array(arm.encoders()) / RESOLUTION
     assert steps == pytest.approx(np.round(steps), abs=1e-6)
     assert arm.encoders() == pytest.approx(arm.links, abs=0.51 * RESOLUTION)
-
-
-def test_arm_falls_where_the_torque_is_off() -> None:
-    arm = ArmPhysics(balance=0.0)
-    arm.set_torque(1, False)
-    arm.advance(0.5)
-    assert arm.links[1] > 0.5
-    arm.set_torque(1, True)
-    arm.advance(2.0)
-    assert arm.links[1] < 0.2

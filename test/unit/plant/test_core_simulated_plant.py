@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from strategies import Play, output_of, paper_example, plants, signals, usual_plays
 
 from backlash_ros.core.assembly import build_plant
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash
 from backlash_ros.core.plant.simulated_plant import Imperfections, SimulatedPlant
@@ -106,15 +105,3 @@ def test_parameters_reach_the_plant() -> None:
     assert simulated.step(0.5) == 0.25
     assert simulated.measure() == pytest.approx(0.5 * 3.25)
     assert simulated.step(2.0) == pytest.approx(2.0)
-
-
-def test_changed_plant_moves_on_from_where_it_was() -> None:
-    before = build_plant(Parameters())
-    for k in range(50):
-        before.step(0.3 * k)
-    after = build_plant(Parameters({'backlash.c_l': -5.0}))
-    after.go_on_from(before)
-    assert after.sample == before.sample
-    assert after.measure() == before.measure()
-    assert after.step(14.0) == before.step(14.0)
-    assert after.measure() == before.measure()

@@ -20,7 +20,6 @@ from servo_bus import (
     POSITION,
     RESOLUTION,
     TORQUE_ENABLE,
-    WATCHDOG,
     EmulatedBus,
     Port,
     packet,
@@ -76,41 +75,11 @@ def test_the_printed_sync_write_sets_both_goals(bus: EmulatedBus) -> None:
     assert [bus.servos[one].get(GOAL) for one in (1, 2)] == [150, 170]
 
 
-@pytest.mark.parametrize(('address', 'data', 'torque', 'error'), [
-    (GOAL, (4096).to_bytes(4, 'little'), 1, 0x04), (POSITION, b'\0\0\0\0', 0, 0x07),
-    (7, b'\x09', 1, 0x07), (GOAL, b'\0', 0, 0x07), (TORQUE_ENABLE, b'\2', 0, 0x04),
-])
-def test_what_may_not_be_written_is_refused(
-    bus: EmulatedBus, address: int, data: bytes, torque: int, error: int,
-) -> None:
-    bus.answer(packet(1, 3, bytes((TORQUE_ENABLE, 0, torque))))
-    before = bytes(bus.servos[1].table)
-    status = bus.answer(packet(1, 3, address.to_bytes(2, 'little') + data))
-    assert status == packet(1, 0x55, bytes((error,)))
-    assert bytes(bus.servos[1].table) == before
-
-
 def test_a_header_within_a_packet_is_stuffed_and_a_wrong_byte_noticed(bus: EmulatedBus) -> None:
     asked = packet(1, 3, bytes((GOAL, 0)) + b'\xff\xff\xfd\x00')
     assert b'\xff\xff\xfd\xfd' in asked
     assert bus.answer(asked) == packet(1, 0x55, b'\x04')  # out of range, thus understood
     assert bus.answer(asked[:-1] + bytes((asked[-1] ^ 1,))) == packet(1, 0x55, b'\x03')
-
-
-def test_the_watchdog_stops_servos_that_nobody_speaks_to(bus: EmulatedBus, clock: Clock) -> None:
-    for address, value in ((TORQUE_ENABLE, 1), (WATCHDOG, 10)):
-        bus.answer(packet(1, 3, bytes((address, 0, value))))
-    goal = bytes((GOAL, 0)) + (CENTRE + 400).to_bytes(4, 'little')
-    bus.answer(packet(1, 3, goal))
-    clock.now += 0.15
-    bus.answer(packet(2, 1, b''))
-    assert bus.servos[1].get(WATCHDOG) == 10
-    clock.now += 0.25
-    assert bus.answer(packet(1, 3, goal)) == packet(1, 0x55, b'\x04')
-    assert bus.servos[1].table[WATCHDOG] == 255
-    assert CENTRE < bus.servos[1].get(GOAL) == bus.servos[1].get(POSITION)
-    bus.answer(packet(1, 3, bytes((WATCHDOG, 0, 0))))
-    assert bus.answer(packet(1, 3, goal)) == packet(1, 0x55, b'\x00')
 
 
 @pytest.fixture
@@ -143,10 +112,3 @@ def test_the_sdk_moves_the_arm_through_the_terminal(
     lost = [bus.arm.lost_motion(joint) / RESOLUTION for joint in bus.arm.joints]
     assert reached == pytest.approx(goals, abs=max(lost))
     assert reached != [CENTRE] * len(ids)
-
-
-def test_a_silent_servo_silences_those_that_wait_for_it(bus: EmulatedBus) -> None:
-    bus.dead.add(3)
-    asked = packet(0xFE, 0x82, bytes((POSITION, 0, 4, 0, 5, 1, 3, 2)))
-    status = b'\0' + CENTRE.to_bytes(4, 'little')
-    assert bus.answer(asked) == packet(5, 0x55, status) + packet(1, 0x55, status)

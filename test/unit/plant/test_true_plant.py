@@ -57,14 +57,6 @@ def test_scaled_damping_is_the_motor_with_that_damping(damping: float) -> None:
     assert_equal(altered, motor(damping=damping), 1e-12)
 
 
-def test_lag_of_whole_samples_is_a_pole_at_zero_for_each() -> None:
-    for samples in (1, 2):
-        expected = TransferFunction(
-            motor().numerator.tolist(), [*motor().denominator, *[0.0] * samples]
-        )
-        assert_equal(altered_plant(motor(), Alteration(lag=samples)), expected, 0.0)
-
-
 @given(plants(), st.sampled_from([2, 3]))
 def test_plant_with_scaled_frequency_takes_the_same_way_faster(
     model: TransferFunction, factor: int,

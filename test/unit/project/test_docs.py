@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import shlex
 import subprocess
@@ -39,9 +38,6 @@ LINK = re.compile(r'\]\(([^)\s]+)\)')
 CODE = re.compile(r'`([^`\n]+)`')
 DOTTED = re.compile(r'[a-z_]+(\.[a-z_0-9]+)+')
 SETTING = re.compile(r'^(?P<name>[a-z_.]+): (?P<value>\S.*)$')
-MARKS = re.compile(
-    r'<!-- (\w+): made by docs/made_by/figures\.py -->\n(.*?)<!-- end -->', re.DOTALL
-)
 GROUPS = {name.split('.')[0] for name in BY_NAME if '.' in name}
 # Files of a result and topics share their first word with a group of parameters.
 FILE_ENDINGS = {'py', 'yaml', 'json', 'csv', 'md', 'html', 'txt'}
@@ -93,18 +89,6 @@ def test_links_lead_to_files_and_headings() -> None:
 def test_every_picture_is_shown() -> None:
     shown = {(page.parent / link).resolve() for page, link in of_every_page(LINK)}
     assert set((DOCS / 'images').iterdir()) <= shown
-
-
-def test_made_tables_are_filled_and_known_to_the_script() -> None:
-    found = {name: text for page in PAGES for name, text in MARKS.findall(page.read_text())}
-    assert all(text.startswith('| ') for text in found.values())
-    source = ast.parse((DOCS / 'made_by' / 'tables.py').read_text())
-    tables = next(
-        node.value for node in ast.walk(source)
-        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == 'TABLES'
-    )
-    assert isinstance(tables, ast.Dict)
-    assert {ast.literal_eval(key) for key in tables.keys if key is not None} == set(found)
 
 
 def test_page_of_parameters_is_current() -> None:

@@ -56,17 +56,5 @@ def test_abscissa_and_ordinate_of_the_loop_are_v_and_u_of_one_message() -> None:
     assert [path['value'] for path in panel['paths']] == [f'/{topics.SIGNALS}.{u}']
 
 
-def test_plotjuggler_subscribes_to_what_it_draws() -> None:
-    selected = PLOTJUGGLER.find('Plugins/plugin/selected_topics')
-    streamer = PLOTJUGGLER.find('previouslyLoaded_Streamer')
-    plugin = PLOTJUGGLER.find('Plugins/plugin')
-    assert selected is not None
-    assert streamer is not None
-    assert plugin is not None
-    assert plugin.attrib['ID'] == streamer.attrib['name']
-    listed = selected.attrib['value'].split(';')
-    assert sorted(listed) == sorted({parts(PLOTJUGGLER_PATH, path)[0] for path in curves()})
-
-
 def test_every_panel_of_foxglove_has_its_place() -> None:
     assert sorted(panels_in(FOXGLOVE['layout'])) == sorted(PANELS)

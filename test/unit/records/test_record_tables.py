@@ -110,13 +110,6 @@ def test_columns_without_names_go_by_their_number(tmp_path: Path) -> None:
     assert read_record(path, columns={'t': '1', 'v': '2', 'y': '3'}).y.tolist() == Y.tolist()
 
 
-def test_without_a_time_the_period_numbers_the_rows(tmp_path: Path) -> None:
-    path = written(tmp_path / 'a.csv', 'v,y\n' + rows('{v:.3f},{y:.3f}'))
-    with pytest.raises(InputError, match='give --period S'):
-        read_record(path)
-    assert read_record(path, 0.02).sample_period == 0.02
-
-
 @pytest.mark.parametrize(('names', 'said'), [
     (('time', 'target pos (5)', 'pos (5)', 'target pos (3)', 'pos (3)'), 'several columns may be'),
     (('t', 'voltage', 'y'), 'no column is v'), (('t', 'v', 'speed'), 'no column is y'),

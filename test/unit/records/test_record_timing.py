@@ -12,6 +12,15 @@ from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import record_of
 from backlash_ros.core.records.timing import averaged
 
+
+def shuffled(t: Array) -> Array:
+    """A few neighbours swapped."""
+    order = np.arange(len(t))
+    for k in (100, 300, 500):
+        order[[k, k + 1]] = order[[k + 1, k]]
+    return order
+
+
 Array = NDArray[np.float64]
 PERIOD_S = 0.01
 COUNT = 1200
@@ -72,6 +81,13 @@ def _begin(record: Record, t: Array) -> float:
     return float(shifts[int(np.argmin(errors))])
 
 
+def test_steps_that_vary_from_row_to_row_are_true_instants() -> None:
+    steps = PERIOD_S * np.random.default_rng(3).choice([1.0, 1.0, 1.0, 1.4], COUNT)
+    t = np.append(0.0, np.cumsum(steps[1:]))
+    record = log(t)
+    assert off(record, t[0] + _begin(record, t)) < 2e-3
+
+
 def test_late_stamps_of_even_samples_are_numbered() -> None:
     late = 0.7 * PERIOD_S * np.random.default_rng(1).random(COUNT)
     record = log(even(), stamps=even() + late)
@@ -79,13 +95,6 @@ def test_late_stamps_of_even_samples_are_numbered() -> None:
     assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-3)
     assert record.v.tolist() == command(even()).tolist()
     assert off(record) < 1.1e-3
-
-
-def test_a_clock_that_is_coarser_than_the_period_numbers_the_rows() -> None:
-    t = 0.004 * np.arange(COUNT)
-    record = log(t, stamps=np.floor(t * 100.0 + 1e-9) / 100.0)
-    assert record.sample_period == pytest.approx(0.004, rel=1e-3)
-    assert record.v.tolist() == command(t).tolist()
 
 
 @pytest.mark.parametrize(('unit_s', 'scale', 'origin'), [
@@ -113,14 +122,6 @@ def test_without_a_time_rows_are_counted_with_the_period_alone(stamps: Array | N
     with pytest.raises(RecordError, match='give --period S'):
         record_of(stamps, v, y)
     assert record_of(stamps, v, y, PERIOD_S).v.tolist() == v.tolist()
-
-
-def shuffled(t: Array) -> Array:
-    """A few neighbours swapped."""
-    order = np.arange(len(t))
-    for k in (100, 300, 500):
-        order[[k, k + 1]] = order[[k + 1, k]]
-    return order
 
 
 def test_rows_in_any_order_are_sorted() -> None:
@@ -164,6 +165,13 @@ def test_a_short_gap_is_missing_samples_and_a_long_one_ends_the_record() -> None
     record = log(t)
     assert len(record.v) == 700
     assert 'long gap' in record.timing
+
+
+def test_rows_that_repeat_the_one_before_count_once() -> None:
+    t = np.repeat(even(), 2)
+    record = log(t, noise=0.0)
+    assert record.v.tolist() == command(even()).tolist()
+    assert '1200 rows that repeat' in record.timing
 
 
 def test_where_moving_y_would_show_the_grid_is_finer() -> None:

@@ -17,6 +17,8 @@ from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import Span
 from backlash_ros.tools.runs.bag import read_bag
+from backlash_ros.tools.runs.run import Run
+from backlash_ros.tools.runs.source import read_run
 
 PERIOD_NS = 10_000_000
 START_NS = 10**18
@@ -105,14 +107,12 @@ def test_from_and_to_choose_the_other_part(
     assert report.main([str(bag), '--from', '2', '--to', '1']) == 2
 
 
-def test_a_controller_that_keeps_its_name_goes_before_a_renamed_one(
-    tmp_path: Path, first: RunRecord, second: RunRecord,
-) -> None:
-    bag = write_pieces(tmp_path / 'bag', Piece(first, node='a'), Piece(second, node='controller'))
-    found = read_bag(bag)
-    assert same(found.record, second)
-    assert 'holds /controller/signals, /a/signals: this is controller' in found.notes[0]
-    assert same(read_bag(bag, axis='a').record, first)
+@pytest.mark.usefixtures('undrawn')
+def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> None:
+    report.write_report(Run(first, PARAMETERS), tmp_path)
+    part = read_run(tmp_path, span=Span(0.5, 0.8)).record
+    assert np.array_equal(part.column('y'), first.column('y')[50:80])
+    assert part.column('t')[0] == 0.0
 
 
 def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(

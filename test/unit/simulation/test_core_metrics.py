@@ -39,12 +39,6 @@ def test_settling_time_counts_from_the_last_excursion() -> None:
     assert settling_time(T, estimate, ONES) == pytest.approx(7.01)
 
 
-def test_settling_time_follows_a_truth_that_moves() -> None:
-    truth = 1.0 + 0.1 * T
-    assert settling_time(T, 1.009 * truth, truth) == 0.0
-    assert settling_time(T, ONES, truth) is None
-
-
 def test_estimate_that_is_not_a_number_is_not_settled() -> None:
     assert settling_time(T, nan * ONES, ONES) is None
     partly = ONES.copy()

@@ -77,13 +77,6 @@ def test_bad_input_is_refused_in_one_line_before_anything_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
-
-def test_processes_find_this_package_behind_what_the_user_has_set() -> None:
-    user, source = environment.with_source({'PYTHONPATH': '/of/the/user'})['PYTHONPATH'].split(':')
-    assert user == '/of/the/user'
-    assert (Path(source) / 'backlash_ros' / '__init__.py').is_file()
-
-
 def test_folder_that_holds_a_bag_is_not_written_over(
     tmp_path: Path, capsys: pytest.CaptureFixture[str],
 ) -> None:

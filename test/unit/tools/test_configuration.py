@@ -103,14 +103,6 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
     assert all(parameters[name] == () for name in set(parameters) - set(load_config(config)))
 
 
-def test_written_infinity_is_one_for_ros_as_well(config: Path) -> None:
-    write_config(Parameters(), config)
-    text = config.read_text()
-    assert 'max: .inf\n' in text
-    assert 'min: -.inf\n' in text
-    assert load_config(config)['control.max'] == inf
-
-
 def test_misspelt_key_is_answered_with_the_nearest_one_and_the_file(config: Path) -> None:
     written(config, '/**: {ros__parameters: {estimator: {lwa: lms}}}')
     with pytest.raises(ParameterError) as caught:
@@ -170,6 +162,15 @@ def test_mistake_in_a_file_is_one_line_that_names_the_file(
     assert str(caught.value).startswith(f'{config}:')
     assert message in str(caught.value)
     assert '\n' not in str(caught.value)
+
+
+def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'nothing\.yaml: cannot be read: No such file'):
+        load_config(tmp_path / 'nothing.yaml')
+    binary = tmp_path / 'binary.yaml'
+    binary.write_bytes(b'\xff\xfe\x00')
+    with pytest.raises(InputError, match='not a text file'):
+        load_config(binary)
 
 
 @pytest.mark.parametrize(
@@ -241,12 +242,6 @@ def test_named_node_goes_before_named_axis_and_that_before_all(
         written(config, text)
         assert effective_parameters(config, axis='x')['seed'] == values[specific]
         left.remove(specific)
-
-
-def test_section_of_an_axis_is_for_that_one_alone(config: Path) -> None:
-    written(config, AXES + '/y/**: {ros__parameters: {seed: 7}}')
-    assert effective_parameters(config, axis='x')['seed'] == Parameters()['seed']
-    assert effective_parameters(config, axis='y')['seed'] == 7
 
 
 def test_setting_of_an_axis_goes_before_one_for_all_in_any_order(config: Path) -> None:

@@ -68,16 +68,6 @@ def test_gaps_in_samples_are_lost_samples(run: RunRecord, tmp_path: Path) -> Non
     assert again.lost_samples == run.lost_samples
 
 
-def test_samples_without_the_later_columns_are_read(run: RunRecord, tmp_path: Path) -> None:
-    path = tmp_path / 'samples.csv'
-    path.write_text(f'{OLD_HEADER}\n' + '\n'.join(
-        ','.join(map(repr, row)) for row in run.rows[:, :10].tolist()
-    ))
-    again = results.read_samples(path, run.sample_period)
-    np.testing.assert_array_equal(again.rows[:, :10], run.rows[:, :10])
-    assert np.isnan(again.column('status')).all()
-
-
 def test_u_is_left_empty_where_it_is_unknown(run: RunRecord, tmp_path: Path) -> None:
     results.write_run(without_truth(run), tmp_path)
     with (tmp_path / 'samples.csv').open(newline='') as file:
@@ -105,14 +95,6 @@ def test_what_is_not_finite_becomes_null(run: RunRecord, tmp_path: Path) -> None
     assert isinstance(stored, dict)
     assert stored['final_std'] == {'m': None, 'c_r': None, 'c_l': None}
     assert stored['estimator'] is None
-
-
-def test_without_truth_nothing_is_said_to_have_settled(run: RunRecord) -> None:
-    summary = summarise(without_truth(run), None)
-    nothing = {'m': None, 'c_r': None, 'c_l': None}
-    assert summary['truth'] == nothing
-    assert summary['settling_time_s'] == nothing
-    assert summary['control_error_rms'] is None
 
 
 def test_summary_tells_the_states_by_their_share(run: RunRecord) -> None:
@@ -176,12 +158,6 @@ def test_latest_points_at_the_newest_folder(
     assert latest.resolve() == folders[-1].resolve()
     # Relative, so that the results can be moved.
     assert str(latest.readlink()) == folders[-1].name
-
-
-def test_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
-    (tmp_path / 'file').touch()
-    with pytest.raises(InputError, match='file: cannot be made a folder'):
-        results.result_directory(tmp_path / 'file')
 
 
 def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
