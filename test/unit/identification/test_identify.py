@@ -247,3 +247,15 @@ def test_an_axis_gets_a_file_of_its_own(
     assert main([*given, '--axis', 'z']) == 0
     found = effective_parameters(tmp_path / 'out' / 'identified.yaml', axis='z')
     assert found.control.max == 5.0
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_a_longer_record_than_is_searched_is_fitted_as_a_whole(tmp_path: Path) -> None:
+    v, y = record(8000)
+    y[7000] = 40.0
+    source = write_csv(tmp_path / 'a.csv', v, y)
+    assert main([str(source), *QUICK, '--out', str(tmp_path / 'out')]) == 0
+    found = json.loads((tmp_path / 'out' / 'identified.json').read_text())
+    assert found['samples'] == 8000
+    assert found['outliers'] >= 1
+    assert abs(found['gap'] - 0.9) < 4.0 * found['std']['gap'] < 2e-3
