@@ -28,7 +28,7 @@ from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.config import load_config
-from backlash_ros.tools.figures import TIME, curve, label, new_figure, png
+from backlash_ros.tools.figures import TIME_LABEL, curve, label, new_figure, png
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def draw(without: Motion, compensated: Motion) -> None:
     axes = figure.subplots()
     curve(axes, without.t, 1e3 * without.tip, 'tab:red', 'gaps taken for 0')
     curve(axes, compensated.t, 1e3 * compensated.tip, 'tab:blue', 'gaps known')
-    label(axes, 'Tip of an arm with play in six joints', 'from where it belongs [mm]', TIME)
+    label(axes, 'Tip of an arm with play in six joints', 'from where it belongs [mm]', TIME_LABEL)
     axes.legend()
     axes.grid(alpha=0.3)
     PICTURE.write_bytes(png(figure))

@@ -18,17 +18,10 @@ from mcap.records import Channel, Chunk, McapRecord, Schema
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-METADATA = 'metadata.yaml'  # written last, when a bag is closed
-SUFFIXES = {'.mcap': 'mcap', '.db3': 'sqlite3'}  # of the file with the messages, and its storage
-CURE = 'ros2 run backlash_ros recorder --repair'
-TOPICS = """
-    SELECT topics.id, name, type, encoded_message_definition FROM topics
-    LEFT JOIN message_definitions ON type = topic_type ORDER BY topics.id
-"""
-# By number, not by time: the index of the times may be the part that is damaged.
-MESSAGES = """
-    SELECT topic_id, timestamp, data FROM messages NOT INDEXED WHERE topic_id IN ({}) ORDER BY id
-"""
+BAG_METADATA = 'metadata.yaml'  # written last, when a bag is closed
+# Of the file with the messages.
+STORAGE_OF_SUFFIX = {'.mcap': 'mcap', '.db3': 'sqlite3'}
+REPAIR_COMMAND = 'ros2 run backlash_ros recorder --repair'
 
 
 class BagError(ValueError):
@@ -84,12 +77,12 @@ class BagReader:
             return wanted(topic)
 
         for file in self.files:
-            read = _read_mcap if SUFFIXES[file.suffix] == 'mcap' else _read_sqlite
+            read = _read_mcap if STORAGE_OF_SUFFIX[file.suffix] == 'mcap' else _read_sqlite
             try:
                 yield from read(file, met)
             # Whatever damaged bytes make a library stumble over, the file is damaged.
             except Exception:
-                closed = (self.path / METADATA).is_file() or self.path.is_file()
+                closed = (self.path / BAG_METADATA).is_file() or self.path.is_file()
                 self.damage = 'is damaged' if closed else 'was never closed'
 
 
@@ -130,10 +123,16 @@ def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Messag
     with closing(sqlite3.connect(uri, uri=True)) as database:
         # Otherwise a file that has lost its end is refused as a whole.
         database.execute('PRAGMA writable_schema = ON')
-        topics = {number: Topic(*rest) for number, *rest in database.execute(TOPICS)}
+        topics = {number: Topic(*rest) for number, *rest in database.execute(
+            'SELECT topics.id, name, type, encoded_message_definition FROM topics '
+            'LEFT JOIN message_definitions ON type = topic_type ORDER BY topics.id'
+        )}
         chosen = [number for number, topic in topics.items() if wanted(topic)]
-        query = MESSAGES.format(', '.join(map(str, chosen)))
-        for number, stamp_ns, data in database.execute(query):
+        # By number, not by time: the index of the times may be the part that is damaged.
+        for number, stamp_ns, data in database.execute(
+            'SELECT topic_id, timestamp, data FROM messages NOT INDEXED '
+            f'WHERE topic_id IN ({", ".join(map(str, chosen))}) ORDER BY id'
+        ):
             yield Message(topics[number], int(stamp_ns), bytes(data))
         closed = database.execute('SELECT count(*) FROM metadata').fetchone()[0]
     if not closed:
@@ -142,16 +141,16 @@ def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Messag
 
 def is_bag(path: Path) -> bool:
     """Whether path is the folder of a bag, properly closed or not, or a file of one."""
-    return (path / METADATA).is_file() or bool(message_files(path))
+    return (path / BAG_METADATA).is_file() or bool(message_files(path))
 
 
 def message_files(path: Path) -> list[Path]:
     """The files with the messages of a bag in their order; itself, if it is one."""
     if path.is_file():
-        return [path] if path.suffix in SUFFIXES else []
+        return [path] if path.suffix in STORAGE_OF_SUFFIX else []
     # bag_10 comes after bag_9.
     return sorted(
-        (file for file in path.glob('*') if file.suffix in SUFFIXES),
+        (file for file in path.glob('*') if file.suffix in STORAGE_OF_SUFFIX),
         key=lambda file: (len(file.name), file.name),
     )
 

@@ -16,8 +16,8 @@ from rosbags.rosbag2 import Writer, WriterError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from backlash_ros.bags.reading import (
-    METADATA,
-    SUFFIXES,
+    BAG_METADATA,
+    STORAGE_OF_SUFFIX,
     BagError,
     BagReader,
     NoBagError,
@@ -64,7 +64,7 @@ def damage(bag: Path) -> str:
     reader = BagReader(bag)
     for _ in reader.messages():
         pass
-    return reader.damage or ('' if (bag / METADATA).is_file() else f'has no {METADATA}')
+    return reader.damage or ('' if (bag / BAG_METADATA).is_file() else f'has no {BAG_METADATA}')
 
 
 def repair(bag: Path) -> Repair | None:
@@ -117,7 +117,7 @@ def _write(reader: BagReader, path: Path) -> tuple[Counter[str], float]:
     counts: Counter[str] = Counter()
     first, last = 2**63, 0
     connections: dict[Topic, Connection] = {}
-    storage = STORAGE[SUFFIXES[reader.files[0].suffix]]
+    storage = STORAGE[STORAGE_OF_SUFFIX[reader.files[0].suffix]]
     with Writer(path, version=9, storage_plugin=storage) as writer:
         for message in reader.messages():
             for topic in reader.topics - connections.keys():

@@ -19,7 +19,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.bags.reading import CURE
+from backlash_ros.bags.reading import REPAIR_COMMAND
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.bags.writer import Bag, RecordingError
 from backlash_ros.core.loop.figures import Finding, Level
@@ -151,7 +151,8 @@ class RecorderNode(ProcessNode):
             self._bag = None
             self.failure = (
                 f'recording to {bag.path} stopped: {error}; saved are {bag.saved} messages of '
-                f'{bag.saved_ns * 1e-9:.1f} s; all else goes on. Make room, then: {CURE} {bag.path}'
+                f'{bag.saved_ns * 1e-9:.1f} s; all else goes on. Make room, then: '
+                f'{REPAIR_COMMAND} {bag.path}'
             )
             self.exit_code = FAILED
             self.log.error(self.failure)

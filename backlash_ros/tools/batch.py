@@ -7,11 +7,12 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf, nan
-from multiprocessing.pool import Pool
 
 import numpy as np
 import yaml
@@ -24,18 +25,20 @@ from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples
-from backlash_ros.tools.runs.run import run_loop
+from backlash_ros.tools.runs.source import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
 
-# The matrices are tiny: threads of the linear algebra would only disturb the other processes.
-ONE_THREAD = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
-GROUPS = {'': 'final', 'std_': 'final_std', 'true_': 'truth', 'settling_': 'settling_time_s'}
-MERITS = ('control_error_rms', 'tracking_error_rms', 'lost_samples')
-PROBLEM = 'problem'  # why a run broke off
-COLUMNS = (*(f'{prefix}{name}' for prefix in GROUPS for name in BACKLASH), *MERITS, PROBLEM)
-
-# What a run came to, under COLUMNS: nothing where a number is unknown or never reached.
+# What an outcome has of m, c_r and c_l: the beginning of a column, and the group in a summary.
+OUTCOME_GROUPS = {
+    '': 'final', 'std_': 'final_std', 'true_': 'truth', 'settling_': 'settling_time_s',
+}
+OUTCOME_COLUMNS = (
+    *(f'{prefix}{name}' for prefix in OUTCOME_GROUPS for name in BACKLASH),
+    'control_error_rms', 'tracking_error_rms', 'lost_samples', 'problem',
+)
+# What a run came to, under OUTCOME_COLUMNS: nothing where a number is unknown or never reached;
+# problem: why it broke off, '' where it did not.
 Outcome = Mapping[str, float | str | None]
 
 
@@ -95,10 +98,8 @@ def combinations(sweeps: Sequence[Sweep]) -> list[dict[str, Value]]:
     names = [sweep.name for sweep in sweeps]
     if len(set(names)) < len(names):
         raise InputError(f'--sweep names {max(names, key=names.count)} twice')
-    return [
-        dict(zip(names, values, strict=True))
-        for values in itertools.product(*(sweep.values for sweep in sweeps))
-    ]
+    products = itertools.product(*(sweep.values for sweep in sweeps))
+    return [dict(zip(names, values, strict=True)) for values in products]
 
 
 def value_text(value: Value) -> str:
@@ -130,15 +131,12 @@ def run_job(job: Job) -> Outcome:
     """Simulate one run; a run that breaks off is an outcome too."""
     parameters = Parameters(job.values)
     try:
-        run = run_loop(build_closed_loop(parameters), job.samples)
+        summary = summarise(run_loop(build_closed_loop(parameters), job.samples), parameters)
     except BrokenOffError as error:
-        return {**dict.fromkeys(COLUMNS), PROBLEM: str(error)}
-    summary = summarise(run, parameters)
-    return {
-        **{f'{prefix}{name}': summary[group][name]
-           for prefix, group in GROUPS.items() for name in BACKLASH},
-        **{name: summary[name] for name in MERITS}, PROBLEM: '',
-    }
+        return {**dict.fromkeys(OUTCOME_COLUMNS), 'problem': str(error)}
+    groups = {f'{prefix}{name}': summary[group][name]
+              for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH}
+    return {name: {**summary, **groups, 'problem': ''}[name] for name in OUTCOME_COLUMNS}
 
 
 def run_jobs(jobs: Sequence[Job], workers: int | None = None, label: str = '') -> list[Outcome]:
@@ -150,52 +148,59 @@ def run_jobs(jobs: Sequence[Job], workers: int | None = None, label: str = '') -
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
             os.cpu_count() or 1)
-    workers = min(workers, len(jobs))
-    tqdm.monitor_interval = 0  # a thread would take the signal that is held back below
     # disable=None: no bar where stderr is not a terminal.
-    with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar, ExitStack() as stack:
-        outcomes: list[Outcome] = []
-        if workers > 1:
-            # Left in any way, the context kills the workers: they have nothing to save.
-            pool = stack.enter_context(_pool(workers))
-            children = set(multiprocessing.active_children())
-            results = pool.imap(run_job, jobs)
-        while len(outcomes) < len(jobs):
-            try:
-                outcomes.append(results.next(timeout=1.0) if workers > 1 else
-                                run_job(jobs[len(outcomes)]))
-                bar.update()
-            except multiprocessing.TimeoutError:
-                if not children <= set(multiprocessing.active_children()):
-                    raise BrokenOffError(
-                        'a worker process was killed: is there enough memory?'
-                    ) from None
+    with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
+        if min(workers, len(jobs)) > 1:
+            return _in_processes(jobs, min(workers, len(jobs)), bar)
+        outcomes = []
+        for job in jobs:
+            outcomes.append(run_job(job))
+            bar.update()
         return outcomes
 
 
-def _pool(workers: int) -> Pool:
-    """Spawned workers, which no Ctrl-C reaches: that is for their parent alone.
+def _in_processes(jobs: Sequence[Job], workers: int, bar: tqdm[None]) -> list[Outcome]:
+    # The matrices are tiny: threads of the linear algebra would only disturb the other processes.
+    # It is read when a worker imports numpy.
+    os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1', MKL_NUM_THREADS='1')
+    executor = ProcessPoolExecutor(
+        workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent
+    )
+    try:
+        with _signals_held():
+            futures = [executor.submit(run_job, job) for job in jobs]
+        for _ in as_completed(futures):
+            bar.update()
+        return [future.result() for future in futures]
+    except BrokenProcessPool:
+        raise BrokenOffError('a worker process was killed: is there enough memory?') from None
+    finally:
+        for worker in multiprocessing.active_children():
+            worker.kill()  # it has nothing to save
+        executor.shutdown(cancel_futures=True)
 
-    A signal that would cut short their start takes effect afterwards.
+
+@contextmanager
+def _signals_held() -> Iterator[None]:
+    """What is started now hears no Ctrl-C, which is for its parent alone, then and later.
+
+    A signal that would cut short a start takes effect afterwards.
     """
-    os.environ.update(ONE_THREAD)  # read when a worker imports numpy
     held: list[int] = []
     handlers = {
         number: signal.signal(number, lambda number, _: held.append(number))
         for number in (signal.SIGINT, signal.SIGTERM)
     }
-    # Workers inherit for good what is blocked while they start.
+    # Processes inherit for good what is blocked while they start.
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
-        pool = multiprocessing.get_context('spawn').Pool(workers, _end_with_parent)
+        yield
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         for number, handler in handlers.items():
             signal.signal(number, handler)
     if held:
-        pool.terminate()
         raise KeyboardInterrupt
-    return pool
 
 
 def _end_with_parent() -> None:
@@ -215,15 +220,16 @@ def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
 
     Raises InputError where all of them did.
     """
-    whole = [outcome for outcome in outcomes if not outcome[PROBLEM]]
+    whole = [outcome for outcome in outcomes if not outcome['problem']]
     if not whole:
-        raise InputError(f'every run broke off, the first one with: {outcomes[0][PROBLEM]}')
+        raise InputError(f'every run broke off, the first one with: {outcomes[0]["problem"]}')
     return {name: _statistics(whole, name) for name in BACKLASH}
 
 
 def _statistics(outcomes: Sequence[Outcome], name: str) -> ParameterStatistics:
     final, std, truth, settling = (
-        np.array([one[f'{prefix}{name}'] for one in outcomes], dtype=float) for prefix in GROUPS
+        np.array([one[f'{prefix}{name}'] for one in outcomes], dtype=float)
+        for prefix in OUTCOME_GROUPS
     )
     error = final - truth
     settling = np.sort(np.where(np.isnan(settling), inf, settling))

@@ -17,8 +17,6 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
 DEFAULT_DURATION_S = 10.0  # of a run
-# A duration may miss a whole number of sample periods by rounding alone.
-WHOLE_TOLERANCE = 1e-6
 NOTHING = '–'  # in a table, where there is no number
 
 
@@ -38,7 +36,7 @@ class Span:
     to_s: float = inf
 
 
-WHOLE = Span()
+WHOLE_SPAN = Span()
 
 
 def add_common_options(parser: argparse.ArgumentParser) -> None:
@@ -64,6 +62,15 @@ def add_out_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--out', type=Path, metavar='DIR',
         help='folder of the results (default: results/<UTC time>, and results/latest points at it)',
+    )
+
+
+def add_duration_option(parser: argparse.ArgumentParser, further: str = '') -> None:
+    """Add --duration, for `number_of_samples`; further: a sentence on other values."""
+    parser.add_argument(
+        '--duration', type=float, metavar='SECONDS',
+        help=f'length of a run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s)'
+             + further,
     )
 
 
@@ -95,7 +102,8 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
         raise InputError(f'--duration={duration!r} must be finite and > 0')
     period = parameters.sample_period
     samples = round(duration / period)
-    if samples < 1 or abs(duration / period - samples) > WHOLE_TOLERANCE * samples:
+    # It may miss a whole number by rounding alone.
+    if samples < 1 or abs(duration / period - samples) > 1e-6 * samples:
         raise InputError(
             f'--duration={duration!r} must be a whole multiple of sample_period={period!r}'
         )

@@ -16,9 +16,7 @@ from backlash_ros.tools.cli import BrokenOffError, InputError
 if TYPE_CHECKING:
     from distributed import Client
 
-ANSWER_S = 10.0  # for the scheduler to answer, and for a first worker to be there
-# What the last bit of a result may depend on.
-NUMERICS = ('numpy', 'scipy')
+CLUSTER_ANSWER_S = 10.0  # for the scheduler to answer, and for a first worker to be there
 
 
 def run_on_cluster(jobs: Sequence[Job], address: str, label: str = '') -> list[Outcome]:
@@ -37,7 +35,7 @@ def run_on_cluster(jobs: Sequence[Job], address: str, label: str = '') -> list[O
     # What the user is to know is told in one line.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     try:
-        client = Client(address, timeout=ANSWER_S, set_as_default=False)
+        client = Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(
@@ -67,11 +65,11 @@ def _check_workers(client: Client, address: str) -> None:
     from distributed import TimeoutError as NoWorkerError
     here = libraries()
     try:
-        client.wait_for_workers(1, timeout=ANSWER_S)
+        client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
         there: dict[str, Any] = client.run(libraries)
     except NoWorkerError:
         raise InputError(
-            f'--cluster {address}: no worker within {ANSWER_S:g} s: start some with '
+            f'--cluster {address}: no worker within {CLUSTER_ANSWER_S:g} s: start some with '
             f'`dask worker {address}`'
         ) from None
     except ImportError as error:
@@ -87,5 +85,5 @@ def _check_workers(client: Client, address: str) -> None:
 
 
 def libraries() -> dict[str, str]:
-    """Versions of the numerical libraries of this process."""
-    return {name: version(name) for name in NUMERICS}
+    """Versions of the libraries on which the last bit of a result may depend."""
+    return {name: version(name) for name in ('numpy', 'scipy')}

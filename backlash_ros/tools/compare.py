@@ -6,7 +6,6 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -28,11 +27,12 @@ from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.analysis import ErrorCurves, control_error, moving_rms
 from backlash_ros.tools.runs.files import result_directory
-from backlash_ros.tools.runs.run import run_loop
+from backlash_ros.tools.runs.source import run_loop
 
-DOCUMENT, FIGURE = Path('comparison.md'), Path('images/comparison.png')
-WINDOW_S = 0.5  # over which the error of a curve is averaged
-HEADER = (
+COMPARISON_WINDOW_S = 0.5  # over which the error of a curve is averaged
+# No gap is wider than this one by definition (2.1), which is as good as none.
+GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
+COMPARISON_HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
     'crossings per reversal',
 )
@@ -54,7 +54,7 @@ class Contender:
 class Result:
     """What became of a contender.
 
-    merits: what stands below HEADER behind the name, None where it does not apply: control error
+    merits: what stands in the table behind the name, None where it does not apply: control error
     [unit of u], relative tracking error, the part of it that the backlash costs, way of v [unit of
     v], crossings of the gap per reversal. curves: of its errors. note: why the run broke off.
     """
@@ -88,13 +88,9 @@ def contenders(scenario: Parameters) -> list[Contender]:
             **tracks, **_fixed(m, 0.0, 0.0), 'fixed.doubt': 0.5,
         }, True),
         Contender('no backlash, tracking', {
-            **tracks, **_fixed(m, 0.0, 0.0), **_NO_GAP,
+            **tracks, **_fixed(m, 0.0, 0.0), **GAPLESS,
         }, True),
     ]
-
-
-# A gap is wider than nothing by definition (2.1); this one is as good as none.
-_NO_GAP = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
 
 def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
@@ -137,12 +133,12 @@ def _measure(contender: Contender, parameters: Parameters, samples: int) -> Resu
     except BrokenOffError as broken:
         return Result(contender, note=str(broken))
     since = 0.2 * run.samples * run.sample_period
-    window = max(round(WINDOW_S / run.sample_period), 1)
+    window = max(round(COMPARISON_WINDOW_S / run.sample_period), 1)
     error = penalty = tracking = None
     if contender.follows:
         tracking = moving_rms(run.column('y') - delayed_reference(run, delay), window)
         gapless = run_loop(build_closed_loop(parameters.replaced({
-            **_NO_GAP, **_fixed(parameters.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
+            **GAPLESS, **_fixed(parameters.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
         })), samples)
         error, best = (delayed_tracking_error_rms(each, delay, since) for each in (run, gapless))
         penalty = None if error is None or best is None else error - best
@@ -160,7 +156,7 @@ def _measure(contender: Contender, parameters: Parameters, samples: int) -> Resu
 def row(result: Result) -> tuple[str, ...]:
     """The line of the table for a result."""
     if result.note:
-        return (result.contender.name, 'broke off', *[NOTHING] * (len(HEADER) - 2))
+        return (result.contender.name, 'broke off', *[NOTHING] * (len(COMPARISON_HEADER) - 2))
     return (result.contender.name, *(number(merit, 3) for merit in result.merits))
 
 
@@ -171,7 +167,7 @@ def comparison_document(
     lines = [
         '# Comparison of laws and structures', '',
         f'![Control error and tracking error of every loop over time]({figure})', '',
-        '| ' + ' | '.join(HEADER) + ' |', '|---' * len(HEADER) + '|',
+        '| ' + ' | '.join(COMPARISON_HEADER) + ' |', '|---' * len(COMPARISON_HEADER) + '|',
         *('| ' + ' | '.join(row(result)) + ' |' for result in results), '',
     ]
     lines += [f'- {result.contender.name}: {result.note}.' for result in results if result.note]
@@ -221,14 +217,14 @@ def _compare(args: Sequence[str] | None) -> None:
     results = compare(scenario, cli.number_of_samples(scenario, options.duration))
     # Drawing libraries take a second to load, which bad input should not cost.
     from backlash_ros.tools.figures import draw_comparison, png
-    print(cli.format_table(HEADER, [row(result) for result in results]))
+    print(cli.format_table(COMPARISON_HEADER, [row(result) for result in results]))
     out = result_directory(options.out)
-    (out / FIGURE).parent.mkdir(parents=True, exist_ok=True)
+    figure, document = 'images/comparison.png', out / 'comparison.md'
+    (out / figure).parent.mkdir(parents=True, exist_ok=True)
     curves = [result.curves for result in results if result.curves is not None]
-    write_atomically(out / FIGURE, png(draw_comparison(curves, WINDOW_S)))
-    document = comparison_document(scenario, results, FIGURE.as_posix())
-    write_atomically(out / DOCUMENT, document)
-    print(f'document: {out / DOCUMENT}')
+    write_atomically(out / figure, png(draw_comparison(curves, COMPARISON_WINDOW_S)))
+    write_atomically(document, comparison_document(scenario, results, figure))
+    print(f'document: {document}')
 
 
 if __name__ == '__main__':

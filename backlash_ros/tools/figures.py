@@ -31,24 +31,19 @@ from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
 
-TIME = 'time t [s]'  # label of an axis
+TIME_LABEL = 'time t [s]'  # label of an axis
 # Okabe-Ito and Tol: told apart with every kind of colour vision.
-COLOURS = {
+HUES = {
     'm': '#0072B2', 'c_r': '#D55E00', 'c_l': '#009E73',
     'u': '#000000', 'u_d': '#E69F00', 'v': '#CC79A7', 'y': '#332288', 'y_m': '#777777',
     'e': '#882255', 'true': '#000000',
 }
-LAW_COLOURS = {'moving_horizon': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
-OTHER_LAW = '#555555'
 CYCLE = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#332288', '#777777', '#000000')
-MARKERS = 'osD^vP*X'
 DASHES = ('-', '--', '-.', ':')
-ESTIMATES = {'m': r'\hat{m}', 'c_r': r'\hat{c}_r', 'c_l': r'\hat{c}_l'}
-STYLES = {'m': '-', 'c_r': '--', 'c_l': '-.'}
-UNITS = {'m': 'unit of u/v', 'c_r': 'unit of v', 'c_l': 'unit of v'}
-WHOLE = Part('Whole run', slice(None))
-DECADES = 8.0  # that a logarithmic axis shows at most: what is below them is as good as zero
-BAND_POINTS = 2000  # of a band, at least: more cannot be told apart
+HATS = {'m': r'\hat{m}', 'c_r': r'\hat{c}_r', 'c_l': r'\hat{c}_l'}
+LINE_STYLES = {'m': '-', 'c_r': '--', 'c_l': '-.'}
+BACKLASH_UNITS = {'m': 'unit of u/v', 'c_r': 'unit of v', 'c_l': 'unit of v'}
+WHOLE_RUN = Part('Whole run', slice(None))
 
 matplotlib.rcParams.update({
     'axes.axisbelow': True, 'axes.grid': True, 'axes.spines.right': False,
@@ -98,8 +93,8 @@ def legend_below(figure: Figure, axes: Axes, title: str = '') -> None:
     figure.legend(handles, labels, title=title or None, loc='outside lower center', ncol=4)
 
 
-def limit_decades(axes: Axes, lowest: float, highest: float, decades: float = DECADES) -> None:
-    """Make y logarithmic over at most so many decades below the highest value."""
+def limit_decades(axes: Axes, lowest: float, highest: float, decades: float = 8.0) -> None:
+    """Make y logarithmic over at most so many decades: what is below them is as good as zero."""
     axes.set_yscale('log')
     if 0.0 < highest < np.inf:
         axes.set_ylim(max(lowest, highest * 10.0**-decades) * 0.6, highest * 1.7)
@@ -121,7 +116,7 @@ def zero_line(axes: Axes) -> None:
 
 def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str = '') -> None:
     """Fill between two signals over time, where both are known."""
-    step = slice(None, None, max(len(t) // BAND_POINTS, 1))
+    step = slice(None, None, max(len(t) // 2000, 1))  # more points cannot be told apart
     axes.fill_between(
         t[step], low[step], high[step], color=colour, alpha=0.18, linewidth=0, label=name or '_',
     )
@@ -151,7 +146,7 @@ def time_grid(figure: Figure, rows: int, parts: Sequence[Part], **others: Any) -
     grid = figure.subplots(rows, len(parts), sharex='col', squeeze=False, **others)
     for column, part in enumerate(parts):
         label(grid[0, column], part.name)
-        label(grid[-1, column], x=TIME)
+        label(grid[-1, column], x=TIME_LABEL)
     return np.asarray(grid)
 
 
@@ -160,7 +155,7 @@ def draw_parameter_errors(
 ) -> Figure:
     """Errors of the estimates over time, as Figure 4 of the paper, and their relative size."""
     figure = new_figure(7.4)
-    parts = (start, WHOLE)
+    parts = (start, WHOLE_RUN)
     grid = time_grid(figure, 2, parts, sharey='row')
     for column, part in enumerate(parts):
         t = run.column('t')[part.rows]
@@ -169,18 +164,18 @@ def draw_parameter_errors(
         for name in BACKLASH:
             truth, std = run.column(f'true_{name}'), run.column(f'std_{name}')[part.rows]
             errors.append(truth - run.column(name))
-            unit = UNITS[name].removeprefix('unit of ')
+            unit = BACKLASH_UNITS[name].removeprefix('unit of ')
             error = errors[-1][part.rows]
-            curve(absolute, t, error, COLOURS[name], f'${name} - {ESTIMATES[name]}$ [{unit}]',
-                  STYLES[name], 1.8)
-            band(absolute, t, error - 2 * std, error + 2 * std, COLOURS[name])
+            curve(absolute, t, error, HUES[name], f'${name} - {HATS[name]}$ [{unit}]',
+                  LINE_STYLES[name], 1.8)
+            band(absolute, t, error - 2 * std, error + 2 * std, HUES[name])
             # Nothing is a percentage of zero, and the logarithm has no zero.
             size = np.abs(errors[-1] / np.where(truth == 0.0, np.nan, truth))
             percents.append(np.maximum(100.0 * size, 1e-300))
-            curve(relative, t, percents[-1][part.rows], COLOURS[name], '', STYLES[name], 1.5)
+            curve(relative, t, percents[-1][part.rows], HUES[name], '', LINE_STYLES[name], 1.5)
             settled = settling[name]
             if settled is not None and settled <= t[-1]:
-                relative.plot(settled, 100.0 * SETTLING_TOLERANCE, 'o', color=COLOURS[name],
+                relative.plot(settled, 100.0 * SETTLING_TOLERANCE, 'o', color=HUES[name],
                               markersize=7, markeredgecolor='white', zorder=5)
         shade(absolute, t, frozen(run)[part.rows], 'frozen')
         zero_line(absolute)
@@ -203,22 +198,22 @@ def draw_estimates(run: RunRecord) -> Figure:
     """Estimates over time with two standard deviations, and the truth where it is known."""
     figure = new_figure(7.0)
     t = run.column('t')
-    for axes, name in zip(time_grid(figure, 3, [WHOLE])[:, 0], BACKLASH, strict=True):
+    for axes, name in zip(time_grid(figure, 3, [WHOLE_RUN])[:, 0], BACKLASH, strict=True):
         estimate, std = run.column(name), run.column(f'std_{name}')
-        title = f'${ESTIMATES[name]}$ = {estimate[-1]:.6g}'
+        title = f'${HATS[name]}$ = {estimate[-1]:.6g}'
         if run.has_truth:
-            curve(axes, t, run.column(f'true_{name}'), COLOURS['true'], 'true', width=6.0,
+            curve(axes, t, run.column(f'true_{name}'), HUES['true'], 'true', width=6.0,
                   alpha=0.22)
-        curve(axes, t, estimate, COLOURS[name], 'estimated', width=1.8)
+        curve(axes, t, estimate, HUES[name], 'estimated', width=1.8)
         if np.isfinite(std).any():
-            band(axes, t, estimate - 2 * std, estimate + 2 * std, COLOURS[name],
+            band(axes, t, estimate - 2 * std, estimate + 2 * std, HUES[name],
                  '±2 standard deviations')
             # The first, nearly boundless uncertainty would flatten everything else: the limits
             # are those of the curves, with a margin for the deviations.
             axes.set_ylim(*limits([estimate, run.column(f'true_{name}')], 0.25))
             title += f' ± {2 * std[-1]:.2g}'
         shade(axes, t, frozen(run), 'frozen')
-        label(axes, f'{title} at the end', f'${ESTIMATES[name]}$ [{UNITS[name]}]')
+        label(axes, f'{title} at the end', f'${HATS[name]}$ [{BACKLASH_UNITS[name]}]')
         legend_above(axes)
     return figure
 
@@ -237,21 +232,21 @@ def _draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]
     """One signal over the whole run, and below it over each part."""
     figure = new_figure(5.6)
     grid = figure.add_gridspec(2, len(parts))
-    panels = [(figure.add_subplot(grid[0, :]), WHOLE)]
+    panels = [(figure.add_subplot(grid[0, :]), WHOLE_RUN)]
     panels += [(figure.add_subplot(grid[1, i]), part) for i, part in enumerate(parts)]
     for axes, part in panels:
         t = run.column('t')[part.rows]
-        curve(axes, t, values[part.rows], COLOURS['e'])
+        curve(axes, t, values[part.rows], HUES['e'])
         shade(axes, t, frozen(run)[part.rows], 'frozen')
         zero_line(axes)
-        label(axes, part.name, name, '' if part is WHOLE else TIME)
+        label(axes, part.name, name, '' if part is WHOLE_RUN else TIME_LABEL)
     return figure
 
 
 def draw_laws(traces: Sequence[LawTrace], start: Part) -> Figure:
     """Control errors of the laws, as Figure 5 of the paper: each alone, then their size."""
     figure = new_figure(1.7 * len(traces) + 3.4)
-    parts = (start, WHOLE)
+    parts = (start, WHOLE_RUN)
     grid = time_grid(figure, len(traces) + 1, parts, height_ratios=[1.0] * len(traces) + [1.7])
     for column, part in enumerate(parts):
         for axes, trace in zip(grid[:-1, column], traces, strict=True):
@@ -280,7 +275,8 @@ def draw_laws(traces: Sequence[LawTrace], start: Part) -> Figure:
 
 
 def _law_colour(trace: LawTrace) -> str:
-    return LAW_COLOURS.get(trace.law, OTHER_LAW)
+    colours = {'moving_horizon': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
+    return colours.get(trace.law, '#555555')
 
 
 def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
@@ -294,13 +290,13 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
         m, c = run.column('m')[-1], run.column(name)[-1]
         if truth:
             true_m, true_c = run.column('true_m')[-1], run.column(f'true_{name}')[-1]
-            curve(axes, span, true_m * (span - true_c), COLOURS[name],
+            curve(axes, span, true_m * (span - true_c), HUES[name],
                   f'true {side} line\n$m(v - {name})$', width=6.0, alpha=0.35)
-        curve(axes, span, m * (span - c), COLOURS[name],
-              f'estimated {side} line\n${ESTIMATES["m"]}(v - {ESTIMATES[name]})$', '--', 1.6)
+        curve(axes, span, m * (span - c), HUES[name],
+              f'estimated {side} line\n${HATS["m"]}(v - {HATS[name]})$', '--', 1.6)
     axes.plot(v, u, color='#999999', linewidth=0.8, zorder=1, label='earlier')
     t = run.column('t')[end.rows]
-    axes.plot(v[end.rows], u[end.rows], color=COLOURS['u'], linewidth=1.1, marker='.',
+    axes.plot(v[end.rows], u[end.rows], color=HUES['u'], linewidth=1.1, marker='.',
               markersize=3, label=f'samples from\n{t[0]:.4g} s to {t[-1]:.4g} s')
     axes.set_xlim(*span)
     axes.set_ylim(*limits([u[end.rows]], margin=0.25))
@@ -314,16 +310,16 @@ def draw_output(run: RunRecord, end: Part, reference: FollowedReference) -> Figu
     """Reference and output: on one scale where y follows, else each on its own."""
     figure = new_figure(5.6)
     t, y = run.column('t'), run.column('y')
-    parts = (WHOLE, end)
+    parts = (WHOLE_RUN, end)
     grid = time_grid(figure, 2, parts)
     late = f', {reference.delay:.4g} s late' if reference.delay else ''
     below = y - reference.values if reference.followed else y
     for (upper, lower), part in zip(grid.T, parts, strict=True):
-        curve(upper, t[part.rows], reference.values[part.rows], COLOURS['y_m'], f'$y_m${late}',
+        curve(upper, t[part.rows], reference.values[part.rows], HUES['y_m'], f'$y_m${late}',
               '--' if reference.followed else '-')
-        curve(lower, t[part.rows], below[part.rows], COLOURS['y'])
+        curve(lower, t[part.rows], below[part.rows], HUES['y'])
         if reference.followed:
-            curve(upper, t[part.rows], y[part.rows], COLOURS['y'], 'y')
+            curve(upper, t[part.rows], y[part.rows], HUES['y'], 'y')
             legend_above(upper)
     above = '[unit of y]' if reference.followed else f'reference $y_m$ [unit of $y_m$]{late}'
     label(grid[0, 0], y=above)
@@ -340,10 +336,10 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     known = bool(np.isfinite(run.column('u')).any())
     for (upper, lower), part in zip(grid.T, parts, strict=True):
         if known:
-            curve(upper, t[part.rows], run.column('u')[part.rows], COLOURS['u'], 'u', width=1.6)
-        curve(upper, t[part.rows], run.column('u_d')[part.rows], COLOURS['u_d'], '$u_d$',
+            curve(upper, t[part.rows], run.column('u')[part.rows], HUES['u'], 'u', width=1.6)
+        curve(upper, t[part.rows], run.column('u_d')[part.rows], HUES['u_d'], '$u_d$',
               '--' if known else '-', 1.6)
-        curve(lower, t[part.rows], run.column('v')[part.rows], COLOURS['v'])
+        curve(lower, t[part.rows], run.column('v')[part.rows], HUES['v'])
     label(grid[0, 0], y='input of G [unit of u]')
     label(grid[1, 0], y='control v [unit of v]')
     legend_above(grid[0, -1])
@@ -365,7 +361,7 @@ def draw_sweep(
     places = numbers if len(numbers) == len(values) else list(map(float, range(len(values))))
     for i, (name, rows) in enumerate(lines.items()):
         for panel, row in zip(panels, rows, strict=True):
-            panel.plot(places, row, color=CYCLE[i % len(CYCLE)], marker=MARKERS[i % len(MARKERS)],
+            panel.plot(places, row, color=CYCLE[i % len(CYCLE)], marker='osD^vP*X'[i % 8],
                        linewidth=1.6, markersize=6, label=name)
     unit = f' [{BY_NAME[swept].unit}]' if BY_NAME[swept].unit else ''
     for panel, parameter in zip(panels, (*BACKLASH, None), strict=True):
@@ -410,7 +406,7 @@ def draw_comparison(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
             limit_decades(axes, float(low), float(high))
     label(upper, 'Control error', f'RMS of $u - u_d$ over {window_s:g} s\n[unit of u]')
     label(lower, 'Tracking error, where y is meant to follow',
-          f'RMS of $y - y_m$ over {window_s:g} s\n[unit of y]', TIME)
+          f'RMS of $y - y_m$ over {window_s:g} s\n[unit of y]', TIME_LABEL)
     handles, names = upper.get_legend_handles_labels()
     figure.legend(handles, names, loc='outside lower center', ncol=3)
     return figure

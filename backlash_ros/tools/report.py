@@ -33,21 +33,19 @@ from backlash_ros.tools.runs.analysis import (
     interesting_parts,
 )
 from backlash_ros.tools.runs.files import (
-    CONFIG,
-    SUMMARY,
+    CONFIG_FILE,
+    SUMMARY_FILE,
+    Run,
     result_directory,
     write_run,
     write_summary,
 )
-from backlash_ros.tools.runs.run import Run
 from backlash_ros.tools.runs.source import read_run
 from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
 from backlash_ros.topics import BACKLASH
 
-PAGE = 'report.html'
-TITLE = 'Adaptive backlash inverse control'
-SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
-UNITS = {'m': 'of u/v', 'c_r': 'of v', 'c_l': 'of v'}
+REPORT_PAGE = 'report.html'
+HTML_SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 
 
 def write_report(run: Run, out: Path) -> dict[str, Any]:
@@ -60,17 +58,18 @@ def write_report(run: Run, out: Path) -> dict[str, Any]:
         print(f'report: warning: {note}', file=sys.stderr)
     summary = summarise(run.record, run.parameters, run.latency_s)
     write_run(run.record, out)
-    write_summary(summary, out / SUMMARY)
+    write_summary(summary, out / SUMMARY_FILE)
     folded = None
     if run.parameters is not None:
-        write_config(run.parameters, out / CONFIG)
-        folded = ('Parameters of this run', (out / CONFIG).read_text(encoding='utf-8'))
+        write_config(run.parameters, out / CONFIG_FILE)
+        folded = ('Parameters of this run', (out / CONFIG_FILE).read_text(encoding='utf-8'))
     pictures = list(draw(run.record, run.parameters, summary))
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)
     notes = [f'{note[0].upper()}{note[1:]}.' for note in run.notes]
     tables = _backlash_table(summary) + _facts(summary)
-    write_atomically(out / PAGE, page(TITLE, headline(summary), notes, [tables], pictures, folded))
+    write_atomically(out / REPORT_PAGE, page(
+        'Adaptive backlash inverse control', headline(summary), notes, [tables], pictures, folded))
     return summary
 
 
@@ -140,7 +139,7 @@ def headline(summary: Mapping[str, Any]) -> str:
     if summary['truth']['m'] is None:
         return f'{who} estimated the backlash; no truth was recorded to compare with.'
     times = summary['settling_time_s']
-    late = [SYMBOLS[name] for name, time in times.items() if time is None]
+    late = [HTML_SYMBOLS[name] for name, time in times.items() if time is None]
     if late:
         return f'{who} did not bring {" and ".join(late)} to within 1 % of the truth.'
     return (
@@ -151,7 +150,8 @@ def headline(summary: Mapping[str, Any]) -> str:
 
 def _backlash_table(summary: Mapping[str, Any]) -> str:
     rows = [
-        (symbol, *estimate_cells(summary, name), UNITS[name]) for name, symbol in SYMBOLS.items()
+        (symbol, *estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
+        for name, symbol in HTML_SYMBOLS.items()
     ]
     rows.append(('f', number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
     return table(('', *ESTIMATE_HEADER, 'unit'), rows)
@@ -210,7 +210,7 @@ def _report(args: Sequence[str] | None) -> None:
         raise InputError(f'{options.path}: holds no sample')
     out = result_directory(options.out)
     write_report(run, out)
-    print(out / PAGE)
+    print(out / REPORT_PAGE)
 
 
 if __name__ == '__main__':

@@ -18,17 +18,14 @@ from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
-from backlash_ros.tools.batch import COLUMNS, PROBLEM, Job, Outcome, statistics
-from backlash_ros.tools.cli import DEFAULT_DURATION_S, NOTHING, InputError, format_table
+from backlash_ros.tools.batch import OUTCOME_COLUMNS, Job, Outcome, statistics
+from backlash_ros.tools.cli import NOTHING, InputError, format_table
 from backlash_ros.tools.cluster import run_on_cluster
 from backlash_ros.tools.config import effective_parameters, write_config
-from backlash_ros.tools.runs.files import CONFIG, result_directory, write_table
-from backlash_ros.tools.runs.run import Run, run_loop
+from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
+from backlash_ros.tools.runs.source import run_loop
 from backlash_ros.tools.runs.summary import estimate_table
 from backlash_ros.topics import BACKLASH
-
-SEEDS, SWEEP, SWEEP_FIGURE = 'seeds.csv', 'sweep.csv', 'sweep.png'
-NAMED_SEEDS = 10  # that an answer lists before it refers to the CSV
 
 Group = tuple[Mapping[str, Value], Sequence[Outcome]]  # a change and the outcomes of its runs
 
@@ -42,10 +39,7 @@ def make_parser() -> argparse.ArgumentParser:
     """The options of `simulate`."""
     parser = OptionParser('simulate', description=__doc__)
     cli.add_common_options(parser)
-    parser.add_argument(
-        '--duration', type=float, metavar='SECONDS',
-        help=f'length of a run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s)',
-    )
+    cli.add_duration_option(parser)
     parser.add_argument(
         '--seeds', type=int, metavar='N',
         help='run N seeds, from --seed on, in parallel and print their statistics',
@@ -79,7 +73,7 @@ def _simulate(args: Sequence[str] | None) -> None:
 
 def _once(parameters: Parameters, duration: float | None, out: Path | None) -> None:
     # Drawing libraries take a second to load, which neither a worker nor bad input should cost.
-    from backlash_ros.tools.report import PAGE, write_report
+    from backlash_ros.tools.report import REPORT_PAGE, write_report
     samples = cli.number_of_samples(parameters, duration)
     loop = build_closed_loop(parameters)
     cli.print_warnings('simulate', parameters)
@@ -89,7 +83,7 @@ def _once(parameters: Parameters, duration: float | None, out: Path | None) -> N
         run = run_loop(loop, samples, lambda _: bar.update())
     directory = result_directory(out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
-    print(f'report: {directory / PAGE}')
+    print(f'report: {directory / REPORT_PAGE}')
 
 
 def _refuse_bad(out: Path | None) -> None:
@@ -111,47 +105,41 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     outcomes = batch.run_jobs(jobs, label='simulate') if options.cluster is None \
         else run_on_cluster(jobs, options.cluster, label='simulate')
     directory = result_directory(options.out)
-    write_config(parameters, directory / CONFIG)
-    csv = directory / (SWEEP if swept else SEEDS)
+    write_config(parameters, directory / CONFIG_FILE)
+    csv = directory / ('sweep.csv' if swept else 'seeds.csv')
     named = (*swept, 'seed')
-    write_table(csv, (*named, *COLUMNS), [
-        [*(_plain(job.values[name]) for name in named), *(outcome[name] for name in COLUMNS)]
+    write_table(csv, (*named, *OUTCOME_COLUMNS), [
+        [*(list(value) if isinstance(value := job.values[name], tuple) else value
+           for name in named), *(outcome[name] for name in OUTCOME_COLUMNS)]
         for job, outcome in zip(jobs, outcomes, strict=True)
     ])
-    # The jobs of one change stand together.
-    size = len(outcomes) // len(changes)
-    groups = [(change, outcomes[i * size:(i + 1) * size]) for i, change in enumerate(changes)]
     if swept:
+        # The jobs of one change stand together.
+        size = len(outcomes) // len(changes)
+        groups = [(change, outcomes[i * size:(i + 1) * size]) for i, change in enumerate(changes)]
         print(_sweep_table(swept, groups))
         from backlash_ros.tools.figures import draw_sweep, png
         figure = draw_sweep(swept[0], sweeps[0].values, _lines(swept, groups), ', '.join(swept[1:]))
-        write_atomically(directory / SWEEP_FIGURE, png(figure))
-        print(f'figure: {directory / SWEEP_FIGURE}')
+        write_atomically(directory / 'sweep.png', png(figure))
+        print(f'figure: {directory / "sweep.png"}')
     else:
         print(_seeds_table(outcomes))
-    for line in _shortfalls(jobs, outcomes):
-        print(line)
+    _print_shortfalls(jobs, outcomes)
     print(f'runs: {csv}')
-
-
-def _plain(value: Value) -> object:
-    return list(value) if isinstance(value, tuple) else value
 
 
 def _seeds_table(outcomes: Sequence[Outcome]) -> str:
     """Statistics of each parameter over the seeds, as text; raises InputError if all broke off."""
-    header = ['', 'bias', 'RMSE', 'settled, median', 'settled, last', 'within 1 %']
     of = statistics(outcomes)
-    known = all(isfinite(s.nees) for s in of.values())
-    if known:
-        low, high = of['m'].nees_interval
-        header.append(f'NEES ({low:.2f} to {high:.2f})')
-    rows = []
-    for name, s in of.items():
-        row = [name, f'{s.bias:+.3g}', f'{s.rmse:.3g}', _seconds(s.settling_median),
-               _seconds(s.settling_max), f'{100.0 * s.within:.4g} %']
-        rows.append([*row, f'{s.nees:.2f}'] if known else row)
-    return format_table(header, rows)
+    low, high = of['m'].nees_interval
+    header = ['', 'bias', 'RMSE', 'settled, median', 'settled, last', 'within 1 %',
+              f'NEES ({low:.2f} to {high:.2f})']
+    rows = [[
+        name, f'{s.bias:+.3g}', f'{s.rmse:.3g}', _seconds(s.settling_median),
+        _seconds(s.settling_max), f'{100.0 * s.within:.4g} %', f'{s.nees:.2f}',
+    ] for name, s in of.items()]
+    shown = None if all(isfinite(s.nees) for s in of.values()) else -1
+    return format_table(header[:shown], [row[:shown] for row in rows])
 
 
 def _sweep_table(swept: Sequence[str], groups: Sequence[Group]) -> str:
@@ -160,7 +148,7 @@ def _sweep_table(swept: Sequence[str], groups: Sequence[Group]) -> str:
     rows = []
     for change, outcomes in groups:
         row = [batch.value_text(change[name]) for name in swept]
-        if all(outcome[PROBLEM] for outcome in outcomes):
+        if all(outcome['problem'] for outcome in outcomes):
             rows.append([*row, *[NOTHING] * 3, 'broke off', NOTHING])
             continue
         of = statistics(outcomes).values()
@@ -178,40 +166,35 @@ def _lines(swept: Sequence[str], groups: Sequence[Group]) -> dict[str, NDArray[n
     """
     lines: dict[str, list[list[float]]] = {}
     for change, outcomes in groups:
+        points = [nan] * 4
+        if not all(outcome['problem'] for outcome in outcomes):
+            of = statistics(outcomes).values()
+            # The logarithm has no zero.
+            points = [max(s.rmse_percent, 1e-10) for s in of] + [max(
+                s.settling_median for s in of
+            )]
         line = lines.setdefault(', '.join(batch.value_text(change[name]) for name in swept[1:]), [])
-        if all(outcome[PROBLEM] for outcome in outcomes):
-            line.append([nan] * 4)
-            continue
-        of = statistics(outcomes).values()
-        slowest = max(s.settling_median for s in of)
-        # The logarithm has no zero.
-        percents = [max(s.rmse_percent, 1e-10) if isfinite(s.rmse_percent) else nan for s in of]
-        line.append([*percents, slowest if isfinite(slowest) else nan])
+        line.append([value if isfinite(value) else nan for value in points])
     return {name: np.array(line).T for name, line in lines.items()}
 
 
-def _shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> list[str]:
-    """Lines that name the runs that broke off or did not end within 1 %."""
-    lines = []
-    pairs = list(zip(jobs, outcomes, strict=True))
-    broken = [job for job, outcome in pairs if outcome[PROBLEM]]
-    if broken:
-        first = next(outcome[PROBLEM] for outcome in outcomes if outcome[PROBLEM])
-        lines.append(f'broke off: {_seeds(broken)}, the first one with: {first}')
-    missed = [
-        job for job, outcome in pairs
-        if not outcome[PROBLEM] and any(outcome[f'settling_{name}'] is None for name in BACKLASH)
-    ]
-    if missed:
-        lines.append(f'not within 1 % at the end: {_seeds(missed)}')
-    return lines
-
-
-def _seeds(jobs: Sequence[Job]) -> str:
-    named = list(dict.fromkeys(str(job.values['seed']) for job in jobs))
-    more = ', ...' if len(named) > NAMED_SEEDS else ''
-    runs = '1 run' if len(jobs) == 1 else f'{len(jobs)} runs'
-    return f'{runs}, seed {", ".join(named[:NAMED_SEEDS])}{more}'
+def _print_shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
+    """Name the runs that broke off or did not end within 1 %."""
+    broken, missed, why = [], [], ''
+    for job, outcome in zip(jobs, outcomes, strict=True):
+        if outcome['problem']:
+            broken.append(job)
+            why = why or str(outcome['problem'])
+        elif any(outcome[f'settling_{name}'] is None for name in BACKLASH):
+            missed.append(job)
+    for what, of, further in (
+        ('broke off', broken, f', the first one with: {why}'),
+        ('not within 1 % at the end', missed, ''),
+    ):
+        seeds = list(dict.fromkeys(str(job.values['seed']) for job in of))
+        named = ', '.join(seeds[:10]) + (', ...' if len(seeds) > 10 else '')
+        if of:
+            print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {named}{further}')
 
 
 def _seconds(time: float) -> str:

@@ -22,11 +22,11 @@ from tables import TABLES
 from backlash_ros.core.simulation.metrics import delayed_reference
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.figures import (
-    COLOURS,
-    ESTIMATES,
-    STYLES,
-    TIME,
-    UNITS,
+    BACKLASH_UNITS,
+    HATS,
+    HUES,
+    LINE_STYLES,
+    TIME_LABEL,
     band,
     curve,
     draw_hysteresis,
@@ -53,7 +53,7 @@ SMALL = {'structure': 'tracking', 'amplitude': '0.2'}
 # The gapless observer allows for a disturbance, which is what helps this loop most.
 NO_INVERSE = {**WITHOUT, 'estimator.initial.m': '1.3', 'fixed.doubt': '0.5'}
 NO_GAP = {'backlash.c_r': '1e-9', 'backlash.c_l': '-1e-9', 'fixed.doubt': '0.0'}
-RESTING: dict[str, Any] = {'linewidth': 6.0, 'alpha': 0.22, 'color': COLOURS['true']}
+RESTING: dict[str, Any] = {'linewidth': 6.0, 'alpha': 0.22, 'color': HUES['true']}
 
 
 def draw_result() -> Figure:
@@ -64,13 +64,13 @@ def draw_result() -> Figure:
     figure = new_figure(6.4)
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[1.3, 1.0])
     t = learned.column('t')
-    curve(upper, t, learned.column('y_m'), COLOURS['y_m'], 'reference $y_m$', '--')
+    curve(upper, t, learned.column('y_m'), HUES['y_m'], 'reference $y_m$', '--')
     curve(upper, t, plain.column('y'), WITHOUT_COLOUR, 'y without compensation', width=1.8)
     curve(upper, t, learned.column('y'), WITH_COLOUR, 'y with this package', width=1.8)
     label(upper, 'Load behind a worn gear', 'angle [rad]')
     legend_above(upper)
     _draw_shares(lower, learned)
-    label(lower, 'What is learned from v and y', 'estimate / truth', TIME)
+    label(lower, 'What is learned from v and y', 'estimate / truth', TIME_LABEL)
     lower.set_ylim(-0.05, 1.15)
     legend_above(lower)
     return figure
@@ -81,7 +81,7 @@ def _draw_shares(axes: Axes, run: RunRecord) -> None:
     axes.axhline(1.0, label='truth', **RESTING)
     for name, width in zip(NAMES, (1.4, 2.4, 1.6), strict=True):
         share = run.column(name) / run.column(f'true_{name}')
-        curve(axes, t, share, COLOURS[name], f'${ESTIMATES[name]}$', STYLES[name], width)
+        curve(axes, t, share, HUES[name], f'${HATS[name]}$', LINE_STYLES[name], width)
 
 
 def draw_figure_4() -> Figure:
@@ -95,16 +95,16 @@ def draw_figure_4() -> Figure:
         for name in NAMES:
             truth = run.column(f'true_{name}')
             error = truth - run.column(name)
-            unit = UNITS[name].removeprefix('unit of ')
-            curve(absolute, t, error, COLOURS[name], f'${name} - {ESTIMATES[name]}$ [{unit}]',
-                  STYLES[name], 1.8)
+            unit = BACKLASH_UNITS[name].removeprefix('unit of ')
+            curve(absolute, t, error, HUES[name], f'${name} - {HATS[name]}$ [{unit}]',
+                  LINE_STYLES[name], 1.8)
             percent = np.maximum(100.0 * np.abs(error / truth), 1e-12)
-            curve(relative, t, percent, COLOURS[name], '', STYLES[name], 1.5)
+            curve(relative, t, percent, HUES[name], '', LINE_STYLES[name], 1.5)
         zero_line(absolute)
         relative.set_yscale('log')
         relative.set_ylim(1e-6, 1e3)
         label(absolute, f'estimator.law: {law}')
-        label(relative, x=TIME)
+        label(relative, x=TIME_LABEL)
     grid[0][0].set_ylim(-3.0, 3.0)
     label(grid[0][0], y='true minus estimated')
     label(grid[1][0], y='size of the error [%]')
@@ -142,7 +142,7 @@ def draw_uncertain_plant() -> Figure:
             label(axes, f'true natural frequency × {scale}, {name}')
         label(line[0], y='error [% of the truth]')
     for axes in grid[1]:
-        label(axes, x=TIME)
+        label(axes, x=TIME_LABEL)
     legend_below(figure, grid[0][0])
     return figure
 
@@ -155,9 +155,9 @@ def _draw_crossing_errors(axes: Axes, run: RunRecord) -> None:
         # Before the first estimate there is no deviation, and so no curve.
         percent = 100.0 * (run.column(name) - truth + 0.0 * std) / np.abs(truth)
         around = 200.0 * std / np.abs(truth)
-        band(axes, t, percent - around, percent + around, COLOURS[name],
+        band(axes, t, percent - around, percent + around, HUES[name],
              '±2 published standard deviations' if name == 'c_r' else '')
-        curve(axes, t, percent, COLOURS[name], f'${ESTIMATES[name]}$', STYLES[name], 1.6)
+        curve(axes, t, percent, HUES[name], f'${HATS[name]}$', LINE_STYLES[name], 1.6)
     shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
 
 
@@ -170,9 +170,9 @@ def draw_recovery() -> Figure:
     axes = figure.subplots()
     t = run.column('t')
     axes.plot(t, run.column('true_c_r'), label='true', **RESTING)
-    curve(axes, t, run.column('c_r'), COLOURS['c_r'], f'${ESTIMATES["c_r"]}$', width=1.8)
+    curve(axes, t, run.column('c_r'), HUES['c_r'], f'${HATS["c_r"]}$', width=1.8)
     shade(axes, t, run.column('status') == 4.0, 'frozen: inconsistent')
-    label(axes, '$c_r$ steps from 3 to 4', f'[{UNITS["c_r"]}]', TIME)
+    label(axes, '$c_r$ steps from 3 to 4', f'[{BACKLASH_UNITS["c_r"]}]', TIME_LABEL)
     legend_above(axes)
     axes.set_ylim(0.0, 4.5)
     return figure
@@ -192,12 +192,12 @@ def draw_tracking() -> Figure:
         curve(upper, t, run.record.column('y'), colour, f'y, {name}', style)
         error = np.abs(run.record.column('y') - reference) / float(np.abs(reference).max())
         curve(lower, t, np.maximum(error, 1e-9), colour, name, style)
-    curve(upper, t, reference, COLOURS['y_m'], '$y_m$, delayed', ':', 2.4)
+    curve(upper, t, reference, HUES['y_m'], '$y_m$, delayed', ':', 2.4)
     lower.set_yscale('log')
     lower.set_ylim(1e-7, 10.0)
     lower.set_xlim(0.0, 4.0)
     label(upper, 'Output', '[unit of y]')
-    label(lower, 'Distance from the delayed reference', 'share of the amplitude', TIME)
+    label(lower, 'Distance from the delayed reference', 'share of the amplitude', TIME_LABEL)
     legend_above(upper)
     legend_above(lower)
     return figure

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from backlash_ros import topics
 from backlash_ros.options import DONE, FAILED, OptionParser
 from backlash_ros.tools import cli
-from backlash_ros.tools.cli import DEFAULT_DURATION_S, InputError, StopRequests
+from backlash_ros.tools.cli import InputError, StopRequests
 
 if TYPE_CHECKING:
     from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
@@ -55,11 +55,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     cli.add_common_options(parser)
-    parser.add_argument(
-        '--duration', type=float, metavar='SECONDS',
-        help=f'length of the run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s); '
-             'inf runs until Ctrl-C',
-    )
+    cli.add_duration_option(parser, '; inf runs until Ctrl-C')
     parser.add_argument(
         '--driver', metavar='COMMAND',
         help='start this command instead of the simulated plant; none: it is started elsewhere',
@@ -120,8 +116,9 @@ def perform(plan: RunPlan) -> int:
 def _announced_domain(plan: RunPlan, stack: ExitStack) -> int | None:
     """ROS_DOMAIN_ID to set, None to leave it alone; says where to listen or what is awaited."""
     from backlash_ros.tools.bringup.environment import free_domain
+    from backlash_ros.tools.bringup.plan import ELSEWHERE
     discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    awaited = [axis.name for axis in plan.axes if axis.driver_is_elsewhere]
+    awaited = [axis.name for axis in plan.axes if axis.driver == ELSEWHERE]
     if awaited:
         # Whoever started the driver did so in the domain that is set there, or in none.
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
@@ -143,7 +140,7 @@ def _announced_domain(plan: RunPlan, stack: ExitStack) -> int | None:
 
 def _announce_others(plan: RunPlan) -> None:
     """Say who besides the driver is waited for."""
-    managed = [axis.process_name('controller') for axis in plan.axes if axis.is_managed]
+    managed = [axis.process_name('controller') for axis in plan.axes if axis.managed]
     if managed:
         print(f'waiting until somebody activates {", ".join(managed)} (autostart: false)',
               flush=True)
@@ -166,7 +163,7 @@ def _report(axis: AxisPlan, joint: str) -> bool:
     """Report one joint, in a folder of its own, or the only one, which is nameless."""
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.bringup.watch import complain
-    from backlash_ros.tools.report import PAGE, write_report
+    from backlash_ros.tools.report import REPORT_PAGE, write_report
     from backlash_ros.tools.runs.source import read_run
     from backlash_ros.tools.runs.summary import estimate_table
     out = axis.out / joint
@@ -182,7 +179,7 @@ def _report(axis: AxisPlan, joint: str) -> bool:
     if latency is not None:
         facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
     print(facts)
-    print(f'report: {out / PAGE}')
+    print(f'report: {out / REPORT_PAGE}')
     return True
 
 

@@ -19,18 +19,21 @@ from backlash_ros.tools.bringup.environment import child_environment, foreign_en
 from backlash_ros.tools.bringup.supervisor import ProcessPlan
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
 from backlash_ros.tools.config import Configuration, read_configuration, write_config
-from backlash_ros.tools.runs.files import CONFIG, result_directory
+from backlash_ros.tools.runs.files import CONFIG_FILE, result_directory
 from backlash_ros.tools.runs.source import BAG
 
-# Each node takes one of the places that discovery on one machine has; some stay for listeners.
-MOST_AXES = 7
+ELSEWHERE = 'none'
 
 
-@dataclass(frozen=True)
+@dataclass
 class AxisPlan:
     """One controller of a run; its parameters are complete and checked, its folder exists.
 
-    name: also its namespace, empty for a run without axes.
+    name: also its namespace, empty for a run without axes. samples: of the whole run, 0 for one
+    without end. sample_period: T [s]. joints: empty where the controller has a single, nameless
+    one. driver: command of what stands in the place of the simulated plant, empty for nothing,
+    ELSEWHERE where somebody else starts it. managed: whether somebody else activates the
+    controller. bag, logs: folders.
     """
 
     name: str
@@ -38,62 +41,21 @@ class AxisPlan:
     out: Path
     record: bool
 
-    @property
-    def samples(self) -> int:
-        """Samples of the whole run, 0 for a run without end."""
-        return self.parameters.samples
+    def __post_init__(self) -> None:
+        p = self.parameters
+        self.samples, self.sample_period = p.samples, p.sample_period
+        self.joints, self.driver = p.joints, p.driver
+        self.managed = not p.autostart
+        self.bag, self.logs = self.out / BAG, self.out / 'logs'
 
-    @property
-    def sample_period(self) -> float:
-        """T [s]."""
-        return self.parameters.sample_period
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The joints of its controller, empty where it has a single, nameless one."""
-        return self.parameters.joints
-
-    @property
-    def bag(self) -> Path:
-        """Folder of the bag."""
-        return self.out / BAG
-
-    @property
-    def logs(self) -> Path:
-        """Folder of the logs."""
-        return self.out / 'logs'
-
-    @property
-    def driver(self) -> str:
-        """Command of what stands in the place of the simulated plant, empty for nothing."""
-        return self.parameters.driver
-
-    @property
-    def has_driver(self) -> bool:
-        """Whether something else stands in the place of the simulated plant."""
-        return bool(self.driver)
-
-    @property
-    def driver_is_elsewhere(self) -> bool:
-        """Whether somebody else starts the driver."""
-        return self.driver == 'none'
-
-    @property
-    def is_managed(self) -> bool:
-        """Whether somebody else activates the controller."""
-        return not self.parameters.autostart
-
-    @property
-    def patient_processes(self) -> tuple[str, ...]:
-        """Processes that wait for somebody who may come at any time."""
-        nodes = []
-        if self.driver_is_elsewhere or self.is_managed:
-            nodes.append('controller')
-        if self.is_managed:
-            nodes.append('plant')  # begins when the controller listens
-        if self.joints:
-            nodes.append('recorder')  # begins when the motion is planned
-        return tuple(map(self.process_name, nodes))
+    def waits(self, process: str) -> bool:
+        """Whether one of its processes waits for somebody who may come at any time."""
+        elsewhere = self.driver == ELSEWHERE
+        return process in map(self.process_name, (
+            *(['controller'] if elsewhere or self.managed else []),
+            *(['plant'] if self.managed else []),  # begins when the controller listens
+            *(['recorder'] if self.joints else []),  # begins when the motion is planned
+        ))
 
     def titled(self, text: str) -> str:
         """The text, with the name of the axis where there are axes."""
@@ -130,16 +92,23 @@ def prepare(options: argparse.Namespace) -> RunPlan:
         raise BrokenOffError(ROS_MISSING)
     configuration = read_configuration(options.config, options.settings, options.seed)
     names = (options.axis,) if options.axis else configuration.axes or ('',)
-    if len(names) > MOST_AXES:
-        raise InputError(f'{len(names)} axes are too many for one machine: at most {MOST_AXES}')
+    # Each node takes one of the places that discovery on one machine has; some stay for listeners.
+    if len(names) > 7:
+        raise InputError(f'{len(names)} axes are too many for one machine: at most 7')
     parameters = {name: _parameters(configuration, name, options) for name in names}
     if options.unlimited and not any(values.driver for values in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
     live_port = options.live_port if options.live_port is not None else 0 if options.live else None
     if live_port is not None and not 0 <= live_port <= LARGEST_PORT:
         raise InputError(f'--live-port={live_port}: must be from 0 (a free one) to {LARGEST_PORT}')
-    _check_files(parameters)
+    users: dict[str, str] = {}
     for name, values in parameters.items():
+        file = values.estimates.file
+        if file and users.setdefault(file, name) != name:
+            raise ParameterError(
+                'estimates.file', file, f'is the file of {users[file]} and of {name}',
+                f'give each axis one of its own, like --set {name}/estimates.file=...',
+            )
         for joint in values.joint_names:
             where = ': '.join(filter(None, ('bringup', name, joint)))
             print_warnings(where, values.of_joint(joint))
@@ -153,7 +122,7 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     try:
         for axis in plan.axes:
             axis.logs.mkdir(parents=True, exist_ok=True)
-            write_config(axis.parameters, axis.out / CONFIG)
+            write_config(axis.parameters, axis.out / CONFIG_FILE)
     except OSError as error:
         raise InputError(f'{plan.out}: cannot be written: {error.strerror}') from None
     return plan
@@ -209,26 +178,13 @@ def _with_driver(axis: str, parameters: Parameters) -> Parameters:
         )
     if mark in text and not axis:
         raise ParameterError('driver', text, 'names an axis', 'list the axes in the parameter axes')
-    if parameters['joints'] and not text:
+    if parameters.joints and not text:
         raise ParameterError(
             'driver', text, 'is empty, and nothing here simulates several joints',
             'give --driver COMMAND, or none for one that you start yourself; '
             '`simulate --axis JOINT` simulates one of them',
         )
     return parameters.replaced({'driver': text.replace(mark, axis)})
-
-
-def _check_files(parameters: Mapping[str, Parameters]) -> None:
-    """Raise ParameterError where two axes would save their estimates in one file."""
-    name = 'estimates.file'
-    users: dict[str, str] = {}
-    for axis, values in parameters.items():
-        file = values.estimates.file
-        if file and users.setdefault(file, axis) != axis:
-            raise ParameterError(
-                name, file, f'is the file of {users[file]} and of {axis}',
-                f'give each axis one of its own, like --set {axis}/{name}=...',
-            )
 
 
 def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]:
@@ -242,14 +198,14 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
     stages: list[list[ProcessPlan]] = [[], [], [], []]
     for axis in plan.axes:
         order = ('controller', '', '' if axis.joints else 'reference', 'recorder') \
-            if axis.has_driver else ('plant', 'reference', 'controller', 'recorder')
+            if axis.driver else ('plant', 'reference', 'controller', 'recorder')
         for stage, node in zip(stages, order, strict=True):
             if node:
                 stage.append(_node(axis, node, child_environment(axis.logs, domain)))
     # Axes with the very same command have one driver together.
     served: dict[tuple[str, ...], list[AxisPlan]] = {}
     for axis in plan.axes:
-        if axis.has_driver and not axis.driver_is_elsewhere:
+        if axis.driver and axis.driver != ELSEWHERE:
             served.setdefault(tuple(shlex.split(axis.driver)), []).append(axis)
     stages[1] += [_driver(plan, command, axes, domain) for command, axes in served.items()]
     if plan.live_port is not None:
@@ -277,7 +233,7 @@ def _node(axis: AxisPlan, node: str, environment: Mapping[str, str]) -> ProcessP
         # The loop and the recorder; in real time the reference follows plant_output as well, in
         # lockstep it follows /clock.
         own = {'wait_for_subscribers': '3' if node == 'plant' and not lockstep else '2'}
-    command = [*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG)]
+    command = [*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG_FILE)]
     for parameter, value in own.items():
         command += ['-p', f'{parameter}:={value}']
     if axis.name:

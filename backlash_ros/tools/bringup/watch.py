@@ -10,17 +10,13 @@ from math import inf, isfinite, nan
 from typing import TextIO
 
 from backlash_ros import topics
-from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
+from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan
 from backlash_ros.tools.bringup.supervisor import Child, Event, ProcessSupervisor
 from backlash_ros.tools.cli import BrokenOffError, StopRequests
 
 READY_DEADLINE_S = 30.0  # for the start of every process
 FIRST_SAMPLE_DEADLINE_S = 30.0  # of a driver that bringup has started
-STALL_DEADLINE_S = 10.0  # without a new sample
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
-# For the recorder, after the last sample: the middleware sends again what got lost on the way to a
-# recorder that was held up, with its own settings every 3 s.
-CATCH_UP_DEADLINE_S = 10.0
 
 
 def complain(message: str) -> None:
@@ -72,7 +68,7 @@ class AxisProgress:
     @property
     def patience(self) -> float:
         """How long to wait for a new sample [s]: a plant of long periods may take its time."""
-        return STALL_DEADLINE_S + 2.0 * self.plan.sample_period
+        return 10.0 + 2.0 * self.plan.sample_period
 
     @property
     def deadline(self) -> float:
@@ -84,7 +80,7 @@ class AxisProgress:
     @property
     def complete(self) -> bool:
         """Whether all samples were made; a driver does not say so, the recorder hears it."""
-        if self.plan.has_driver:
+        if self.plan.driver:
             return 0 < self.plan.samples <= self.made
         return self.published is not None
 
@@ -108,7 +104,7 @@ class AxisProgress:
         if self.made == 0:
             self.begin()
             # A driver may have been running before; a simulated plant begins with sample 0.
-            self.first = int(sample) if self.plan.has_driver else 0
+            self.first = int(sample) if self.plan.driver else 0
         made = int(sample) + 1 - self.first
         self._heard = {'samples': made, **_counts(progress, 'received')}
         if made > self.made:
@@ -123,8 +119,8 @@ class AxisProgress:
     def check_pace(self) -> None:
         """Raise BrokenOffError for samples that do not come."""
         now, plan = time.monotonic(), self.plan
-        if plan.has_driver and self.made == 0:
-            if not plan.driver_is_elsewhere and now > self.began + FIRST_SAMPLE_DEADLINE_S:
+        if plan.driver and self.made == 0:
+            if plan.driver != ELSEWHERE and now > self.began + FIRST_SAMPLE_DEADLINE_S:
                 raise BrokenOffError(plan.titled(
                     f'no sample within {FIRST_SAMPLE_DEADLINE_S:g} s: does the driver publish its '
                     f'output? See {plan.logs}; where it needs longer, start it yourself '
@@ -140,7 +136,7 @@ class AxisProgress:
         elif now > self.moved + self.patience:
             at = f' after sample {self.first + self.made - 1}' if self.made else ''
             silence = f'no new sample for {self.patience:g} s{at}'
-            if not plan.has_driver:
+            if not plan.driver:
                 raise BrokenOffError(plan.titled(f'{silence}, see {plan.logs}'))
             # The controller knows what to do when a real plant falls silent.
             if self._says_silence:
@@ -214,12 +210,12 @@ class RunWatch:
             self._listen()
             late = [
                 child for child in missing if child.plan.name not in self._ready
-                and child.plan.name not in self._axes[child.plan.axis].plan.patient_processes
+                and not self._axes[child.plan.axis].plan.waits(child.plan.name)
             ]
             if late and time.monotonic() > deadline:
                 names = ', '.join(child.plan.name for child in late)
                 hint = ' (a controller waits until the driver subscribes to its command)' \
-                    if any(axis.has_driver for axis in self._plan.axes) else ''
+                    if any(axis.driver for axis in self._plan.axes) else ''
                 logs = '\n'.join(f'the end of {child.end_of_log()}' for child in late)
                 raise BrokenOffError(
                     f'not ready within {READY_DEADLINE_S:g} s: {names}{hint}\n{logs}'
@@ -227,7 +223,9 @@ class RunWatch:
 
     def _catch_up(self) -> None:
         """Wait until the recorder has told of all that was published, and say what is missing."""
-        deadline = time.monotonic() + CATCH_UP_DEADLINE_S
+        # The middleware sends again what got lost on the way to a recorder that was held up, with
+        # its own settings every 3 s.
+        deadline = time.monotonic() + 10.0
         while not self._over and time.monotonic() < deadline and any(
             axis.unheard for axis in self._axes.values()
         ):

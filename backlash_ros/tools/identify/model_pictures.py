@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.identification.uncertainty import response, response_std, root_covariances
-from backlash_ros.tools.figures import COLOURS, label, legend_above, new_figure
+from backlash_ros.tools.figures import HUES, label, legend_above, new_figure
 
 Array = NDArray[np.float64]
 
@@ -36,8 +36,8 @@ def draw_poles(found: Identification, details: Details) -> Figure:
         circle = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 720))
         axes.plot(circle.real, circle.imag, color='#777777', linewidth=0.8)
         for roots, spreads, mark, colour, name in (
-            (poles, pole_spreads, 'x', COLOURS['c_r'], 'poles'),
-            (zeros, zero_spreads, 'o', COLOURS['m'], 'zeros'),
+            (poles, pole_spreads, 'x', HUES['c_r'], 'poles'),
+            (zeros, zero_spreads, 'o', HUES['m'], 'zeros'),
         ):
             axes.plot(roots.real, roots.imag, mark, color=colour, markerfacecolor='none',
                       markersize=8, label=name)
@@ -82,13 +82,13 @@ def draw_bode(found: Identification, details: Details) -> Figure:
     hertz = w / (2.0 * np.pi * found.sample_period)
     size = np.abs(value)
     upper.fill_between(hertz, size * np.maximum(1.0 - spread, 1e-3), size * (1.0 + spread),
-                       color=COLOURS['m'], alpha=0.25, linewidth=0)
-    upper.loglog(hertz, size, color=COLOURS['m'])
+                       color=HUES['m'], alpha=0.25, linewidth=0)
+    upper.loglog(hertz, size, color=HUES['m'])
     phase = np.degrees(np.unwrap(np.angle(value)))
     turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))
-    lower.fill_between(hertz, phase - turn, phase + turn, color=COLOURS['m'], alpha=0.25,
+    lower.fill_between(hertz, phase - turn, phase + turn, color=HUES['m'], alpha=0.25,
                        linewidth=0)
-    lower.semilogx(hertz, phase, color=COLOURS['m'])
+    lower.semilogx(hertz, phase, color=HUES['m'])
     for axes in (upper, lower):
         for edge in (found.frequencies[0], found.frequencies[-1]):
             axes.axvline(edge / (2.0 * np.pi * found.sample_period), color='#444444',

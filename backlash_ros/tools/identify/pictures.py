@@ -13,8 +13,8 @@ from backlash_ros.core.identification.identification import Details, Identificat
 from backlash_ros.core.identification.order_selection import gives_way
 from backlash_ros.core.identification.uncertainty import autocorrelation
 from backlash_ros.tools.figures import (
-    COLOURS,
-    TIME,
+    HUES,
+    TIME_LABEL,
     curve,
     label,
     legend_above,
@@ -29,7 +29,7 @@ from backlash_ros.tools.page import Picture
 Array = NDArray[np.float64]
 
 LAGS = 60  # of the autocorrelation
-MEASURED, SIMULATED, RESIDUAL = COLOURS['y'], COLOURS['u_d'], COLOURS['e']
+MEASURED, SIMULATED, RESIDUAL = HUES['y'], HUES['u_d'], HUES['e']
 ORDER_COLOURS = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#56B4E9', '#332288')
 LOOP_POINTS = 4000  # samples that the curves over v show
 
@@ -99,7 +99,7 @@ def draw_held_out(found: Identification, details: Details) -> Figure:
     zero_line(lower)
     share = 1.0 - details.held_out.rms / max(float(np.nanstd(y)), 1e-300)
     label(upper, f'{share:.2%} of the motion is predicted', 'y')
-    label(lower, '', 'difference', TIME)
+    label(lower, '', 'difference', TIME_LABEL)
     return figure
 
 
@@ -114,7 +114,7 @@ def draw_residual(found: Identification, details: Details) -> Figure:
     t: Array = found.sample_period * np.arange(samples.first, samples.last, dtype=float)
     curve(over_time, t, residual, RESIDUAL, width=0.8)
     zero_line(over_time)
-    label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME)
+    label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME_LABEL)
     known = int(np.isfinite(residual).sum())
     r = autocorrelation(residual, LAGS)[1:]
     bound = SURE / np.sqrt(known)
@@ -151,11 +151,11 @@ def draw_profile(found: Identification, details: Details) -> Figure:
     rms = np.sqrt(details.profile.squares / max(details.profile.best.rows, 1))
     close = np.abs(gaps - found.gap) <= 0.21 * found.gap
     for axes, chosen in ((whole, np.full(len(gaps), True)), (near, close)):
-        axes.plot(gaps[chosen], rms[chosen], '.-', color=COLOURS['m'], markersize=4)
-        axes.axvline(found.gap, color=COLOURS['c_r'], linewidth=1.0)
+        axes.plot(gaps[chosen], rms[chosen], '.-', color=HUES['m'], markersize=4)
+        axes.axvline(found.gap, color=HUES['c_r'], linewidth=1.0)
     whole.set_yscale('log')
     std = found.std['gap']
-    near.axvspan(found.gap - SURE * std, found.gap + SURE * std, color=COLOURS['c_r'], alpha=0.2,
+    near.axvspan(found.gap - SURE * std, found.gap + SURE * std, color=HUES['c_r'], alpha=0.2,
                  linewidth=0)
     label(whole, 'Over the swing of v', 'RMS of the residual', 'gap [v]')
     label(near, f'Near {found.gap:.4g} ± {std:.2g}', '', 'gap [v]')
@@ -205,13 +205,13 @@ def draw_loop(found: Identification, details: Details) -> Figure:
     figure = new_figure(4.6)
     left, right = figure.subplots(1, 2)
     v = details.samples.v[-LOOP_POINTS:]
-    left.plot(v, details.samples.whole_y[-LOOP_POINTS:], color=COLOURS['y'], linewidth=0.8)
+    left.plot(v, details.samples.whole_y[-LOOP_POINTS:], color=HUES['y'], linewidth=0.8)
     label(left, 'As measured', 'y', 'v')
     u = found.m * (details.fit.play.p[-LOOP_POINTS:] - found.c_r)
     right.plot(v, u, color='#222222', linewidth=1.2, label='u', zorder=3)
     ends = np.array([v.min(), v.max()])
     for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):
-        right.plot(ends, found.m * (ends - value), color=COLOURS[name], linewidth=4.0, alpha=0.5,
+        right.plot(ends, found.m * (ends - value), color=HUES[name], linewidth=4.0, alpha=0.5,
                    label=f'{name} = {value:.4g}')
     label(right, 'As found', 'u', 'v')
     right.legend(frameon=False, loc='upper left', fontsize=10)

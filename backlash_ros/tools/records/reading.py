@@ -8,17 +8,17 @@ from pathlib import Path
 
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import record_of, record_of_samples
-from backlash_ros.tools.cli import WHOLE, InputError, Span
+from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.records.columns import choose_columns, unit_of
 from backlash_ros.tools.records.table import Table, read_table
-from backlash_ros.tools.runs.files import RECORD, SAMPLES
+from backlash_ros.tools.runs.files import RECORD_FILE, SAMPLES_FILE
 
 NO_TABLES = ('.npz', '.mcap', '.db3', '.zstd', '.zst')  # files of results and bags
 NO_COLUMNS: Mapping[str, str] = {}
 
 
 def read_record(
-    path: Path, period: float | None = None, span: Span = WHOLE, axis: str = '',
+    path: Path, period: float | None = None, span: Span = WHOLE_SPAN, axis: str = '',
     columns: Mapping[str, str] = NO_COLUMNS,
 ) -> Record:
     """Read a table (CSV or the like, Parquet), a folder of results or a bag.
@@ -30,7 +30,7 @@ def read_record(
         raise InputError(f'{path}: does not exist')
     try:
         record = _read(path, period, axis, columns)
-        record = record if span == WHOLE else record.between(span.from_s, span.to_s)
+        record = record if span == WHOLE_SPAN else record.between(span.from_s, span.to_s)
     except RecordError as error:
         raise InputError(f'{path}: {error}') from None
     return replace(record, source=str(path))
@@ -50,10 +50,10 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
     bag = find_bag(path)
     if bag is not None:
         return read_bag_record(bag, period, axis, columns)
-    if path.is_dir() and not any((path / name).is_file() for name in (RECORD, SAMPLES)):
+    if path.is_dir() and not any((path / name).is_file() for name in (RECORD_FILE, SAMPLES_FILE)):
         raise InputError(
-            f'{path}: holds no bag, no {RECORD} and no {SAMPLES}: give one of them, or a table '
-            'with t, v and y'
+            f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}: give one of them, or a '
+            'table with t, v and y'
         )
     run = read_run(path).record
     if not run.samples:

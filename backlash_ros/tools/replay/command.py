@@ -93,8 +93,8 @@ def _opened(
 ) -> tuple[RunRecord, Parameters, Sequence[Sequence[float]]]:
     """The run, the parameters with which it is to be replayed, and what its driver reported."""
     from backlash_ros.tools.records.reading import is_table
-    from backlash_ros.tools.runs.files import SAMPLES
-    if is_table(path) and path.name != SAMPLES:
+    from backlash_ros.tools.runs.files import SAMPLES_FILE
+    if is_table(path) and path.name != SAMPLES_FILE:
         return _logged(path, options, span)
     from backlash_ros.tools.runs.source import read_run
     source = read_run(path.resolve(), options.config, span, options.axis)
@@ -181,16 +181,15 @@ def _one(job: _Job, out: Path | None) -> None:
     from backlash_ros.atomic_file import write_atomically
     from backlash_ros.tools.figures import png
     from backlash_ros.tools.replay.replay_figure import draw_replay
-    from backlash_ros.tools.report import PAGE, write_report
-    from backlash_ros.tools.runs.files import result_directory
-    from backlash_ros.tools.runs.run import Run
+    from backlash_ros.tools.report import REPORT_PAGE, write_report
+    from backlash_ros.tools.runs.files import Run, result_directory
     directory = result_directory(out)
     summary = write_report(Run(replayed, parameters), directory)
     write_atomically(directory / FIGURE, png(draw_replay(recorded, replayed)))
     print(format_table(('', 'run', 'replay', '±'), _compared(recorded, summary)))
     print(_states(replayed) if isnan(recorded.column('m')[-1]) else _parted(recorded, replayed))
     print(directory / FIGURE)
-    print(directory / PAGE)
+    print(directory / REPORT_PAGE)
 
 
 def _compared(recorded: RunRecord, summary: Mapping[str, Any]) -> list[tuple[str, ...]]:

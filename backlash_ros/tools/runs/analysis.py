@@ -18,14 +18,11 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import delayed_reference, delayed_tracking_error_rms
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.cli import BrokenOffError, InputError
-from backlash_ros.tools.runs.run import run_loop
+from backlash_ros.tools.runs.source import run_loop
 from backlash_ros.tools.runs.summary import reference_delay
 
 Array = NDArray[np.float64]
 
-LONGEST_COMPARISON = 10_000  # samples for which the other laws are simulated
-# RMS of the error over that of the reference below which y counts as following it.
-FOLLOWING = 0.5
 
 
 @dataclass(frozen=True)
@@ -112,9 +109,9 @@ def moving_rms(values: Array, samples: int) -> Array:
 
 
 def compared_samples(run: RunRecord) -> int:
-    """For how many samples the laws are compared: the run with its lost ones, if not too long."""
+    """For how many samples the laws are compared: the run with its lost ones, 10,000 at most."""
     length = round(float(run.column('t')[-1]) / run.sample_period) + 1
-    return min(length, LONGEST_COMPARISON)
+    return min(length, 10_000)
 
 
 def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
@@ -149,7 +146,7 @@ def followed_reference(run: RunRecord, parameters: Parameters | None) -> Followe
     error = delayed_tracking_error_rms(run, delay, half)
     return FollowedReference(
         delayed_reference(run, delay), delay * run.sample_period,
-        error is not None and error < FOLLOWING,
+        error is not None and error < 0.5,  # of the RMS of the reference
     )
 
 

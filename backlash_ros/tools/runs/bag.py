@@ -14,23 +14,20 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.bags.reading import CURE, BagError, BagReader, Topic
+from backlash_ros.bags.reading import REPAIR_COMMAND, BagError, BagReader, Topic
 from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.cli import WHOLE, InputError, Span
-from backlash_ros.tools.runs.run import Run
+from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
+from backlash_ros.tools.runs.files import Run
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
-ARRAY, NUMBER = 'std_msgs/msg/Float64MultiArray', 'std_msgs/msg/Float64'
-MODEL_LABELS = ('numerator', 'denominator', 'delay_samples')  # by which a renamed one is known
-LABELS = {
+# By which a topic is known whose node was renamed.
+ARRAY_LABELS = {
     topics.SIGNALS: topics.SIGNAL_LABELS, topics.ESTIMATES: topics.ESTIMATE_LABELS,
-    topics.TRUTH: topics.TRUTH_LABELS, topics.MODEL: MODEL_LABELS,
+    topics.TRUTH: topics.TRUTH_LABELS, topics.MODEL: ('numerator', 'denominator', 'delay_samples'),
 }
-# Share of the rows at which the count falls back; more is no restart but two nodes at once.
-LARGEST_RESTART_SHARE = 0.1
 
 
 @dataclass
@@ -76,7 +73,7 @@ class Table:
 
 
 def read_bag(
-    path: Path, sample_period: float | None = None, span: Span = WHOLE, axis: str = '',
+    path: Path, sample_period: float | None = None, span: Span = WHOLE_SPAN, axis: str = '',
 ) -> Run:
     """Read the run that a bag holds; nothing is said about its parameters.
 
@@ -85,9 +82,9 @@ def read_bag(
     restarted, it is what the last one did within the span. axis: of several, '' for the first.
     Raises InputError, in one line, for a bag that cannot be read or holds no run.
     """
-    content = read_topics(path, lambda topic: topic.message_type == ARRAY and any(
-        last_part(topic.name) == last_part(name) for name in LABELS
-    ))
+    wanted = set(map(last_part, ARRAY_LABELS))
+    content = read_topics(path, lambda topic: last_part(topic.name) in wanted
+                          and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
         tables, models, notes = _find_tables(path, content, axis)
     except InputError as error:
@@ -159,7 +156,7 @@ def read_topics(path: Path, wanted: Callable[[Topic], bool]) -> Content:
         content.damage = (
             f'{path} {reader.damage or "is damaged"}: this is what is left, {count} messages of '
             f'{max(last - first, 0) * 1e-9:.1f} s{unread}; once it is not being recorded any more, '
-            f'`{CURE} {path}` completes it'
+            f'`{REPAIR_COMMAND} {path}` completes it'
         )
     for messages in content.messages.values():
         messages.sort(key=lambda each: each[0])
@@ -172,7 +169,7 @@ def read_reports(path: Path, y: Array, axis: str = '') -> list[list[float]]:
     y (N,): outputs of the run, by whose values they are found among the messages. Empty where the
     bag holds no applied_control, or the outputs are not all there. Raises InputError.
     """
-    content = read_topics(path, lambda topic: topic.message_type == NUMBER)
+    content = read_topics(path, lambda topic: topic.message_type == 'std_msgs/msg/Float64')
     chosen: list[list[tuple[int, Any]]] = []
     for topic in (topics.PLANT_OUTPUT, topics.APPLIED_CONTROL):
         names = sorted(name for name in content.messages if f'/{name}'.endswith(f'/{topic}'))
@@ -221,7 +218,7 @@ def _find_tables(
     if joint:
         notes.append(note)
         axis = ''
-    for topic, labels in LABELS.items():
+    for topic, labels in ARRAY_LABELS.items():
         name, note = choose_namespace(_names_of(content, topic, labels), axis)
         if topic == topics.SIGNALS and note:
             notes.append(note)
@@ -314,7 +311,8 @@ def _choose_section(tables: dict[str, Table], span: Span) -> str:
     signals = tables[topics.SIGNALS]
     restarts = np.flatnonzero(np.diff(signals.sample) <= 0) + 1
     note = ''
-    if restarts.size > LARGEST_RESTART_SHARE * len(signals.stamps):
+    # Where the count falls back that often, two nodes are at work.
+    if restarts.size > 0.1 * len(signals.stamps):
         note = 'two controllers published at once: the first row of each sample is used'
     elif restarts.size:
         cut_ns = float(signals.stamps[restarts[-1]])

@@ -1,4 +1,4 @@
-"""The files of a run: its folder, samples.csv, record.npz, summary.json."""
+"""A run, and its files: its folder, samples.csv, record.npz, summary.json."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import io
 import json
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from itertools import count
 from math import isfinite
@@ -14,21 +15,49 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from backlash_ros.atomic_file import point_link, write_atomically
 from backlash_ros.core.loop.learned_model import from_fields
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.cli import InputError
+from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 
-RESULTS = Path('results')
-LATEST = 'latest'
-SAMPLES, RECORD, SUMMARY, CONFIG = 'samples.csv', 'record.npz', 'summary.json', 'parameters.yaml'
-LEARNED = 'learned.'  # before the names of what record.npz has of G
+SAMPLES_FILE, RECORD_FILE, SUMMARY_FILE = 'samples.csv', 'record.npz', 'summary.json'
+CONFIG_FILE = 'parameters.yaml'
 SAMPLE_COLUMNS = (
     't', 'y_m', 'y', 'u_d', 'v', 'u', 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
     'status',
 )
-FEWEST_COLUMNS = 10  # samples.csv once ended with f
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that was simulated or recorded.
+
+    parameters: None where no parameters.yaml stands beside it. latency_s: from the departure of
+    y(k) at the driver to that of v(k) at the controller, shape (N,), nan where unknown; None for
+    a simulation. notes: what the user has to know about the source, a sentence each.
+    """
+
+    record: RunRecord
+    parameters: Parameters | None
+    latency_s: NDArray[np.float64] | None = None
+    notes: tuple[str, ...] = ()
+
+
+def cut(record: RunRecord, span: Span) -> RunRecord:
+    """The rows within the span, their time counted from the first one; raises InputError."""
+    if span == WHOLE_SPAN:
+        return record
+    t = record.column('t')
+    rows = record.rows[(t >= span.from_s) & (t < span.to_s)].copy()
+    if not len(rows):
+        raise InputError('there is no sample between --from and --to')
+    rows[:, COLUMNS.index('t')] -= rows[0, COLUMNS.index('t')]
+    # G is recorded as it was believed at the end.
+    learned = record.learned if t[-1] < span.to_s else None
+    return RunRecord(rows, record.sample_period, record.lost_samples, learned)
 
 
 def result_directory(out: Path | None) -> Path:
@@ -39,16 +68,17 @@ def result_directory(out: Path | None) -> Path:
     if out is not None:
         _make(out)
         return out
-    _make(RESULTS)
+    results = Path('results')
+    _make(results)
     # Two runs within one second need two names.
     name = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H-%M-%SZ')
     for number in count(1):
-        directory = RESULTS / (name if number == 1 else f'{name}-{number}')
+        directory = results / (name if number == 1 else f'{name}-{number}')
         try:
             directory.mkdir()
         except FileExistsError:
             continue
-        point_link(RESULTS / LATEST, directory.name)
+        point_link(results / 'latest', directory.name)
         break
     return directory
 
@@ -92,17 +122,17 @@ def _cell(value: object) -> str:
 def write_run(run: RunRecord, directory: Path) -> None:
     """Write samples.csv for everyone, and record.npz with all that `report` can draw."""
     columns = [run.column(name) for name in SAMPLE_COLUMNS]
-    write_table(directory / SAMPLES, SAMPLE_COLUMNS, np.column_stack(columns).tolist())
+    write_table(directory / SAMPLES_FILE, SAMPLE_COLUMNS, np.column_stack(columns).tolist())
     learned = run.learned.fields() if run.learned is not None else {}
     arrays: dict[str, Any] = {
-        f'{LEARNED}{label}': np.array(values) for label, values in learned.items()
+        f'learned.{label}': np.array(values) for label, values in learned.items()
     }
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer, columns=np.array(COLUMNS), rows=run.rows, sample_period=run.sample_period,
         lost_samples=run.lost_samples, **arrays,
     )
-    write_atomically(directory / RECORD, buffer.getvalue())
+    write_atomically(directory / RECORD_FILE, buffer.getvalue())
 
 
 def read_record(path: Path) -> RunRecord:
@@ -114,8 +144,8 @@ def read_record(path: Path) -> RunRecord:
                 if name in COLUMNS:
                     rows[:, COLUMNS.index(name)] = column
             fields = {
-                name.removeprefix(LEARNED): stored[name].tolist()
-                for name in stored.files if name.startswith(LEARNED)
+                name.removeprefix('learned.'): stored[name].tolist()
+                for name in stored.files if name.startswith('learned.')
             }
             return RunRecord(
                 rows, float(stored['sample_period']), int(stored['lost_samples']),
@@ -135,7 +165,8 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
             header, *lines = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f'{path}: cannot be read: {error}') from None
-    if tuple(header) not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:FEWEST_COLUMNS]):
+    # It once ended with f.
+    if tuple(header) not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:10]):
         raise InputError(f'{path}: line 1: must be the header {",".join(SAMPLE_COLUMNS)}')
     if not lines:
         raise InputError(f'{path}: holds no sample')

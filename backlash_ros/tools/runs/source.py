@@ -1,23 +1,35 @@
-"""Any run: a bag, a folder of results, record.npz or samples.csv, with what stands beside it."""
+"""Where runs come from: bags and folders of results, with what stands beside them; simulation."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from backlash_ros.bags.reading import is_bag
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.cli import WHOLE, InputError, Span
+from backlash_ros.core.simulation.closed_loop import ClosedLoop
+from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
 from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs.bag import read_bag
-from backlash_ros.tools.runs.files import CONFIG, RECORD, SAMPLES, read_record, read_samples
-from backlash_ros.tools.runs.run import Run, cut
+from backlash_ros.tools.runs.files import (
+    CONFIG_FILE,
+    RECORD_FILE,
+    SAMPLES_FILE,
+    Run,
+    cut,
+    read_record,
+    read_samples,
+)
 
 BAG = 'bag'  # folder of the bag within the results
 
 
 def read_run(
-    path: Path, config: Path | None = None, span: Span = WHOLE, axis: str = '',
+    path: Path, config: Path | None = None, span: Span = WHOLE_SPAN, axis: str = '',
 ) -> Run:
     """Read a run; raises InputError.
 
@@ -33,17 +45,17 @@ def read_run(
     if bag is not None:
         return replace(read_bag(bag, period, span, axis), parameters=parameters)
     if path.is_dir():
-        files = [path / name for name in (RECORD, SAMPLES) if (path / name).is_file()]
+        files = [path / name for name in (RECORD_FILE, SAMPLES_FILE) if (path / name).is_file()]
         if not files:
-            raise InputError(f'{path}: holds no bag, no {RECORD} and no {SAMPLES}')
+            raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
         path = files[0]
     if path.suffix == '.npz':
         return Run(cut(read_record(path), span), parameters)
     if path.suffix == '.csv':
         return Run(cut(read_samples(path, period), span), parameters)
     raise InputError(
-        f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of results, {RECORD} '
-        f'or {SAMPLES}'
+        f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of results, '
+        f'{RECORD_FILE} or {SAMPLES_FILE}'
     )
 
 
@@ -58,11 +70,27 @@ def _parameters(path: Path, config: Path | None, axis: str) -> Parameters | None
     if is_bag(path):
         # A bag lies in the folder of the results to which the parameters belong.
         places.append(places[0].parent)
-    files = [config] if config else [file for place in places if (file := place / CONFIG).is_file()]
-    if not files:
+    files = [config] if config else [place / CONFIG_FILE for place in places]
+    file = next((file for file in files if config or file.is_file()), None)
+    if file is None:
         return None
-    configuration = read_configuration(files[0])
+    configuration = read_configuration(file)
     known = configuration.axes or configuration.joints
     if axis not in known:
         axis = configuration.joints[0] if configuration.joints else ''
     return configuration.parameters(axis)
+
+
+def run_loop(
+    loop: ClosedLoop, samples: int, on_sample: Callable[[int], None] | None = None,
+) -> RunRecord:
+    """Simulate a run; raises BrokenOffError when its signals grow beyond every number."""
+    try:
+        # The controller refuses what is not finite: numpy need not say so as well.
+        with np.errstate(over='ignore', invalid='ignore', divide='ignore'):
+            return loop.run(samples, on_sample)
+    except OverflowError as error:
+        raise BrokenOffError('the run broke off: a signal grew beyond every number') from error
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
+        reason = ' '.join(str(error).split())
+        raise BrokenOffError(f'the run broke off: {reason}') from error

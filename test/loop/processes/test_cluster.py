@@ -16,7 +16,7 @@ from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.tools import cluster as tools_cluster
 from backlash_ros.tools.bringup.environment import with_source
-from backlash_ros.tools.simulate import SEEDS, main
+from backlash_ros.tools.simulate import main
 
 HERE = '127.0.0.1'
 RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
@@ -93,7 +93,7 @@ def test_a_killed_worker_loses_no_run_and_no_bit_and_another_numpy_is_refused(
 ) -> None:
     wait_until(cluster.is_whole, 'the workers')  # simulate does so for 10 s only
     with monkeypatch.context() as other:
-        other.setattr(tools_cluster, 'NUMERICS', ('numpy',))
+        other.setattr(tools_cluster, 'version', lambda name: '0.1')
         assert main([*RUNS, '--cluster', cluster.address]) == 2
     assert 'install the same versions' in capsys.readouterr().err
     remote, local = tmp_path / 'remote', tmp_path / 'local'
@@ -112,4 +112,4 @@ def test_a_killed_worker_loses_no_run_and_no_bit_and_another_numpy_is_refused(
         simulation.kill()
         simulation.wait()
     assert simulation.returncode == 0, said
-    assert (remote / SEEDS).read_bytes() == (local / SEEDS).read_bytes()
+    assert (remote / 'seeds.csv').read_bytes() == (local / 'seeds.csv').read_bytes()

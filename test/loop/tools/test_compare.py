@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.compare import HEADER, compare, contenders, main
+from backlash_ros.tools.compare import COMPARISON_HEADER, compare, contenders, main
 
 
 def test_document_and_figure_come_from_one_command(
@@ -30,7 +30,7 @@ def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_learned_backlash_costs_less_than_an_uncompensated_one() -> None:
     merits = {
-        result.contender.name: dict(zip(HEADER[1:], result.merits, strict=True))
+        result.contender.name: dict(zip(COMPARISON_HEADER[1:], result.merits, strict=True))
         for result in compare(Parameters(), 400)
     }
     learned, plain = merits['moving_horizon, tracking'], merits['no compensation, tracking']

@@ -20,7 +20,7 @@ def test_missing_scheduler_is_told_in_one_line(
     address: str, cure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
 ) -> None:
     pytest.importorskip('distributed')
-    monkeypatch.setattr(tools_cluster, 'ANSWER_S', 0.3)
+    monkeypatch.setattr(tools_cluster, 'CLUSTER_ANSWER_S', 0.3)
     assert main([*RUNS, '--cluster', address]) == 2
     said = capsys.readouterr().err
     assert said.count('\n') == 1
