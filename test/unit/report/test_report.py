@@ -21,8 +21,7 @@ from backlash_ros.tools.cli import InputError, Span
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs import analysis
 from backlash_ros.tools.runs.bag import read_bag
-from backlash_ros.tools.runs.files import write_run, write_summary
-from backlash_ros.tools.runs.run import Run
+from backlash_ros.tools.runs.files import Run, write_run, write_summary
 from backlash_ros.tools.runs.source import read_run
 from backlash_ros.tools.runs.summary import summarise
 

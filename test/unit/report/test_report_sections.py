@@ -17,7 +17,7 @@ from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import Span
 from backlash_ros.tools.runs.bag import read_bag
-from backlash_ros.tools.runs.run import Run
+from backlash_ros.tools.runs.files import Run
 from backlash_ros.tools.runs.source import read_run
 
 PERIOD_NS = 10_000_000
