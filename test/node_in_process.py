@@ -32,7 +32,7 @@ from backlash_ros.core.loop.sample_counter import JointOutputs, Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
-from backlash_ros.nodes.runtime.prompt_executor import make_executor
+from backlash_ros.nodes.runtime.executor import make_executor
 from backlash_ros.tools.bringup.environment import free_domain
 
 START_NS = 1_800_000_000_000_000_000

@@ -30,15 +30,13 @@ from backlash_ros.core.driver_check.gentle_drive import Drive, GentleDrive, Rang
 from backlash_ros.core.driver_check.motion import record_of
 from backlash_ros.core.driver_check.verdict import all_fit, judge, table
 from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.nodes.control.last_command_sender import CONFIRMED_WITHIN_S
-from backlash_ros.nodes.diagnostics.presence import Presence
-from backlash_ros.nodes.diagnostics.rivals import identity_made_by
+from backlash_ros.nodes.control.last_commands import CONFIRMED_WITHIN_S
+from backlash_ros.nodes.control.rivals import Presence, identity_made_by
 from backlash_ros.nodes.driver_check.driver_graph import DriverGraph
 from backlash_ros.nodes.driver_check.options import EXECUTABLE, parameter_files, parse_options
-from backlash_ros.nodes.runtime.arguments import ros_arguments
+from backlash_ros.nodes.runtime.executor import NodeExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH
-from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
-from backlash_ros.nodes.runtime.spin import ProcessNode, run
+from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 from backlash_ros.shipped import find_config
 

@@ -34,17 +34,15 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import CONTROLLER, JOINTS
 from backlash_ros.nodes.control.joint import Joint
-from backlash_ros.nodes.control.last_command_sender import LastCommandSender
-from backlash_ros.nodes.control.reports import Reports
+from backlash_ros.nodes.control.last_commands import LastCommandSender
+from backlash_ros.nodes.control.publishing import StepPublisher
+from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.control.services import offer_services
-from backlash_ros.nodes.control.step_publisher import StepPublisher
-from backlash_ros.nodes.diagnostics.rivals import RivalWatch
-from backlash_ros.nodes.runtime.declare import LiveParameters
-from backlash_ros.nodes.runtime.driver_io import DriverIo
-from backlash_ros.nodes.runtime.events import emit
+from backlash_ros.nodes.runtime.driver_io import DriverIo, Reports
 from backlash_ros.nodes.runtime.lifecycle import ManagedNode
-from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT, stamp_ns_of
-from backlash_ros.nodes.runtime.spin import run
+from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, stamp_ns_of
+from backlash_ros.nodes.runtime.parameters import LiveParameters
+from backlash_ros.nodes.runtime.process import emit, run
 
 # Share of a period for which the controller sleeps after the command: on a busy processor the
 # driver, woken by the command, would have to wait for it otherwise.
@@ -98,7 +96,7 @@ class ControllerNode(ManagedNode):
         self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         self._reference = self._io.listen_to_references(
-            self._on_reference, KEPT if self._lockstep else 1
+            self._on_reference, KEPT_QOS if self._lockstep else 1
         )
         # The first command begins with what the driver reports, even if it is not learned from.
         self._reports = None if self._lockstep else Reports(self, self._io, p.joint_names)
@@ -108,7 +106,7 @@ class ControllerNode(ManagedNode):
             for joint in p.joint_names
         ]
         if self._lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
+            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         offer_services(self, self)
         self._live = LiveParameters(
             self, p, self._check_change, self._take_up, lambda: self.loops is None
@@ -416,12 +414,12 @@ def _check_style(p: Parameters) -> None:
     style = p.io.style
     if p.lockstep and style != 'native':
         raise ParameterError('lockstep', True, 'needs io.style: native')
-    if p.joint_names and style == 'native':
+    if p.joints and style == 'native':
         raise ParameterError(
             'io.style', style, 'has messages for one joint only',
             'set joint_state_topic or ros2_control',
         )
-    if style == 'joint_state_topic' and not (p.joint_names or p.io.joint):
+    if style == 'joint_state_topic' and not (p.joints or p.io.joint):
         raise ParameterError(JOINTS, (), 'is empty', f'name them, io.style is {style}')
 
 

@@ -13,8 +13,7 @@ from backlash_ros import topics
 from backlash_ros.core.driver_check.findings import Message
 from backlash_ros.core.driver_check.gentle_drive import Drive, IdentificationDrive, Range
 from backlash_ros.nodes.check_driver import CheckDriverNode
-from backlash_ros.nodes.runtime.arguments import ros_arguments
-from backlash_ros.nodes.runtime.spin import run
+from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED
 
 EXECUTABLE = 'identify'

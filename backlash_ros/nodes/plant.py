@@ -19,23 +19,23 @@ from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import PLANT
 from backlash_ros.core.scenario import build_plant
-from backlash_ros.nodes.runtime.declare import LiveParameters
-from backlash_ros.nodes.runtime.events import emit
+from backlash_ros.nodes.runtime.executor import NodeExecutor
 from backlash_ros.nodes.runtime.messages import (
     DEPTH,
     DIAGNOSTICS_PERIOD_S,
-    KEPT,
+    KEPT_QOS,
     DiagnosticsPublisher,
     LabelledArrayPublisher,
     arrival_ns,
     clock_message,
 )
-from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
-from backlash_ros.nodes.runtime.spin import ProcessNode, run, spin_paced
+from backlash_ros.nodes.runtime.parameters import LiveParameters
+from backlash_ros.nodes.runtime.process import ProcessNode, emit, run, spin_paced
 
 # Share of a period after which it is too late to publish an output: it would look like the next.
-LATEST = 0.75
-LATE, MISSED, NOT_FINITE = 'late controls', 'missed outputs', 'non-finite controls dropped'
+LATEST_SHARE = 0.75
+LATE_CONTROLS, MISSED_OUTPUTS = 'late controls', 'missed outputs'
+BAD_CONTROLS = 'non-finite controls dropped'
 
 
 class PlantNode(ProcessNode):
@@ -68,7 +68,7 @@ class PlantNode(ProcessNode):
         self._latest_ns = 0
         self._outputs = 0  # published
         self._newest = 0  # samples up to the newest of these outputs
-        self._counts = {LATE: 0, MISSED: 0, NOT_FINITE: 0}
+        self._counts = {LATE_CONTROLS: 0, MISSED_OUTPUTS: 0, BAD_CONTROLS: 0}
         self._lately = Lately()
         self._truth_rows: list[tuple[float, ...]] = []
         self._output_message, self._applied_message = Float64(), Float64()
@@ -79,7 +79,7 @@ class PlantNode(ProcessNode):
         )
         self._diagnostics = DiagnosticsPublisher(self, 'simulated plant')
         if self._lockstep:
-            self._time = self.create_publisher(Clock, topics.CLOCK, KEPT)
+            self._time = self.create_publisher(Clock, topics.CLOCK, KEPT_QOS)
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
         LiveParameters(self, p, build_plant, self._take_up)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
@@ -131,7 +131,7 @@ class PlantNode(ProcessNode):
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
         v = message.data
         if not isfinite(v):
-            self._counts[NOT_FINITE] += 1
+            self._counts[BAD_CONTROLS] += 1
             return
         self._held.take(v, arrival_ns(info['received_timestamp']))
         self._heard = True
@@ -152,10 +152,10 @@ class PlantNode(ProcessNode):
         """Real time: simulate up to this tick and publish y; return whether to go on."""
         passed = tick - self._tick
         if self._expecting and self._heard:
-            self._counts[LATE] += 1
-        self._counts[MISSED] += max(passed - 1, 0)
+            self._counts[LATE_CONTROLS] += 1
+        self._counts[MISSED_OUTPUTS] += max(passed - 1, 0)
         self._tick = tick
-        self._latest_ns = due_ns + int(LATEST * self._sample_period * 1e9)
+        self._latest_ns = due_ns + int(LATEST_SHARE * self._sample_period * 1e9)
         # Of the intervals that ended while the process was held up, some were over before v came.
         for missed in reversed(range(passed)):
             # All that has come so far came within the newest interval.
@@ -187,7 +187,7 @@ class PlantNode(ProcessNode):
         if self._lockstep:
             self._time.publish(clock_message(round(sample * self._sample_period * 1e9)))
         elif time.monotonic_ns() > self._latest_ns:
-            self._counts[MISSED] += 1
+            self._counts[MISSED_OUTPUTS] += 1
             return False
         self._expecting = True
         self._output.publish(self._output_message)
@@ -221,9 +221,9 @@ class PlantNode(ProcessNode):
 def _finding(lately: dict[str, int]) -> Finding:
     """What the counts of the last few seconds say."""
     samples = max(lately['samples'], 1)
-    late, missed = lately[LATE] / samples, lately[MISSED] / samples
-    if lately[NOT_FINITE]:
-        text = f'{lately[NOT_FINITE]} {topics.CONTROL} messages lately were no finite number: ' \
+    late, missed = lately[LATE_CONTROLS] / samples, lately[MISSED_OUTPUTS] / samples
+    if lately[BAD_CONTROLS]:
+        text = f'{lately[BAD_CONTROLS]} {topics.CONTROL} messages lately were no finite number: ' \
                'the old one holds'
         return Finding(Level.WARN, 'bad controls', text)
     if missed > TROUBLE:

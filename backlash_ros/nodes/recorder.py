@@ -7,7 +7,9 @@ import shutil
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from math import nan
 from pathlib import Path
@@ -15,6 +17,8 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
+from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
@@ -23,22 +27,91 @@ from backlash_ros.bags.reading import REPAIR_COMMAND
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.bags.writer import Bag, RecordingError
 from backlash_ros.core.loop.figures import Finding, Level
+from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters.table import RECORDER
-from backlash_ros.nodes.recording.channel import Channel
-from backlash_ros.nodes.recording.progress import Progress
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
-from backlash_ros.nodes.runtime.events import ENABLED, emit
+from backlash_ros.nodes.runtime.executor import NodeExecutor
 from backlash_ros.nodes.runtime.messages import (
     DIAGNOSTICS_PERIOD_S,
-    KEPT,
+    KEPT_QOS,
     DiagnosticsPublisher,
     stamp_ns_of,
 )
-from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
-from backlash_ros.nodes.runtime.spin import ProcessNode, run
+from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, run
 from backlash_ros.options import BAD_INPUT, FAILED
 
-DEPTH = 10_000  # messages that may wait while the disk is slow
+
+@dataclass
+class Channel:
+    """A recorded topic: what came in, and how many messages were missed on the way."""
+
+    topic: str
+    several_publishers: bool
+    name: str = ''  # with namespace and remappings, as it is recorded
+    connection: Connection | None = None
+    received: int = 0
+    recorded: int = 0
+    missed: int = 0
+    sequence: int = UNNUMBERED
+
+    def count(self, sequence: int) -> None:
+        """Take note of a message."""
+        self.received += 1
+        if sequence == UNNUMBERED or self.several_publishers:
+            return
+        if self.sequence != UNNUMBERED and sequence > self.sequence + 1:
+            self.missed += sequence - self.sequence - 1
+        self.sequence = sequence
+
+
+class Progress:
+    """The newest rows, still serialised, and what they say about the run."""
+
+    def __init__(self) -> None:
+        self._estimates = b''
+        self._truth = b''
+        # The truth of a sample follows its signals by one sample.
+        self._signals: deque[bytes] = deque(maxlen=8)
+        self._first = b''
+        self._rows = 0
+
+    def take(self, topic: str, message: bytes) -> None:
+        """Remember a row of one of the array topics."""
+        if topic == topics.ESTIMATES:
+            self._estimates = message
+        elif topic == topics.TRUTH:
+            self._truth = message
+        elif topic == topics.SIGNALS:
+            self._first = self._first or message
+            self._signals.append(message)
+            self._rows += 1
+
+    def report(self) -> dict[str, object]:
+        """Content of a progress event, empty before the first sample."""
+        if not (self._estimates and self._signals):
+            return {}
+        signals = [_row(message, topics.SIGNAL_LABELS) for message in self._signals]
+        first, newest = _row(self._first, topics.SIGNAL_LABELS), signals[-1]
+        estimates = _row(self._estimates, topics.ESTIMATE_LABELS)
+        truth = _row(self._truth, topics.TRUTH_LABELS) if self._truth else {}
+        same = [row for row in signals if row['sample'] == truth.get('sample')]
+        return {
+            'sample': int(min(newest['sample'], estimates['sample'])),
+            'status': int(newest['status']),
+            **{name: estimates[name] for name in (
+                'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
+            )},
+            **{f'true_{name}': truth.get(name) for name in ('m', 'c_r', 'c_l')},
+            'control_error': truth['u'] - same[0]['u_d'] if same else None,
+            'lost': int(newest['sample'] - first['sample']) + 1 - self._rows,
+        }
+
+
+def _row(message: bytes, labels: tuple[str, ...]) -> dict[str, float]:
+    return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=False))
+
+
+RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
 FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that a flush takes
 # Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
 DRAIN_S = 0.3
@@ -84,12 +157,12 @@ class RecorderNode(ProcessNode):
         }
         for topic, message_type in recorded.items():
             # A G that was learned before this recorder came belongs into the bag as well.
-            qos: QoSProfile | int = KEPT if topic == topics.MODEL else DEPTH
+            qos: QoSProfile | int = KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH
             subscription = self._record(topic, message_type, qos)
             if p.wait_for_publishers and topic in wanted:
                 needed.append(subscription)
         if self._lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, DEPTH)
+            self.create_subscription(Clock, topics.CLOCK, self._on_clock, RECORDER_DEPTH)
         if ENABLED:
             self.create_timer(0.2, self._tell, clock=self.steady_clock)
         self.call_when(
@@ -179,7 +252,7 @@ class RecorderNode(ProcessNode):
         return partial(_is_published, subscription)
 
     def _start(self) -> None:
-        qos = output_qos(self.settings, DEPTH)
+        qos = output_qos(self.settings, RECORDER_DEPTH)
         self._record(self._driver.output, self._driver.output_type, qos)
         emit('ready')
 

@@ -13,21 +13,18 @@ from backlash_ros import topics
 from backlash_ros.core.loop.reference_pace import ReferencePace
 from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.table import REFERENCE
+from backlash_ros.core.parameters.table import REFERENCE_NODE
 from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.scenario import build_reference
-from backlash_ros.nodes.runtime.declare import LiveParameters
 from backlash_ros.nodes.runtime.driver_io import DriverIo
-from backlash_ros.nodes.runtime.events import emit
-from backlash_ros.nodes.runtime.inbox import Inbox
-from backlash_ros.nodes.runtime.messages import DEPTH, KEPT, arrival_ns, stamp_ns_of
-from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor
-from backlash_ros.nodes.runtime.spin import ProcessNode, run
+from backlash_ros.nodes.runtime.executor import Inbox, NodeExecutor
+from backlash_ros.nodes.runtime.messages import DEPTH, KEPT_QOS, arrival_ns, stamp_ns_of
+from backlash_ros.nodes.runtime.parameters import LiveParameters
+from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 LONGEST_SLEEP_S = 0.05  # so that signals and requests are noticed
 # The loop runs so long, as the controller tells, before outputs that do not come here are given up.
 UNHEARD_S = 0.5
-SAMPLES = 'samples'  # their count in /diagnostics
 
 
 class ReferenceNode(ProcessNode):
@@ -39,7 +36,7 @@ class ReferenceNode(ProcessNode):
     """
 
     def __init__(self) -> None:
-        super().__init__(REFERENCE)
+        super().__init__(REFERENCE_NODE)
         p = self.settings
         self._signal = build_reference(p)
         self._offset_s = 0.0  # keeps the phase where the frequency changes
@@ -53,7 +50,7 @@ class ReferenceNode(ProcessNode):
         self._loop_runs_at: float | None = None  # when that was seen [s]
         self._message = Float64()
         self._output = self.create_publisher(
-            Float64, topics.REFERENCE, KEPT if self._lockstep else DEPTH
+            Float64, topics.REFERENCE, KEPT_QOS if self._lockstep else DEPTH
         )
         listeners = p.wait_for_subscribers
         self._pace = ReferencePace(
@@ -129,7 +126,7 @@ class ReferenceNode(ProcessNode):
         """Whether the controller of this loop has used any."""
         loop = self.settings.io.joint or self.resolve_topic_name(self._io.topics.control)
         return any(
-            value.key == SAMPLES and value.value != '0'
+            value.key == 'samples' and value.value != '0'
             for status in message.status if status.hardware_id == loop for value in status.values
         )
 
@@ -146,7 +143,7 @@ class ReferenceNode(ProcessNode):
     def _start(self) -> None:
         self._started = True
         if self._lockstep:
-            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT)
+            self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         else:
             self._io.listen(self._on_output, depth=1)
             if self._pace.waits:
@@ -171,7 +168,7 @@ class ReferenceNode(ProcessNode):
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run(REFERENCE, ReferenceNode, args)
+    return run(REFERENCE_NODE, ReferenceNode, args)
 
 
 if __name__ == '__main__':

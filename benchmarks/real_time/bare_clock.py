@@ -11,7 +11,7 @@ import signal
 import sys
 import time
 
-from backlash_ros.nodes.plant import LATEST
+from backlash_ros.nodes.plant import LATEST_SHARE
 
 
 def main() -> None:
@@ -28,7 +28,7 @@ def main() -> None:
             time.sleep(max(due - time.monotonic(), 0.0))
             late = time.monotonic() - due
             longest = max(longest, late)
-            missed += late > LATEST * period_s
+            missed += late > LATEST_SHARE * period_s
     except KeyboardInterrupt:
         print(f'{ticks} periods, {missed} missed, the latest by {1e3 * longest:.1f} ms',
               file=sys.stderr)

@@ -25,7 +25,7 @@ from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.nodes.runtime.prompt_executor import make_executor
+from backlash_ros.nodes.runtime.executor import make_executor
 from real_time.node_processes import (
     DEADLINE_S,
     check_running,

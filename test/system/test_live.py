@@ -14,7 +14,7 @@ from bringup_processes import Session, bringup_sessions, wait_until
 from live_pages import address_of, frames, listening_addresses
 from ros_processes import ros_world
 
-from backlash_ros.nodes.live.node import LABELS
+from backlash_ros.nodes.live.command import LABELS
 
 LOOK_S = 0.02
 MODULE = 'live.command'

@@ -9,10 +9,10 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Parameter
 from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER, JOINTS
 
-MODEL, FILE = 'plant.denominator', 'estimates.file'
+JOINT_MODEL, ESTIMATES_FILE = 'plant.denominator', 'estimates.file'
 # A joint of which nobody has said what it is like: v = y_m, within its limits.
 PASS_THROUGH: dict[str, object] = {
-    'plant.numerator': (1.0,), MODEL: (1.0, 0.0), 'estimator.law': 'fixed',
+    'plant.numerator': (1.0,), JOINT_MODEL: (1.0, 0.0), 'estimator.law': 'fixed',
     'structure': 'proportional', 'proportional.f': 0.0, 'estimator.initial.m': 1.0,
     'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
 }
@@ -60,10 +60,10 @@ def values_of(
             )
     values = {**shared, **own, 'io.joint': joint}
     del values[JOINTS]
-    if MODEL not in values:
+    if JOINT_MODEL not in values:
         values.update(PASS_THROUGH)
-    if values.get(FILE):
-        values[FILE] = file_of(str(values[FILE]), joint)
+    if values.get(ESTIMATES_FILE):
+        values[ESTIMATES_FILE] = file_of(str(values[ESTIMATES_FILE]), joint)
     return values
 
 

@@ -14,7 +14,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 Group = TypeVar('Group')
 
-LARGEST = 1e100  # squares, and products of two, still are numbers
+LARGEST_NUMBER = 1e100  # squares, and products of two, still are numbers
 NAMESPACE = pattern(r'[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # a name that ROS takes for one
 
 
@@ -189,9 +189,9 @@ def _real(parameter: Parameter, value: object) -> float:
         raise ParameterError(parameter.name, '...', 'is too large for a number') from None
     if isnan(number) or not (isfinite(number) or parameter.infinite):
         raise ParameterError(parameter.name, number, 'must be finite')
-    if isfinite(number) and abs(number) > LARGEST:
+    if isfinite(number) and abs(number) > LARGEST_NUMBER:
         raise ParameterError(
-            parameter.name, number, f'must be within ±{LARGEST:g}', 'choose another unit'
+            parameter.name, number, f'must be within ±{LARGEST_NUMBER:g}', 'choose another unit'
         )
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     if number < parameter.low or (parameter.above and number == parameter.low):

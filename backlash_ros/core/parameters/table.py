@@ -12,15 +12,15 @@ from math import inf
 
 from backlash_ros.core.parameters.parameter import Parameter, declared_in, option
 
-CONTROLLER, PLANT, REFERENCE, RECORDER = 'controller', 'plant', 'reference', 'recorder'
+CONTROLLER, PLANT, REFERENCE_NODE, RECORDER = 'controller', 'plant', 'reference', 'recorder'
 BRINGUP = 'bringup'
 # Whose names the sections of a parameter file have.
-NODES = (CONTROLLER, PLANT, REFERENCE, RECORDER, BRINGUP)
+NODES = (CONTROLLER, PLANT, REFERENCE_NODE, RECORDER, BRINGUP)
 JOINTS, NOISE = 'joints', 'estimator.output_noise_std'
 
 of_both = partial(option, used_by=(CONTROLLER, PLANT))
 simulated = partial(option, used_by=(PLANT,))
-of_reference = partial(option, used_by=(REFERENCE,))
+of_reference = partial(option, used_by=(REFERENCE_NODE,))
 
 
 @dataclass(frozen=True)
@@ -228,7 +228,7 @@ class DriverMessages:
         'joint_state_topic: JointState, references on robot_joint_command, outputs on '
         'robot_joint_states, commands as io.command says',
         choices=('native', 'ros2_control', 'joint_state_topic'),
-        used_by=(CONTROLLER, REFERENCE, RECORDER), per_node=True, fixed=True)
+        used_by=(CONTROLLER, REFERENCE_NODE, RECORDER), per_node=True, fixed=True)
     command: str = option(
         'joint_state', 'joint_state_topic: JointState on joint_commands, or an array of all '
         'joints on forward_command_controller/commands', choices=('joint_state', 'array'),
@@ -238,14 +238,14 @@ class DriverMessages:
         'until it is back', per_node=True, fixed=True)
     joint: str = option(
         '', 'name of the joint in JointState, empty where there is just one',
-        used_by=(CONTROLLER, REFERENCE), per_node=True, fixed=True)
+        used_by=(CONTROLLER, REFERENCE_NODE), per_node=True, fixed=True)
     field: str = option(
         'position', 'what of the joint is y in JointState',
-        choices=('position', 'velocity', 'effort'), used_by=(CONTROLLER, REFERENCE),
+        choices=('position', 'velocity', 'effort'), used_by=(CONTROLLER, REFERENCE_NODE),
         per_node=True, fixed=True)
     best_effort: bool = option(
         False, 'listen to a driver that publishes best effort, which may lose messages',
-        used_by=(CONTROLLER, REFERENCE, RECORDER), per_node=True, fixed=True)
+        used_by=(CONTROLLER, REFERENCE_NODE, RECORDER), per_node=True, fixed=True)
 
 
 @dataclass(frozen=True)
@@ -293,16 +293,16 @@ class ParameterTree:
 
     sample_period: float = option(
         0.01, 'sample period T of G(z)', 's', low=0.0, above=True,
-        used_by=(CONTROLLER, PLANT, REFERENCE), per_node=True)
+        used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
     plant: PlantModel = PlantModel()
     actuator: ActuatorModel = ActuatorModel()
     lockstep: bool = option(
         False,
         'run as fast as the machine allows: each sample waits for its reference and its control',
-        used_by=(CONTROLLER, PLANT, REFERENCE, RECORDER), per_node=True, fixed=True)
+        used_by=(CONTROLLER, PLANT, REFERENCE_NODE, RECORDER), per_node=True, fixed=True)
     wait_for_subscribers: int = option(
         0, 'start only when the main topic has this many listeners', low=0,
-        used_by=(CONTROLLER, PLANT, REFERENCE), per_node=True, fixed=True)
+        used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True, fixed=True)
     estimator: EstimatorOptions = EstimatorOptions()
     lms: LmsSteps = LmsSteps()
     gradient: GradientStep = GradientStep()

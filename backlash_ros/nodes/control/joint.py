@@ -3,29 +3,109 @@
 from __future__ import annotations
 
 import time
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
+from math import isfinite
+from pathlib import Path
 
 from rclpy.qos import QoSProfile
 
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.estimates_file import worth_saving
+from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.figures import OF_MESSAGES, Finding, Level
 from backlash_ros.core.loop.phase import Phase
-from backlash_ros.core.loop.sample_counter import JointOutputs
+from backlash_ros.core.loop.report_use import awaited_reports
+from backlash_ros.core.loop.sample_counter import JointOutputs, Output
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.nodes.control.estimate_saver import EstimateSaver
-from backlash_ros.nodes.control.first_command import FirstCommand
-from backlash_ros.nodes.control.model_publisher import ModelPublisher
-from backlash_ros.nodes.control.reports import Reports
-from backlash_ros.nodes.diagnostics.diagnosis import Diagnosis, counts_of, values_of, worst
-from backlash_ros.nodes.diagnostics.rivals import RivalWatch
-from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
+from backlash_ros.nodes.control.diagnosis import Diagnosis, counts_of, values_of, worst
+from backlash_ros.nodes.control.publishing import ModelPublisher
+from backlash_ros.nodes.control.rivals import RivalWatch
+from backlash_ros.nodes.runtime.driver_io import DriverIo, Reports, output_qos
 from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
-from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.nodes.runtime.process import ProcessNode
+
+
+class EstimateSaver:
+    """Writes to one file, one writing after the other.
+
+    file: path, empty for none.
+    """
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+        # A disk that is slow to confirm a file would cost samples.
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix='estimates')
+
+    def save(self, estimate: Estimate, p: Parameters) -> Future[str]:
+        """Begin to save; the result says why it failed, empty if it did not."""
+        return self._thread.submit(self._write, estimate, p)
+
+    def close(self) -> None:
+        """Wait until everything is written."""
+        self._thread.shutdown()
+
+    def _write(self, estimate: Estimate, p: Parameters) -> str:
+        try:
+            save_estimate(Path(self.file), estimate, p)
+        except OSError as error:
+            return f'estimates.file={self.file!r} cannot be written: {error.strerror}'
+        return ''
+
+
+class FirstCommand:
+    """Decides when the loop may begin.
+
+    reports: those of the driver, None in lockstep. before: v before a cleanup, None without one.
+    """
+
+    def __init__(
+        self, node: ProcessNode, io: DriverIo, reports: Reports | None, joint: str = '',
+    ) -> None:
+        self._node, self._io, self._reports, self._joint = node, io, reports, joint
+        self.before: float | None = None
+        self._warned: set[str] = set()  # texts
+        self._unanswered = 0  # outputs that were not answered because v was not known yet
+
+    def v_at_start(self, p: Parameters) -> float | None:
+        """The v that acts as far as this node can know, None if it cannot."""
+        if self.before is not None:
+            return self.before
+        initial = p.control.initial
+        # In lockstep there is the simulated plant alone, which begins at 0.
+        return initial if isfinite(initial) and self._reports is not None else None
+
+    def may_follow(self, loop: ControlLoop, output: Output, p: Parameters) -> bool:
+        """Whether it is known from which v the first command goes on, or waiting is in vain."""
+        if self._io.is_simulated:
+            return True
+        if missing := p.missing_limits:
+            self._warn_once(
+                f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
+                'bears: set them'
+            )
+        if loop.learn_v(output.stamp_ns):
+            return True
+        reported = self._reports is not None and self._reports.publishers > 0
+        self._unanswered += 1
+        if reported and self._unanswered <= awaited_reports(p):
+            return False
+        if self._io.in_joint_space:
+            # v and y are the same angle but for the gap: the joint holds where it stands.
+            loop.go_on_from(output.y / loop.estimate.m)
+            return True
+        self._warn_once(
+            'nobody says which v acts now, so the first command goes on from 0: publish '
+            f'{self._io.topics.applied}, or set control.initial'
+        )
+        return True
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            self._node.log.warning(f'{self._joint}: {text}' if self._joint else text)
 
 
 class Joint:

@@ -17,7 +17,7 @@ from backlash_ros import topics
 from backlash_ros.core.driver_check.findings import FLOAT64, Graph
 from backlash_ros.core.driver_check.verdict import similar_topics
 from backlash_ros.core.parameters.table import RECORDER
-from backlash_ros.nodes.diagnostics.rivals import names_of
+from backlash_ros.nodes.control.rivals import names_of
 from backlash_ros.nodes.runtime.messages import DEPTH
 
 NOT_OURS = {'/rosout', '/parameter_events'}

@@ -6,23 +6,129 @@ The page is served to this machine alone, at an address that is printed.
 from __future__ import annotations
 
 import argparse
+import asyncio
+import json
+import socket
 import sys
+import time
+from collections.abc import Sequence
 
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.nodes.live.node import EXECUTABLE, LiveNode
-from backlash_ros.nodes.live.page_server import bound_socket
-from backlash_ros.nodes.monitor.followed import give_way
-from backlash_ros.nodes.runtime.arguments import ros_arguments
-from backlash_ros.nodes.runtime.spin import run
+from backlash_ros.nodes.live.page_server import (
+    HOST,
+    CurvePoints,
+    History,
+    PageServer,
+    bound_socket,
+    rounded,
+)
+from backlash_ros.nodes.monitor.followed import ControllerState, FollowedControllers, give_way
+from backlash_ros.nodes.runtime.executor import NodeExecutor
+from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
 from backlash_ros.options import LARGEST_PORT, OptionParser
+from backlash_ros.topics import BACKLASH
+
+LIVE = 'live'
+FRAME_PERIOD_S = 0.1  # between two frames of the page
+SHOWN_S = 10.0  # width of the curves
+LIVE_LABELS = (
+    *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
+    'y_m', 'y', 'u_d', 'v', 'u_hat',
+)
+
+
+class LiveNode(ProcessNode):
+    """Shows every controller of the domain, or those of some namespaces.
+
+    wanted: names of controllers or namespaces, none for all. bound: where the page is served.
+    """
+
+    def __init__(self, wanted: Sequence[str], bound: socket.socket) -> None:
+        super().__init__(LIVE)
+        # A machine that is held up for a second loses no point.
+        self._followed = FollowedControllers(self, wanted, LIVE_LABELS, depth=30)
+        self._socket = bound
+        self._start_ns = time.time_ns()
+        self._points: dict[str, CurvePoints] = {}
+        self._history = History(round(SHOWN_S / FRAME_PERIOD_S))
+        self._states = ''  # of all controllers, as JSON
+
+    def work(self, executor: NodeExecutor) -> None:
+        """Serve the page until a signal ends it."""
+        asyncio.run(self._serve(executor))
+
+    async def _serve(self, executor: NodeExecutor) -> None:
+        server = PageServer(self._socket, self._frame)
+        self._look()
+        await server.start()
+        address = f'http://{HOST}:{self._socket.getsockname()[1]}'
+        if ENABLED:
+            emit('ready', address=address)
+        else:
+            print(address, flush=True)
+        due_s = time.monotonic()
+        try:
+            while not self.stopping:
+                # Signals, and the look for further controllers; it does not wait.
+                executor.spin_once(timeout_sec=0.0)
+                self._look()
+                await server.renew()
+                due_s = max(due_s + FRAME_PERIOD_S, time.monotonic())
+                await asyncio.sleep(due_s - time.monotonic())
+        finally:
+            await server.stop()
+
+    def _look(self) -> None:
+        """Take in what has come since the last look."""
+        self._followed.take_diagnostics()
+        self._history.add({
+            name: self._points.setdefault(name, CurvePoints(self._start_ns)).take(followed.take())
+            for name, followed in self._followed.by_name.items()
+        })
+        now_s = time.monotonic()
+        states = sorted(self._followed.states, key=lambda state: state.name)
+        self._states = json.dumps(
+            [content_of(state, now_s) for state in states],
+            separators=(',', ':'), allow_nan=False,
+        )
+
+    def _frame(self, known: int) -> tuple[str, int]:
+        """A frame for a page that has the portions before the number `known`."""
+        now = 1e-9 * (time.time_ns() - self._start_ns)
+        awaited = json.dumps(self._followed.awaited)
+        portions = ','.join(self._history.since(known))
+        return (
+            f'{{"now":{now:.3f},"shown":{SHOWN_S},"awaited":{awaited},'
+            f'"controllers":{self._states},"portions":[{portions}]}}', self._history.end
+        )
+
+
+def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
+    """What the page says of a controller in words and numbers. now_s: on the steady clock."""
+    number = state.number
+    return {
+        'name': state.name, 'word': state.word(now_s), 'message': state.message,
+        # Nobody knows how somebody is who says nothing any more.
+        'level': 2 if state.silent_s(now_s) else min(state.level, 2),
+        'estimates': {
+            name: [rounded(value), rounded(half)]
+            for name, (value, half) in state.estimates.items()
+        },
+        'excitation': rounded(number('excitation: swing of v / gap')),
+        'rate': rounded(number('rate [Hz]')),
+        'latency': [rounded(number(f'latency {which} [ms]')) for which in ('p50', 'p99')],
+        'counts': {name: state.values.get(name, '') for name in ('samples', 'lost', 'late')},
+        'learning': state.is_on('learning'), 'compensating': state.is_on('compensating'),
+        'events': [list(event) for event in state.events],
+    }
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     parser = OptionParser(
-        EXECUTABLE, description=__doc__,
+        LIVE, description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog='From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )
@@ -40,7 +146,7 @@ def main(args: list[str] | None = None) -> int:
     give_way()
     with bound:
         return run(
-            EXECUTABLE, lambda: LiveNode(options.name, bound), ros_arguments(arguments)
+            LIVE, lambda: LiveNode(options.name, bound), ros_arguments(arguments)
         )
 
 

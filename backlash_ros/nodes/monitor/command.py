@@ -6,22 +6,239 @@ Without a terminal a line per controller is printed once a second.
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import select
 import sys
+import termios
+import time
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Any, TextIO
 
+from rclpy.client import Client
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
+from rich import live as rich_live
+from rich.console import Console
+from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros.nodes.monitor.followed import give_way
-from backlash_ros.nodes.monitor.node import EXECUTABLE, MonitorNode
-from backlash_ros.nodes.runtime.arguments import ros_arguments
-from backlash_ros.nodes.runtime.spin import run
-from backlash_ros.options import OptionParser
+from backlash_ros.nodes.monitor.followed import (
+    ControllerState,
+    FollowedControllers,
+    give_way,
+    time_of_day,
+)
+from backlash_ros.nodes.monitor.view import ASCII_BAR, BAR, plain_line, screen
+from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
+from backlash_ros.options import DONE, OptionParser
+from backlash_ros.topics import BACKLASH
+
+# Arrows and function keys come as sequences of which a part looks like other keys.
+KEY_SEQUENCE = re.compile(r'\x1b(\[|O)[0-9;]*.?')
+
+
+@contextmanager
+def pressed_keys(stream: TextIO) -> Iterator[Callable[[], str]]:
+    """A function that returns what was pressed since its last call; nothing but on a terminal.
+
+    Ctrl-C still is a signal. The terminal is left as it was found.
+    """
+    if not stream.isatty():
+        yield lambda: ''
+        return
+    descriptor = stream.fileno()
+    before = termios.tcgetattr(descriptor)
+
+    def read() -> str:
+        if not select.select([descriptor], [], [], 0.0)[0]:
+            return ''
+        return KEY_SEQUENCE.sub('', os.read(descriptor, 100).decode(errors='ignore'))
+
+    try:
+        tty.setcbreak(descriptor)
+        yield read
+    finally:
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+
+MONITOR = 'monitor'
+SCREEN_PERIOD_S = 0.2  # of the screen
+LINE_S = 1.0  # between two plain lines
+SERVICE_TIMEOUT_S = 5.0  # longest wait for a service
+NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
+
+
+@dataclass
+class Asked:
+    """A call of a service. until_s: when the wait for it ends. then: the switches afterwards."""
+
+    answer: Future
+    until_s: float
+    state: ControllerState
+    service: str
+    then: dict[str, str]
+
+
+class MonitorNode(ProcessNode):
+    """Follows every controller of the domain, or those of some namespaces.
+
+    wanted: names of controllers or namespaces, none for all.
+    """
+
+    def __init__(self, wanted: Sequence[str]) -> None:
+        super().__init__(MONITOR)
+        self._followed = FollowedControllers(self, wanted, BACKLASH, depth=1)
+        self._service_clients: dict[str, dict[str, Client]] = {}  # of controllers, by service
+        self._selected = 0
+        self._notice, self._notice_ends_s = '', 0.0
+        self._confirmed_until_s = 0.0  # a second r resets
+        self._pending: list[Asked] = []
+
+    def work(self, executor: SingleThreadedExecutor) -> None:
+        """Show controllers until a key or a signal ends it."""
+        # Whatever a terminal cannot show must not end this.
+        if hasattr(sys.stdout, 'reconfigure'):
+            sys.stdout.reconfigure(errors='replace')
+        console = Console()
+        with suppress(BrokenPipeError):
+            if console.is_terminal and not console.is_dumb_terminal:
+                self._show(executor, console)
+            else:
+                self._print_lines(executor, sys.stdout)
+            return
+        # Python would complain of the broken pipe once more when it flushes at its end.
+        sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
+
+    def _show(self, executor: SingleThreadedExecutor, console: Console) -> None:
+        blocks = BAR if console.encoding.startswith('utf') else ASCII_BAR
+        with pressed_keys(sys.stdin) as keys, rich_live.Live(
+            console=console, screen=True, auto_refresh=False, redirect_stdout=False,
+            redirect_stderr=False,
+        ) as live:
+            due_s = 0.0
+            while not self.stopping:
+                executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
+                pressed = keys()
+                for key in pressed:
+                    self._on_key(key)
+                self._look_for_answers()
+                if pressed or time.monotonic() >= due_s:
+                    due_s = time.monotonic() + SCREEN_PERIOD_S
+                    self._refresh()
+                    live.update(screen(
+                        self._states, self._selected, self._text_below(), time.monotonic(),
+                        console.width, console.height, blocks,
+                    ), refresh=True)
+
+    def _print_lines(self, executor: SingleThreadedExecutor, stream: TextIO) -> None:
+        due_s = time.monotonic() + LINE_S
+        while not self.stopping:
+            executor.spin_once(timeout_sec=SCREEN_PERIOD_S)
+            if time.monotonic() >= due_s:
+                due_s += LINE_S
+                self._refresh()
+                for state in self._states:
+                    print(plain_line(state, time.monotonic()), file=stream)
+                if not self._states:
+                    print(self._followed.awaited, file=stream)
+                stream.flush()
+
+    def _refresh(self) -> None:
+        self._followed.take_diagnostics()
+        for followed in self._followed.by_name.values():
+            # Here already: it takes a moment until a client has found its service.
+            self._clients_of(followed.state.node)
+            for _ in followed.take():
+                pass  # the state has it
+
+    def _clients_of(self, name: str) -> dict[str, Client]:
+        """Clients of the services of a controller, by the last part of their names."""
+        if name not in self._service_clients:
+            self._service_clients[name] = {
+                service: self.create_client(kind, f'{name}/{service}') for service, kind in (
+                    ('freeze_adaptation', SetBool), ('enable_compensation', SetBool),
+                    ('reset_estimates', Trigger), ('save_estimates', Trigger),
+                )
+            }
+        return self._service_clients[name]
+
+    def _text_below(self) -> str:
+        if time.monotonic() < self._notice_ends_s:
+            return self._notice
+        return '' if self._states else self._followed.awaited
+
+    @property
+    def _states(self) -> list[ControllerState]:
+        return self._followed.states
+
+    def _on_key(self, key: str) -> None:
+        if key == 'q':
+            self.exit_code, self.stopping = DONE, True
+        elif key == '\t' and self._states:
+            self._selected = (self._selected + 1) % len(self._states)
+            self._confirmed_until_s = 0.0
+        elif key in ACTIONS and self._states:
+            self._act(key, self._states[self._selected])
+
+    def _act(self, key: str, state: ControllerState) -> None:
+        """Call the service behind a key."""
+        service, switch = ACTIONS[key]
+        if key == 'r' and time.monotonic() > self._confirmed_until_s:
+            self._confirmed_until_s = time.monotonic() + NOTICE_S
+            self._say(f'press r once more to reset the estimates of {state.name}')
+            return
+        self._confirmed_until_s = 0.0
+        client = self._clients_of(state.node)[service]
+        if not client.service_is_ready():
+            self._say(f'{state.node}/{service} is not there')
+            return
+        request: Any = Trigger.Request()
+        then: dict[str, str] = {}
+        if switch:
+            on = not state.is_on(switch)
+            then = {switch: str(on)}
+            request = SetBool.Request(data=on if service == 'enable_compensation' else not on)
+        self._pending.append(Asked(
+            client.call_async(request), time.monotonic() + SERVICE_TIMEOUT_S, state, service, then
+        ))
+        self._say(f'{state.node}/{service} ...')
+
+    def _look_for_answers(self) -> None:
+        for asked in list(self._pending):
+            if asked.answer.done():
+                response = asked.answer.result()
+                text = response.message
+                if response.success:
+                    # The next diagnostics may be a second away.
+                    asked.state.values |= asked.then
+            elif time.monotonic() > asked.until_s:
+                text = f'no answer from {asked.service} within {SERVICE_TIMEOUT_S:g} s'
+            else:
+                continue
+            self._pending.remove(asked)
+            asked.state.note(time_of_day(), text)
+            self._say(f'{asked.state.name}: {text}')
+
+    def _say(self, text: str) -> None:
+        self._notice, self._notice_ends_s = text, time.monotonic() + NOTICE_S
+
+
+# What a key calls, and the switch of the diagnostics that it turns over.
+ACTIONS = {
+    'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
+    'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
+}
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     parser = OptionParser(
-        EXECUTABLE, description=__doc__,
+        MONITOR, description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog='keys: f freezes or goes on learning, c compensates or not, r (twice) resets the '
                'estimates,\n      s saves them, Tab takes the next controller, q ends.',
@@ -30,7 +247,7 @@ def main(args: list[str] | None = None) -> int:
                         help='a controller or a namespace, as /pan (default: all there are)')
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
     give_way()
-    return run(EXECUTABLE, lambda: MonitorNode(options.name), ros_arguments(arguments))
+    return run(MONITOR, lambda: MonitorNode(options.name), ros_arguments(arguments))
 
 
 if __name__ == '__main__':

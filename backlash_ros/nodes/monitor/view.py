@@ -10,18 +10,18 @@ from rich.console import Group
 from rich.panel import Panel
 from rich.text import Text
 
-from backlash_ros.nodes.monitor.state import ControllerState
+from backlash_ros.nodes.monitor.followed import ControllerState
 from backlash_ros.topics import BACKLASH
 
 KEYS = 'f freeze/learn  c compensate  r reset  s save  q quit'
-COLOURS = ('green', 'yellow', 'red')  # of the levels of /diagnostics
-SHORT = 10  # lines of a controller without events, its frame included
+LEVEL_COLOURS = ('green', 'yellow', 'red')  # of the levels of /diagnostics
+PANEL_LINES = 10  # lines of a controller without events, its frame included
 VALUES = 32  # columns before a bar
 # Sure, within the band, beyond it.
-BLOCKS, ASCII_BLOCKS = '█▒·', '#=.'
+BAR, ASCII_BAR = '█▒·', '#=.'
 
 
-def bar(value: float, half_width: float, scale: float, width: int, blocks: str = BLOCKS) -> str:
+def bar(value: float, half_width: float, scale: float, width: int, blocks: str = BAR) -> str:
     """A bar from 0 to |value| on an axis that ends at `scale`, its band in another shade.
 
     Empty where value or scale is nothing to draw. A band that is there takes a column at least.
@@ -85,7 +85,7 @@ def panel(
     """One controller in a frame. events: how many of the newest ones."""
     inner = width - 4
     silent = state.silent_s(now_s) > 0.0
-    colour = 'red' if silent else COLOURS[min(state.level, 2)]
+    colour = 'red' if silent else LEVEL_COLOURS[min(state.level, 2)]
     text = Text(no_wrap=True, overflow='crop')
     text.append(state.word(now_s), style=f'bold {colour}')
     # Often the cure stands in the second line.
@@ -105,19 +105,19 @@ def panel(
 
 def screen(
     states: Sequence[ControllerState], selected: int, notice: str, now_s: float,
-    width: int, height: int, blocks: str = BLOCKS,
+    width: int, height: int, blocks: str = BAR,
 ) -> Group:
     """All controllers; where there is no room, all but the selected one in a line each."""
     several = 'Tab next  ' if len(states) > 1 else ''
     below = wrap(notice or several + KEYS, width)
     room = height - len(below)
-    every = len(states) * SHORT <= room
+    every = len(states) * PANEL_LINES <= room
     long = room // max(len(states), 1) if every else room - (len(states) - 1)
     parts: list[Panel | Text] = []
     for i, state in enumerate(states):
         if every or i == selected:
             parts.append(panel(
-                state, now_s, width, long - SHORT, len(states) > 1 and i == selected, blocks
+                state, now_s, width, long - PANEL_LINES, len(states) > 1 and i == selected, blocks
             ))
         else:
             parts.append(_cropped(plain_line(state, now_s)[:width]))

@@ -1,13 +1,15 @@
-"""How y comes from the driver and v goes to it: plain numbers, or the messages of ros2_control."""
+"""What the driver reports to have applied, by joint."""
 
 from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -15,11 +17,12 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
+from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.sample_counter import JointOutputs
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.runtime.messages import DEPTH
-from backlash_ros.nodes.runtime.number_message import message_with, number_of
-from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.nodes.runtime.executor import Inbox
+from backlash_ros.nodes.runtime.messages import DEPTH, message_with, number_of
+from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class DriverTopics(NamedTuple):
@@ -35,7 +38,7 @@ class DriverTopics(NamedTuple):
     applied_type: type[Any]
 
 
-STYLES = {
+IO_STYLES = {
     'native': DriverTopics(
         topics.REFERENCE, Float64, topics.PLANT_OUTPUT, Float64, topics.CONTROL, Float64,
         topics.APPLIED_CONTROL, Float64,
@@ -53,11 +56,11 @@ STYLES = {
 
 def driver_topics(p: Parameters) -> DriverTopics:
     """The topics and types that io.style, io.command and joints ask for."""
-    found = STYLES[p.io.style]
+    found = IO_STYLES[p.io.style]
     if p.io.style == 'joint_state_topic':
         if p.io.command == 'array':
             found = found._replace(control=topics.JOINT_COMMANDS, control_type=Float64MultiArray)
-    elif p.joint_names:
+    elif p.joints:
         found = found._replace(
             reference_type=JointState, applied=topics.APPLIED_JOINT_COMMANDS,
             applied_type=JointState,
@@ -242,3 +245,38 @@ class DriverIo:
             self.repeats_stamps = self._node.count_publishers(self.topics.output) == 1
         self._header_ns, self._number = stamp_ns, number
         return 0 if self.repeats_stamps else stamp_ns
+
+
+class Reports:
+    """Taken when a loop looks for them: v and stamp [ns] of each joint since its last look."""
+
+    def __init__(self, node: Node, io: DriverIo, joints: tuple[str, ...]) -> None:
+        self._io = io
+        self._inbox = Inbox(node, io.topics.applied_type, io.topics.applied, REMEMBERED)
+        self._new: dict[str, deque[tuple[float, int]]] = {
+            joint: deque(maxlen=REMEMBERED) for joint in joints
+        }
+
+    @property
+    def publishers(self) -> int:
+        """How many there are."""
+        return self._inbox.publishers
+
+    def of(self, joint: str) -> Iterator[tuple[float, int]]:
+        """Those of a joint."""
+        self._look()
+        new = self._new[joint]
+        while new:
+            yield new.popleft()
+
+    def forget(self) -> None:
+        """Drop them all: they are of no use to a loop that begins later."""
+        self._look()
+        for new in self._new.values():
+            new.clear()
+
+    def _look(self) -> None:
+        for message, info in self._inbox.take_all():
+            stamp_ns = self._io.stamp_ns(info)
+            for joint, v in self._io.values(message).items():
+                self._new[joint].append((v, stamp_ns))

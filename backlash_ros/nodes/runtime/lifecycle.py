@@ -9,7 +9,7 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.nodes.runtime.process import ProcessNode
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 

@@ -1,10 +1,11 @@
-"""Messages that are made once and published often."""
+"""Messages that are made once and published often, or read without being made."""
 
 from __future__ import annotations
 
 import time
 from array import array
 from collections.abc import Mapping, Sequence
+from struct import Struct
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -18,12 +19,28 @@ from backlash_ros import topics
 from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.loop.level_log import LevelLog
 
+LITTLE_ENDIAN = b'\x00\x01\x00\x00'
+_LITTLE, _BIG = Struct('<4xd'), Struct('>4xd')
+_WHOLE = Struct('<4sd')
+
+
+def number_of(message: bytes) -> float:
+    """The number in a message."""
+    number: float = (_LITTLE if message[1] & 1 else _BIG).unpack_from(message)[0]
+    return number
+
+
+def message_with(number: float) -> bytes:
+    """A message with this number."""
+    return _WHOLE.pack(LITTLE_ENDIAN, number)
+
+
 # Deep enough that a recorder which is held up for a second misses nothing.
 DEPTH = 1000
 DIAGNOSTICS_PERIOD_S = 1.0  # of every node, besides each change
 SILENT_S = 3.0 * DIAGNOSTICS_PERIOD_S  # after which a node that has said something is gone
 # In lockstep a missed message would stop the loop for good: who comes late gets it all the same.
-KEPT = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+KEPT_QOS = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def without_events() -> PublisherEventCallbacks:

@@ -17,10 +17,9 @@ from ros_processes import wait_until
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from backlash_ros.nodes.runtime import prompt_executor
-from backlash_ros.nodes.runtime.inbox import Inbox
-from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, PromptExecutor, make_executor
-from backlash_ros.nodes.runtime.spin import spin_paced
+from backlash_ros.nodes.runtime import executor as prompt_executor
+from backlash_ros.nodes.runtime.executor import Inbox, NodeExecutor, PromptExecutor, make_executor
+from backlash_ros.nodes.runtime.process import spin_paced
 from backlash_ros.tools.bringup.environment import free_domain
 
 

@@ -10,7 +10,7 @@ from waiting import DEADLINE_S
 # Calls of a PyDLL keep the interpreter locked, as Fast DDS does when it hangs.
 LEAVE = """
 import ctypes, sys, time
-from backlash_ros.nodes.runtime.forced_exit import exit_at_the_latest
+from backlash_ros.nodes.runtime.process import exit_at_the_latest
 with exit_at_the_latest(0.1, 9):
     pass
 time.sleep(0.3)

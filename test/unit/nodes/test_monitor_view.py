@@ -8,7 +8,7 @@ from math import inf, nan
 import pytest
 from rich.console import Console
 
-from backlash_ros.nodes.monitor.state import ControllerState
+from backlash_ros.nodes.monitor.followed import ControllerState
 from backlash_ros.nodes.monitor.view import axis_end, bar, plain_line, screen
 
 VALUES = {

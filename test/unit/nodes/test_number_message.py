@@ -9,7 +9,7 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Float64
 
-from backlash_ros.nodes.runtime.number_message import message_with, number_of
+from backlash_ros.nodes.runtime.messages import message_with, number_of
 
 NUMBERS = (0.0, -1.5, 1e-300, 12.345678901234567, inf, -inf)
 

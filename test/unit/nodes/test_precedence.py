@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from backlash_ros.nodes.diagnostics.rivals import ENDPOINT, SINCE, Rival, Rivals
+from backlash_ros.nodes.control.rivals import ENDPOINT, SINCE, Rival, Rivals
 from backlash_ros.nodes.runtime.messages import SILENT_S
 
 

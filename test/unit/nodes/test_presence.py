@@ -8,7 +8,7 @@ from contextlib import closing
 
 import pytest
 
-from backlash_ros.nodes.diagnostics.presence import LISTED, Presence
+from backlash_ros.nodes.control.rivals import LISTED, Presence
 
 DOMAIN = os.getpid() + 1000  # of no ROS, so of nobody else
 LONG = '/a_name' * 30

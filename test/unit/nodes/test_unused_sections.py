@@ -8,7 +8,7 @@ import pytest
 import yaml
 from places import ROOT
 
-from backlash_ros.nodes.runtime.unused_sections import unused
+from backlash_ros.nodes.runtime.parameters import unused
 
 CONFIGS = sorted((ROOT / 'config').glob('*.yaml'))
 

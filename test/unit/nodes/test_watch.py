@@ -11,9 +11,9 @@ from rclpy.node import Node
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.nodes.control.watch_publisher import (
-    LOOK_S,
-    PERIOD_S,
+from backlash_ros.nodes.control.publishing import (
+    WATCH_LOOK_S,
+    WATCH_PERIOD_S,
     WatchPublisher,
     watched_values,
 )
@@ -64,7 +64,7 @@ def test_nothing_is_published_and_seldom_anything_asked_while_nobody_listens() -
     watch, publishers = watch_of()
     run(watch, 1000.0, 10.0)
     assert all(publisher.sent == [] for publisher in publishers.values())
-    assert all(publisher.looks <= 10.0 / LOOK_S for publisher in publishers.values())
+    assert all(publisher.looks <= 10.0 / WATCH_LOOK_S for publisher in publishers.values())
 
 
 def test_only_what_is_listened_to_is_published() -> None:
@@ -84,8 +84,8 @@ def test_every_topic_keeps_to_the_lesser_of_its_bound_and_the_sampling_rate(
     run(watch, rate_hz, 4.0)
     for publisher in publishers.values():
         # At the end those that follow v still wait for the sample after it.
-        assert 0.99 * 4.0 * min(rate_hz, 1.0 / PERIOD_S) - 1 <= len(publisher.sent)
-        assert len(publisher.sent) <= 4.0 * min(rate_hz, 1.0 / PERIOD_S) + 1
+        assert 0.99 * 4.0 * min(rate_hz, 1.0 / WATCH_PERIOD_S) - 1 <= len(publisher.sent)
+        assert len(publisher.sent) <= 4.0 * min(rate_hz, 1.0 / WATCH_PERIOD_S) + 1
 
 
 @pytest.mark.parametrize('rate_hz', [10.0, 100.0, 450.0, 1000.0])
@@ -102,7 +102,7 @@ def test_u_is_the_one_that_the_v_before_it_led_to(rate_hz: float, others: bool) 
         before = len(u)
         watch.follow(row, ESTIMATES, k / rate_hz)
         assert u[before:] == v[before:len(u)]
-    assert len(u) > 900 * min(1.0, 1.0 / PERIOD_S / rate_hz)
+    assert len(u) > 900 * min(1.0, 1.0 / WATCH_PERIOD_S / rate_hz)
 
 
 def test_values_are_those_of_the_rows_with_bands_of_two_deviations() -> None:

@@ -1,16 +1,20 @@
-"""A node as a process: arguments, start-up, work, signals, shutdown, exit code."""
+"""A node as a process: arguments, start-up, work, events, signals, shutdown, exit code."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import gc
+import json
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from math import isfinite
 from typing import Any, cast
 
 import rclpy
@@ -31,16 +35,87 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import as_yaml
 from backlash_ros.core.parameters.table import PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.nodes.runtime.declare import changed_values, declare_parameters
-from backlash_ros.nodes.runtime.forced_exit import exit_at_the_latest
-from backlash_ros.nodes.runtime.prompt_executor import NodeExecutor, make_executor
-from backlash_ros.nodes.runtime.unused_sections import complaints
+from backlash_ros.nodes.runtime.executor import NodeExecutor, make_executor
+from backlash_ros.nodes.runtime.parameters import changed_values, complaints, declare_parameters
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 
-LOOK_S = 0.01  # between two looks at a condition of start-up
-AGAIN_S = 0.1  # between two requests to stop, until the node has heard one
+
+def ros_arguments(arguments: Sequence[str]) -> list[str]:
+    """The part between --ros-args and --, all of them."""
+    found, inside = [], False
+    for argument in arguments:
+        inside = (inside or argument == '--ros-args') and argument != '--'
+        if inside:
+            found.append(argument)
+    return found
+
+
+ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
+
+
+def emit(event: str, **content: object) -> None:
+    """Print an event, flushed; nothing unless BACKLASH_ROS_EVENTS=1. JSON has no nan: null."""
+    if ENABLED:
+        checked = {name: _without_nan(value) for name, value in content.items()}
+        print(json.dumps({'event': event, **checked}), flush=True)
+
+
+def _without_nan(value: object) -> object:
+    return None if isinstance(value, float) and not isfinite(value) else value
+
+
+SIGEV_THREAD = 2  # <signal.h>: the timer calls a function, in a thread of its own
+
+
+class _SignalEvent(ctypes.Structure):
+    """struct sigevent of Linux; value is handed to function."""
+
+    _fields_ = (
+        ('value', ctypes.c_void_p), ('signal', ctypes.c_int), ('notify', ctypes.c_int),
+        ('function', ctypes.c_void_p), ('attributes', ctypes.c_void_p),
+        ('reserved', ctypes.c_char * 32),
+    )
+
+
+class _TimerSpec(ctypes.Structure):
+    """struct itimerspec: period and delay as seconds and nanoseconds."""
+
+    _fields_ = tuple(
+        (name, ctypes.c_long) for name in ('period_s', 'period_ns', 'delay_s', 'delay_ns')
+    )
+
+
+@contextmanager
+def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
+    """End the process with this exit code where the block takes longer than within_s [s]."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # nobody may be reading any more
+            stream.flush()
+    if sys.platform != 'linux':
+        yield
+        return
+    c = ctypes.CDLL(None)
+    event = _SignalEvent(
+        value=code, notify=SIGEV_THREAD, function=ctypes.cast(c._exit, ctypes.c_void_p).value
+    )
+    timer = ctypes.c_void_p()
+    if c.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) != 0:
+        yield  # out of timers: without a last resort, as on any other system
+        return
+    seconds, fraction = divmod(within_s, 1.0)
+    c.timer_settime(
+        timer, 0, ctypes.byref(_TimerSpec(0, 0, int(seconds), int(fraction * 1e9))), None
+    )
+    try:
+        yield
+    finally:
+        c.timer_delete(timer)
+
+
+START_LOOK_S = 0.01  # between two looks at a condition of start-up
+STOP_RETRY_S = 0.1  # between two requests to stop, until the node has heard one
 GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node in a second
-REMIND_S = 5.0  # between two lines that say what start-up waits for
+START_REMIND_S = 5.0  # between two lines that say what start-up waits for
 # A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
 NAP_NS = 3_000_000
 
@@ -100,7 +175,7 @@ class ProcessNode(Node):
         self, condition: Callable[[], bool], action: Callable[[], None], awaited: str,
     ) -> None:
         """Call action as soon as condition holds; `awaited` says in the log what is missing."""
-        remind = time.monotonic() + REMIND_S
+        remind = time.monotonic() + START_REMIND_S
 
         def look() -> None:
             nonlocal remind
@@ -108,10 +183,10 @@ class ProcessNode(Node):
                 self.destroy_timer(timer)
                 action()
             elif time.monotonic() > remind:
-                remind += REMIND_S
+                remind += START_REMIND_S
                 self.log.info(f'waiting for {awaited}')
 
-        timer = self.create_timer(LOOK_S, look, clock=self.steady_clock)
+        timer = self.create_timer(START_LOOK_S, look, clock=self.steady_clock)
 
     def _stop(self) -> None:
         self.stopping = True
@@ -218,7 +293,7 @@ class _SignalPipe:
                     # An executor that is busy may overlook a single one.
                     while not node.stopping:
                         node.stop_request.trigger()
-                        time.sleep(AGAIN_S)
+                        time.sleep(STOP_RETRY_S)
 
         threading.Thread(target=wait, daemon=True).start()
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import inspect
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
 from rclpy.guard_condition import GuardCondition
@@ -20,7 +21,42 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-from backlash_ros.nodes.runtime.inbox import Polled
+
+class Polled(MutuallyExclusiveCallbackGroup):
+    """Of subscriptions that no executor serves."""
+
+    def can_execute(self, entity: Any) -> bool:
+        """Never: whoever wants a message takes it."""
+        return False
+
+
+class Inbox:
+    """The newest messages of a topic, at most `depth`, until somebody looks.
+
+    To take a message costs a tenth of what it costs to be woken up by it.
+    """
+
+    def __init__(self, node: Node, message_type: type[Any], topic: str, depth: int) -> None:
+        self._type, self._node = message_type, node
+        untyped: Any = Polled
+        self._subscription = node.create_subscription(
+            message_type, topic, lambda _: None, depth, callback_group=untyped()
+        )
+
+    @property
+    def publishers(self) -> int:
+        """How many there are."""
+        return int(self._subscription.get_publisher_count())
+
+    def take_all(self) -> Iterator[tuple[Any, dict[str, Any]]]:
+        """Message and info (time stamps, number) of all that have arrived, oldest first."""
+        while (taken := self._subscription.handle.take_message(self._type, False)) is not None:
+            yield taken
+
+    def close(self) -> None:
+        """Take no more."""
+        self._node.destroy_subscription(self._subscription)
+
 
 KNOWN_RCLPY = ('7.1.',)  # begin of the versions: those of ROS 2 Jazzy
 # Services and events may wait so long.

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+import socket
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from math import inf
+from pathlib import Path
 from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -15,13 +20,49 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
 from backlash_ros.core.loop.diagnosis import UNNAMED
-from backlash_ros.nodes.diagnostics.presence import Presence
 from backlash_ros.nodes.runtime.messages import SILENT_S
-from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.nodes.runtime.process import ProcessNode
+
+LISTED = Path('/proc/net/unix')
+
+
+class Presence:
+    """Makes a publisher of a topic known to all of this machine until it is closed.
+
+    domain: ROS_DOMAIN_ID. topic: its full name. identity: of the publisher, in letters and digits.
+    """
+
+    def __init__(self, domain: int, topic: str, identity: str) -> None:
+        # A name may have 107 bytes, a topic more.
+        place = hashlib.sha256(f'{domain} {topic}'.encode()).hexdigest()[:32]
+        self._prefix, self._own = f'@backlash_ros/{place}/', identity
+        self._socket: socket.socket | None = None
+        if sys.platform == 'linux':
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            # Nobody else can have this identity; where sockets are forbidden, nobody is listed.
+            with suppress(OSError):
+                self._socket.bind(f'\0{self._prefix[1:]}{identity}')
+
+    def others(self) -> frozenset[str]:
+        """Identities of the other publishers."""
+        try:
+            names = [line.rsplit(' ', 1)[-1] for line in LISTED.read_text().splitlines()]
+        except OSError:
+            return frozenset()
+        found = {
+            name.removeprefix(self._prefix) for name in names if name.startswith(self._prefix)
+        }
+        return frozenset(found - {self._own})
+
+    def close(self) -> None:
+        """Let go of the name."""
+        if self._socket is not None:
+            self._socket.close()
+
 
 # What discovery mostly takes: a publisher that is found so soon after the start of a node was there
 # before it. Controllers of this machine are waited for however long it takes.
-SETTLE_S = 0.7
+DISCOVERY_S = 0.7
 HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
 OWN_S = 1.0  # for the graph to show a publisher of this very process
 # Keys in /diagnostics by which controllers know each other.
@@ -112,7 +153,7 @@ class RivalWatch:
         self.found: tuple[Rival, ...] = ()
         self._node, self._changed = node, changed
         own = identity_made_by(node, self.topic, advertise)
-        self._rivals = Rivals(own, time.monotonic() + SETTLE_S)
+        self._rivals = Rivals(own, time.monotonic() + DISCOVERY_S)
         self._presence = Presence(node.context.get_domain_id(), self.topic, own)
         self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
         self._others: frozenset[str] = frozenset()

@@ -11,7 +11,7 @@ from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.messages import DIAGNOSTICS_PERIOD_S
-from backlash_ros.nodes.runtime.spin import ProcessNode
+from backlash_ros.nodes.runtime.process import ProcessNode
 
 SHORTEST_STEP_S = 1e-3  # between two commands of a ramp to zero
 CONFIRMED_WITHIN_S = 0.1  # longest wait for the driver to confirm the last command

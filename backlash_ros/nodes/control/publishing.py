@@ -1,0 +1,195 @@
+"""What the controller publishes besides its commands: every step, single quantities, G(z)."""
+
+from __future__ import annotations
+
+import time
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
+from math import inf, nan
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from std_msgs.msg import Float64, Float64MultiArray, MultiArrayDimension
+
+from backlash_ros import topics
+from backlash_ros.core.control.controller import ControlStep
+from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.learned_model import learned_model_of
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.simulation.run_record import stated_deviations
+from backlash_ros.nodes.runtime.messages import LabelledArrayPublisher, without_events
+
+WATCH_PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
+WATCH_LOOK_S = 0.5  # between two looks at who listens
+WATCH_DEPTH = 10  # messages that may wait for a subscriber
+U_INDEX = topics.SIGNAL_LABELS.index('u_hat')
+BAND = 2.0  # half width of the band around an estimate, in standard deviations
+
+
+class WatchPublisher:
+    """Publishes `controller/watch/<label>` for each label of which there is a subscriber.
+
+    Of a joint that has a name: `controller/watch/<joint>/<label>`.
+
+    The topics take turns, so that after a command of a fast loop one message leaves, not all.
+    After v(k) comes the u that it led to, which is known with y(k+1): points of their loop.
+    """
+
+    def __init__(self, node: Node, joint: str = '') -> None:
+        self._publishers: dict[str, Publisher] = {
+            label: node.create_publisher(
+                Float64, topics.of_node(topics.watched(label, joint)), WATCH_DEPTH,
+                event_callbacks=without_events(),
+            ) for label in topics.WATCH_LABELS
+        }
+        self._message = Float64()
+        self._heard: list[str] = []  # labels with a subscriber
+        self._turn = -1  # whose turn it was among these
+        self._looked_at_s = self._sent_at_s = -inf
+        self._v_sent = False  # with the newest sample, so that its u is that of the next one
+        self._u_of_v: float | None = None  # u that belongs to the v that was sent last
+
+    def follow(self, signals: Sequence[float], estimates: Sequence[float], now_s: float) -> None:
+        """Publish what is due of a sample.
+
+        signals, estimates: its rows, in the order of their labels. now_s: on the steady clock.
+        """
+        if now_s >= self._looked_at_s + WATCH_LOOK_S:
+            self._looked_at_s = now_s
+            self._heard = [
+                label for label, publisher in self._publishers.items()
+                if publisher.get_subscription_count()
+            ]
+        if not self._heard:
+            return
+        if self._v_sent:
+            self._v_sent, self._u_of_v = False, signals[U_INDEX]
+        spacing = WATCH_PERIOD_S / len(self._heard)
+        # After a pause each is due once.
+        self._sent_at_s = max(self._sent_at_s, now_s - WATCH_PERIOD_S)
+        # The comparison of times must not lose one message of each round to rounding.
+        due = int((now_s - self._sent_at_s) / spacing + 1e-6)
+        if not due:
+            return
+        values = watched_values(signals, estimates)
+        for _ in range(due):
+            turn = (self._turn + 1) % len(self._heard)
+            label = self._heard[turn]
+            if label == 'u_hat' and self._v_sent:
+                return
+            self._turn = turn
+            self._sent_at_s += spacing
+            self._message.data = values[label]
+            if label == 'u_hat' and self._u_of_v is not None:
+                self._message.data, self._u_of_v = self._u_of_v, None
+            self._v_sent = self._v_sent or label == 'v'
+            self._publishers[label].publish(self._message)
+
+
+def watched_values(signals: Sequence[float], estimates: Sequence[float]) -> dict[str, float]:
+    """The value of each of WATCH_LABELS, nan for bands where the law has no deviations."""
+    signal = dict(zip(topics.SIGNAL_LABELS, signals, strict=True))
+    estimate = dict(zip(topics.ESTIMATE_LABELS, estimates, strict=True))
+    values = {'gap': estimate['c_r'] - estimate['c_l']}
+    for name in ('m', 'c_r', 'c_l'):
+        value, half = estimate[name], BAND * estimate[f'std_{name}']
+        values |= {name: value, f'{name}_low': value - half, f'{name}_high': value + half}
+    return values | {name: value for name, value in signal.items() if name != 'sample'}
+
+
+Row = tuple[float, ...]
+
+
+class StepPublisher:
+    """The topics ~/signals, ~/estimates and those below ~/watch.
+
+    The rows of several joints are one after the other, with the joint before each label; that of a
+    joint without a step is nan.
+    """
+
+    def __init__(self, node: Node, joints: Sequence[str]) -> None:
+        self._signals, self._estimates = (
+            LabelledArrayPublisher(node, topics.of_node(topic), [
+                topics.of_joint(label, joint) for joint in joints for label in labels
+            ]) for topic, labels in (
+                (topics.SIGNALS, topics.SIGNAL_LABELS), (topics.ESTIMATES, topics.ESTIMATE_LABELS)
+            )
+        )
+        self._watches = {joint: WatchPublisher(node, joint) for joint in joints}
+
+    @property
+    def listeners(self) -> int:
+        """How many subscribers there are to every step."""
+        return min(self._signals.listeners, self._estimates.listeners)
+
+    def publish(
+        self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep],
+    ) -> None:
+        """Tell of the steps of a sample."""
+        rows = [_rows(loop, steps.get(joint)) for joint, loop in loops.items()]
+        self._signals.publish(_joined(signals for signals, _ in rows))
+        self._estimates.publish(_joined(estimates for _, estimates in rows))
+        now_s = time.monotonic()
+        for joint, (signals, estimates) in zip(loops, rows, strict=True):
+            if joint in steps:
+                self._watches[joint].follow(signals, estimates, now_s)
+
+
+def _rows(loop: ControlLoop, step: ControlStep | None) -> tuple[Row, Row]:
+    """Signals and estimates of a joint."""
+    if step is None:
+        return (nan,) * len(topics.SIGNAL_LABELS), (nan,) * len(topics.ESTIMATE_LABELS)
+    e, sample = step.estimate, float(loop.counter.index)
+    estimator = loop.core.estimator
+    return (
+        step.y_m, step.y, step.u_d, step.v, estimator.u_hat, estimator.innovation,
+        float(e.status), sample, loop.statistics.latencies[-1],
+    ), (e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample)
+
+
+def _joined(rows: Iterator[Row]) -> Row:
+    return sum(rows, ())
+
+
+# Who comes late gets the newest ones: G may never change again. More than one, so that a subscriber
+# that is held up misses none, and one of each joint.
+NEWEST = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Deviations and noise change with every few samples, and are of use at the pace of a reader.
+MODEL_PERIOD_S = 1.0
+
+
+class ModelPublisher:
+    """Publishes `controller/model` when G has changed, else once per MODEL_PERIOD_S of samples.
+
+    Counted in samples, so that a run in lockstep is the same whenever it is made. A message is
+    about one joint, whose name is part of the labels.
+    """
+
+    def __init__(self, node: Node, joint: str) -> None:
+        self._publisher = node.create_publisher(
+            Float64MultiArray, topics.of_node(topics.MODEL), NEWEST,
+            event_callbacks=without_events(),
+        )
+        self._joint = joint
+        self._told: StateModel | None = None  # the newest one that followed a sample
+        self._since = inf  # samples since then
+
+    def follow(self, loop: ControlLoop, sample_period_s: float) -> None:
+        """Publish after a sample, if it is time."""
+        self._since += 1
+        learned = loop.core.estimator.learned_model
+        if learned is not self._told or self._since * sample_period_s >= MODEL_PERIOD_S:
+            self._told, self._since = learned, 0
+            self.publish(loop)
+
+    def publish(self, loop: ControlLoop) -> None:
+        """Publish at once."""
+        fields = learned_model_of(loop.core.estimator, loop.told).fields()
+        message = Float64MultiArray()
+        message.layout.dim = [
+            MultiArrayDimension(label=topics.of_joint(label, self._joint), size=len(values))
+            for label, values in fields.items()
+        ]
+        message.data = array('d', [value for values in fields.values() for value in values])
+        self._publisher.publish(message)

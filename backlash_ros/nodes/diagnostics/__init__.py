@@ -1,1 +1,0 @@
-"""What is wrong, the likeliest cause first, and who else is there."""

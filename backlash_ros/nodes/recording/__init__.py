@@ -1,1 +1,0 @@
-"""What the recorder knows of each topic and of the run."""
