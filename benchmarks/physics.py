@@ -17,11 +17,7 @@ from math import isinf, nan
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
-from gears.gear_figures import draw_hysteresis, draw_map
-from gears.gear_map import HEADER as WRONG_HEADER
-from gears.gear_map import map_cells, summary, wrong_rows
-from gears.gear_processes import HEADER as PROCESS_HEADER
-from gears.gear_processes import process_row
+from gears.gear_figures import draw_hysteresis
 from gears.gear_runs import (
     MOTIONS,
     PERIODS,
@@ -39,7 +35,6 @@ from gears.gear_runs import (
     uncompensated,
 )
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
-from tqdm import tqdm
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters.parameter import Value
@@ -196,26 +191,6 @@ def write(name: str, text: str) -> None:
     DOCUMENT.write_text(marks.sub(lambda mark: mark[1] + text + mark[2], page))
 
 
-def make_map(side: int, processes: int, into_document: bool) -> None:
-    """Draw the map, and say what is wrong on it."""
-    cells = map_cells(side, processes)
-    rows, counts = wrong_rows(cells), summary(cells)
-    print(f'{text_table(WRONG_HEADER, rows)}\n{counts}')
-    draw_map(cells, (IMAGES if into_document else ROOT / 'results') / 'physics_map.png')
-    if into_document:
-        table = markdown_table(WRONG_HEADER, rows) + '\n' if rows else ''
-        write('physics_map', f'{counts}\n\n{table}'.rstrip() + '\n')
-
-
-def run_processes(presets: list[str], into_document: bool) -> None:
-    """Measure what a user gets in real time, one preset after the other."""
-    rows = [process_row(preset) for preset in tqdm(presets, 'real time', disable=None)]
-    print(text_table(PROCESS_HEADER, rows))
-    if into_document:
-        table = markdown_table(PROCESS_HEADER, rows)
-        write('physics_processes', f'{table}\n\nMeasured on {machine()}.\n')
-
-
 def main() -> None:
     """Measure and print, or write."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -228,21 +203,11 @@ def main() -> None:
     parser.add_argument('--periods', type=int, default=PERIODS, help='of the motion')
     parser.add_argument('--parameter', action='append', default=[], metavar='KEY=VALUE',
                         help='change the identified file for the loops that learn')
-    parser.add_argument('--map', type=int, metavar='CELLS', default=0,
-                        help='only the map of inertia and bandwidth, with so many cells a side')
-    parser.add_argument('--real', action='store_true',
-                        help='only one sine a preset, as real processes in real time')
     parser.add_argument('--processes', type=int, default=processors(), metavar='N',
                         help='that compute beside each other')
     parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
     options = parser.parse_args()
-    if options.map:
-        make_map(options.map, options.processes, options.write)
-        return
     presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
-    if options.real:
-        run_processes(presets, options.write)
-        return
     sources = parallel(
         find, [(p, e, options.rate, options.duration) for p in presets for e in (False, True)],
         'identification', options.processes,

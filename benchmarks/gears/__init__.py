@@ -1,1 +1,1 @@
-"""Gears made of physics: their runs in one process and in real ones, and the map."""
+"""Gears made of physics: their runs in one process."""
