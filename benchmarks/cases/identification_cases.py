@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
+from backlash_ros.core.estimation.play import play
 from backlash_ros.core.identification.motion import strokes
-from backlash_ros.core.identification.play_record import PlayRecord
 
 Array = NDArray[np.float64]
 
@@ -70,7 +70,7 @@ def random_case(seed: int, series: int = 2026) -> Case:
     gap = _geometric(rng, *GAPS) * float(np.ptp(v))
     c_r = gap * float(rng.uniform(0.2, 0.8))
     start = float(v[0]) + float(rng.uniform(0.0, 1.0)) * gap
-    u = m * (PlayRecord(v).output(gap, start).p - c_r)
+    u = m * (play(v, gap, start) - c_r)
     before = np.full(SETTLING + delay + 1, 0.0 if integrating else u[0])
     clean = lfilter(numerator, denominator, np.append(before, u))[SETTLING:SETTLING + count]
     k = np.arange(count)

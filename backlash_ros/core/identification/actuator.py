@@ -52,7 +52,7 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
     off = float(np.sqrt(np.mean((found.v - commands)**2)))
     if details is None or off <= NEGLIGIBLE * gap:
         return found
-    p = details.fit.play.p
+    p = details.fit.p
     side = np.where(p <= found.v, 1.0, np.where(p >= found.v + gap, -1.0, 0.0))
     rows = _pushed(side)
     best = _best(commands, found.v, side, rows)

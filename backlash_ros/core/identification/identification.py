@@ -15,6 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.identification import uncertainty
+from backlash_ros.core.identification.gap_search import (
+    Profile,
+    profile,
+    search,
+    steiglitz_mcbride,
+)
 from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.not_play import Observed
 from backlash_ros.core.identification.order_selection import (
@@ -32,13 +38,14 @@ from backlash_ros.core.identification.order_selection import (
 )
 from backlash_ros.core.identification.output_error import (
     Fit,
-    Point,
     Samples,
     Structure,
+    best_start,
     fit,
-    linear_columns,
+    linear_rows,
+    squares_of,
+    triangle,
 )
-from backlash_ros.core.identification.separable_search import Profile, profile, search
 from backlash_ros.core.identification.uncertainty import Covariance
 from backlash_ros.core.identification.verdict import APART, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
@@ -51,19 +58,26 @@ T = TypeVar('T')
 
 GENERAL = Structure(3, 0, False)  # G with which the gap is searched first, and a tap per delay
 FEWEST = 8  # samples per unknown below which nothing is fitted
+EARLY, LATEST = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
+WINDOW = 4  # delays from one look at later ones to the next
+SHORTEST = 20  # samples of a record for each of the delay, at least
+LATER = 5.0  # log-likelihood by which a later delay must fit better
+ROWS = 1200  # in which gaps are compared: of more samples, neighbours are averaged
 SAME = 0.005  # relative distance of two gaps that are one
-NEAR = np.linspace(0.8, 1.2, 17)  # gaps around the best one, relative
+NEAR = np.linspace(0.8, 1.2, 13)  # gaps around the best one, relative
+WHOLE = 24  # gaps over the swing of v
 LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
 TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
 class Options:
-    """What is compared. integrators: of G, without and with one. slope: m, where it is known, else
-    1: m and the gain of G cannot be told apart. held_out: share of the record, its last."""
+    """What is compared. delays [samples]: none for EARLY, and later ones where these fit better.
+    integrators: of G, without and with one. slope: m, where it is known, else 1: m and the gain of
+    G cannot be told apart. held_out: share of the record, its last."""
 
     orders: Sequence[int] = (0, 1, 2, 3, 4)
-    delays: Sequence[int] = (0, 1, 2, 3)
+    delays: Sequence[int] = ()
     integrators: Sequence[bool] = (False, True)
     slope: float = 1.0
     held_out: float = 1.0 / 3.0
@@ -155,6 +169,18 @@ def identify(v: Array, y: Array, sample_period: float, options: Options | None =
             return found
 
 
+class _Search(NamedTuple):
+    """The best of the structures that were compared. rivals: other minima (gap, how far behind)."""
+
+    samples: Samples
+    compared: list[Compared]
+    chosen: Compared
+    best: Fit
+    rivals: list[tuple[float, float]]
+    curve: Profile
+    delays: Sequence[int]
+
+
 def identifying(
     v: Array, y: Array, sample_period: float, options: Options,
 ) -> Generator[str, None, Identification]:
@@ -165,55 +191,93 @@ def identifying(
     if nothing is not None:
         return nothing
     part = busiest(v, y)
-    first = max(options.delays) + 1
-    searched = Samples(v[part], y[part], first)
-    whole = GENERAL._replace(taps=GENERAL.order + max(options.delays))
-    found = yield from _named('searching the gap', search(searched, whole))
-    wild = _outliers(searched, found[0])
-    if wild.any():
-        searched = searched.without(wild)
-        found = yield from _named('searching the gap again', search(searched, whole))
-    candidates = _distinct(found)[:2]
-    compared = yield from _named('comparing orders and delays', compare(
-        searched, [one.point for one in candidates], options.orders, options.delays,
-        options.integrators, options.held_out,
-    ))
-    while True:
-        chosen = selected(compared)
-        best, rivals, curve = yield from _named('refining', _refined(searched, chosen))
-        if chosen.exact or not gives_way(best, compared):
-            break
-        # Only the best fit of all shows that a pole is none.
-        compared = [one._replace(fit=best) if one is chosen else one for one in compared]
-    alike = equal_delays(compared, chosen)
-    rows = effective_rows(searched, best)
+    s = yield from _searched(v[part], y[part], options, options.delays or EARLY)
+    if not options.delays and s.chosen.structure.delay == EARLY[-1]:
+        s = yield from _later(s, options)
+    rows = effective_rows(s.samples, s.best)
     # With as many poles, some of them may fit worse.
     others = [
-        one for one in _with_delays(searched, best, alike)
-        if rows * np.log(one.squares / max(best.squares, TINY)) <= PLATEAU
+        one for one in _with_delays(s.samples, s.best, equal_delays(s.compared, s.chosen))
+        if rows * np.log(one.squares / max(s.best.squares, TINY)) <= PLATEAU
     ]
-    best = yield from _named('choosing the delay', least_response(
-        searched, best, others, best.squares / rows,
+    best, penalty = yield from _named('choosing the delay', least_response(
+        s.samples, s.best, others, s.best.squares / rows,
     ))
-    samples, left_out = searched, int(wild.sum())
-    if len(v) > len(searched.v):
-        samples = Samples(v, y, first)
-        best = _on_all(samples, best)
+    yield 'fitting the whole record'
+    kept = y.copy()
+    kept[part] = s.samples.whole_y
+    samples = Samples(v, kept, max(s.delays) + 1)
+    if len(v) > len(s.samples.v):
+        best = _on_all(samples, best, penalty)
         wild = _outliers(samples, best)
-        left_out = int(wild.sum())
-        if left_out:
-            samples = samples.without(wild)
-            best = fit(samples, best.structure, best.point)
+        samples = samples.without(wild) if wild.any() else samples
+    best = fit(samples, best.structure, best.point, penalty=penalty)
     yield 'judging'
     return _described(
-        samples, searched, best, compared, chosen, rivals, curve, left_out,
+        samples, s, best, int((np.isfinite(y) & np.isnan(samples.whole_y)).sum()),
         Identification(sample_period, v, y), options, part.start,
     )
 
 
+def _searched(
+    v: Array, y: Array, options: Options, delays: Sequence[int],
+) -> Generator[str, None, _Search]:
+    """The best structure with one of these delays."""
+    samples = Samples(v, y, max(delays) + 1)
+    whole = _general(min(delays), max(delays))
+    found = yield from _named('searching the gap', search(samples.coarse(ROWS), whole))
+    wild = _outliers(samples, fit(samples, whole, found[0].point))
+    if wild.any():
+        samples = samples.without(wild)
+        found = yield from _named('searching the gap again', search(
+            samples.coarse(ROWS), whole))
+    compared = yield from _named('comparing orders and delays', compare(
+        samples, [one.point for one in _distinct(found)[:2]], options.orders, delays,
+        options.integrators, options.held_out,
+    ))
+    finalists = [one for one in compared if np.isfinite(one.criterion)]
+    while True:
+        chosen = selected(finalists)
+        best, rivals, curve = yield from _named('refining', _refined(samples, chosen))
+        if chosen.exact or not gives_way(best, finalists):
+            return _Search(samples, compared, chosen, best, rivals, curve, delays)
+        # Only the best fit of all shows that a pole is none.
+        finalists = [one._replace(fit=best) if one is chosen else one for one in finalists]
+
+
+def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
+    """The search among later delays, where one of them explains y better."""
+    v, y = early.samples.v, early.samples.whole_y
+    latest = min(LATEST, len(v) // SHORTEST)
+    samples = Samples(v, y, latest + 1, most=ROWS)
+    gaps = np.append(early.best.point.gap * np.array([1.0, 0.75, 0.5]),
+                     samples.swing * np.geomspace(0.01, 0.5, 5))
+    tried = []
+    for delay in range(0, latest, WINDOW):
+        structure = _general(delay, delay + WINDOW)
+        for gap in gaps.tolist():
+            p = samples.played(gap, float(v[0]) + 0.5 * gap)
+            a = steiglitz_mcbride(samples, structure, p)[0]
+            tried.append((squares_of(samples, structure, a, p), delay))
+        yield 'searching later delays'
+    delay = min(tried)[1]
+    if not delay:
+        return early
+    window = range(delay - 1, min(delay + WINDOW + 2, latest) + 1)
+    late = yield from _searched(v, y, options, window)
+    rows = effective_rows(late.samples, late.best)
+    better = rows * float(np.log(early.best.rms / max(late.best.rms, TINY)))
+    return late if better > LATER else early
+
+
+def _general(first: int, last: int) -> Structure:
+    """G with which the gap is searched: a few poles, and a tap for each delay."""
+    return GENERAL._replace(delay=first, taps=GENERAL.order + last - first)
+
+
 def _nothing(v: Array, y: Array, sample_period: float, options: Options) -> Identification | None:
     """Where there is nothing to fit: why."""
-    first = max(options.delays) + 1
+    first = max(options.delays or EARLY) + 1
     part = busiest(v, y)
     known = np.isfinite(y[part][first:])
     # The first samples of them are fitted alone, to predict the others.
@@ -263,40 +327,39 @@ def _refined(
     samples: Samples, chosen: Compared,
 ) -> Generator[None, None, tuple[Fit, list[tuple[float, float]], Profile]]:
     """The best fit of the chosen structure, other minima (gap, how far behind), the profile."""
-    structure, swing = chosen.structure, samples.play.swing
-    best = chosen.fit
-    whole: Array = np.append(0.0, np.geomspace(1e-3, 0.99, 40) * swing)
-    curve = yield from profile(samples, structure, whole, best)
-    around = np.array([gap for gap in best.point.gap * NEAR if 0.0 < gap < swing])
-    near = yield from profile(samples, structure, around, best)
+    structure, swing = chosen.structure, samples.swing
+    coarse = samples.coarse(ROWS)
+    centre = fit(coarse, structure, chosen.fit.point)
+    whole: Array = np.append(0.0, np.geomspace(1e-3, 0.99, WHOLE) * swing)
+    curve = yield from profile(coarse, structure, whole, centre)
+    around = np.array([gap for gap in centre.point.gap * NEAR if 0.0 < gap < swing])
+    near = yield from profile(coarse, structure, around, centre)
     minima: list[Fit] = []
     for minimum in [*near.minima()[:3], *curve.minima()[:3]]:
         minima.append(fit(samples, structure, minimum.point))
         yield
-    best = min([best, *minima], key=lambda one: one.squares)
+    best = min([chosen.fit, *minima], key=lambda one: one.squares)
     rows = effective_rows(samples, best)
     rivals = sorted(
         (behind, one.point.gap) for one in minima
         if abs(one.point.gap - best.point.gap) > APART * best.point.gap
         for behind in [0.5 * rows * float(np.log(one.squares / max(best.squares, TINY)))]
     )
-    gaps = np.concatenate([curve.gaps, near.gaps, [best.point.gap]])
+    gaps = np.concatenate([curve.gaps, near.gaps, [centre.point.gap]])
     order = np.argsort(gaps, kind='stable')
-    fits = [*curve.fits, *near.fits, best]
+    fits = [*curve.fits, *near.fits, centre]
     merged = Profile(
         gaps[order], np.array([fits[k].squares for k in order]), [fits[k] for k in order]
     )
     return best, [(gap, behind) for behind, gap in rivals], merged
 
 
-def _on_all(samples: Samples, best: Fit) -> Fit:
+def _on_all(samples: Samples, best: Fit, penalty: Array | None) -> Fit:
     """The same structure on a longer record, at whose begin p may be anywhere in the gap."""
     v0, gap = float(samples.v[0]), best.point.gap
-    fits = [
-        fit(samples, best.structure, Point(best.point.a, gap, v0 + share * gap))
-        for share in (0.0, 0.5, 1.0)
-    ]
-    return min(fits, key=lambda one: one.squares)
+    starts = [v0 + share * gap for share in (0.0, 0.5, 1.0)]
+    begin = best_start(samples, best.structure, [best.point.a], gap, starts)
+    return fit(samples, best.structure, begin, penalty=penalty)
 
 
 def _with_delays(samples: Samples, best: Fit, delays: Sequence[int]) -> list[Fit]:
@@ -308,9 +371,8 @@ def _with_delays(samples: Samples, best: Fit, delays: Sequence[int]) -> list[Fit
 
 
 def _described(
-    samples: Samples, searched: Samples, best: Fit, compared: Sequence[Compared],
-    chosen: Compared, rivals: list[tuple[float, float]], curve: Profile, left_out: int,
-    given: Identification, options: Options, searched_from: int,
+    samples: Samples, s: _Search, best: Fit, left_out: int, given: Identification,
+    options: Options, searched_from: int,
 ) -> Identification:
     """Everything there is to say of the best fit."""
     covariance = uncertainty.covariance_of(samples, best)
@@ -326,7 +388,7 @@ def _described(
     rows = effective_rows(samples, best)
     still = _still(samples, best)
     correlation = max(lag_one(samples, best) - 3.0 / np.sqrt(len(samples.known)), 0.0)
-    held_out = _held_out(searched, chosen, options.held_out)
+    held_out = _held_out(s.samples, s.chosen, options.held_out)
     numerator = best.numerator / options.slope
     step = quantum(samples.y)
     total = float(best.numerator.sum())
@@ -339,9 +401,9 @@ def _described(
         # Whatever the correlation: what explains nine tenths of y shows v.
         inf if best.squares < 0.01 * still
         else 0.5 * rows * float(np.log(still / max(best.squares, TINY))),
-        correlation, held_out.rms, held_out.trained, rivals, best.play.reversals, step,
+        correlation, held_out.rms, held_out.trained, s.rivals, best.reversals, step,
         [_text(pole) for pole in cancelled_poles(best)], best.structure.delay,
-        max(options.delays),
+        best.structure.delay == max(s.delays) and _delay_open(samples, best),
     ))
     # What no model explains moves both sides of the gap alike.
     more = 0.25 * (verdict.gap_std**2 - gap_var)
@@ -354,37 +416,43 @@ def _described(
         },
         numerator=tuple(numerator.tolist()), denominator=_proper(best),
         delay=best.structure.delay,
-        delays=tuple(sorted({*equal_delays(compared, chosen), best.structure.delay})),
+        delays=tuple(sorted({*equal_delays(s.compared, s.chosen), best.structure.delay})),
         integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
         quantum=step, correlation=correlation,
         ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
         uncertainty=_as_parameter(float(spread.max())), outliers=left_out,
         reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
         details=Details(
-            samples, searched, searched_from, best, covariance, tuple(compared), chosen, curve,
-            held_out,
+            samples, s.samples, searched_from, best, covariance, tuple(s.compared), s.chosen,
+            s.curve, held_out,
         ),
     )
 
 
+def _delay_open(samples: Samples, best: Fit) -> bool:
+    """Whether one more sample of delay fits as well."""
+    later = Samples(samples.v, samples.whole_y, samples.first + 1)
+    longer = best.structure._replace(delay=best.structure.delay + 1)
+    this, other = (fit(later, structure, best.point) for structure in (best.structure, longer))
+    ratio = float(np.log(max(other.squares, TINY) / max(this.squares, TINY)))
+    return bool(best.structure.delay) and effective_rows(later, this) * ratio < PLATEAU
+
+
 def _still(samples: Samples, best: Fit) -> float:
     """Squares left over by a u that stands still, through the same G."""
-    structure = best.structure
-    columns = linear_columns(samples, structure, best.point.a, best.play.p)
-    columns = columns[samples.known, structure.numerator_taps:]
-    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
-    basis = np.linalg.qr(columns / np.where(scale > 0.0, scale, 1.0))[0]
-    left = samples.target - basis @ (basis.T @ samples.target)
-    return max(float(left @ left), TINY)
+    rows = linear_rows(samples, best.structure, best.point.a, best.p)
+    without = samples.reduced(rows[best.structure.numerator_taps:])
+    r, scale = triangle(np.vstack([without, samples.target]))
+    return max(float(r[-1, -1] * scale[-1]) ** 2, TINY)
 
 
 def _observed(samples: Samples, best: Fit, step: float) -> Observed:
     """The signals of a fit, each where it acts on y."""
     y = samples.y
-    noise = noise_of(samples.known.astype(float), samples.target)
+    noise = noise_of(samples.known.astype(float), y[samples.known])
     return Observed(
         samples.v[samples.first:samples.last], y,
-        samples.delayed(best.play.p, best.structure.delay), best.simulated,
+        samples.delayed(best.p, best.structure.delay), best.simulated,
         max(noise, step / np.sqrt(12.0)), best.point.gap,
     )
 

@@ -31,19 +31,22 @@ UNKNOWN = 0.1  # relative deviation, or difference, of G beyond which the record
 
 def least_response(
     samples: Samples, best: Fit, rivals: Sequence[Fit], noise_variance: float,
-) -> Generator[None, None, Fit]:
-    """The fit to take. rivals: with other delays, that fit alike. noise_variance: effective."""
+) -> Generator[None, None, tuple[Fit, Array | None]]:
+    """The fit to take, and the penalty that it was made with, as `fit` takes it.
+
+    rivals: with other delays, that fit alike. noise_variance: effective.
+    """
     silent = _silent(samples, best)
     if not len(silent):
         silent = _contradicted(best, rivals)
     if not len(silent):
-        return best
-    found: list[tuple[float, Fit]] = []
+        return best, None
+    found: list[tuple[float, Fit, Array | None]] = []
     for one in (best, *rivals):
-        smooth = _smoothed(samples, one, silent, noise_variance)
-        found.append((_gain(smooth, silent), smooth))
+        smooth, penalty = _smoothed(samples, one, silent, noise_variance)
+        found.append((_gain(smooth, silent), smooth, penalty))
         yield
-    return min(found, key=lambda pair: pair[0])[1]
+    return min(found, key=lambda one: one[0])[1:]
 
 
 def _silent(samples: Samples, best: Fit) -> Array:
@@ -79,16 +82,18 @@ def _gain(found: Fit, silent: Array) -> float:
     return float(values @ values)
 
 
-def _smoothed(samples: Samples, found: Fit, silent: Array, noise_variance: float) -> Fit:
+def _smoothed(
+    samples: Samples, found: Fit, silent: Array, noise_variance: float,
+) -> tuple[Fit, Array | None]:
     """The fit with the heaviest penalty whose squares stay within what is allowed."""
     rows, gain = _rows(found, silent), _gain(found, silent)
     if gain == 0.0:
-        return found
+        return found, None
     most = found.squares + 4.0 * noise_variance  # two standard deviations
     factor = np.sqrt(1e4 * found.squares / gain)
     for _ in range(12):
         smooth = fit(samples, found.structure, found.point, penalty=factor * rows)
         if smooth.squares <= most:
-            return smooth
+            return smooth, factor * rows
         factor *= 0.25
-    return found
+    return found, None

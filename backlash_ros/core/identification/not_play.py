@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize, nnls
 
-from backlash_ros.core.identification.play_record import PlayRecord
+from backlash_ros.core.estimation.play import LEFT, engaged, plays
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
@@ -169,12 +169,12 @@ def other_nonlinearity(o: Observed) -> str:
     """A dead zone, a drive that compensates already, or several plays in parallel."""
     part = slice(0, min(len(o.v), LONGEST))
     fit = _Family(o.v[part], o.y[part])
-    swing, play = float(np.ptp(fit.v)), PlayRecord(fit.v)
+    swing = float(np.ptp(fit.v))
     if swing == 0.0 or len(fit.rows) < 100:
         return ''
 
     def with_play(width: float) -> Array:
-        return play.output(abs(width), float(fit.v[0]) + 0.5 * abs(width)).p - 0.5 * abs(width)
+        return _played(fit.v, abs(width)) - 0.5 * abs(width)
 
     widths = [(swing * share,) for share in WIDTHS] + [(o.gap,)]
     one = fit.best(with_play, widths)
@@ -212,13 +212,14 @@ def other_nonlinearity(o: Observed) -> str:
 def varies(o: Observed, parts: Sequence[NDArray[np.bool_]]) -> tuple[Array, Array]:
     """The gap in each part of a record (flags (N,) each), and its standard deviation."""
     fit = _Family(o.v, o.y)
-    play = PlayRecord(o.v).output(o.gap, float(o.v[0]) + 0.5 * o.gap)
-    columns = fit.columns(play.p)
+    p = _played(o.v, o.gap)
+    left = engaged(o.v, p, o.gap) == LEFT
+    columns = fit.columns(p)
     _, solution = fit.squares(columns)
     residual = fit.target - np.column_stack([columns, fit.common]) @ solution
     # What y would do if the gap were wider in this part alone.
     by = np.column_stack([
-        fit.columns((play.by_gap - 0.5) * flags) @ solution[:columns.shape[1]] for flags in parts
+        fit.columns((left - 0.5) * flags) @ solution[:columns.shape[1]] for flags in parts
     ])
     whole = np.column_stack([by, fit.common])
     scale = np.sqrt(np.einsum('ij,ij->j', whole, whole))
@@ -390,6 +391,12 @@ class _Family:
             return False
         # What happens to fit one part of the motion does not fit the other.
         return bool((self.halves(other) < (1.0 - 0.5 * share) * self.halves(one)).all())
+
+
+def _played(v: Array, gap: float) -> Array:
+    """p (N,) of v (N,), from the middle of the gap."""
+    p: Array = plays(v, np.array([gap]), v[:1] + 0.5 * gap)[0]
+    return p
 
 
 def _dead_zone(v: Array, centre: float, half: float) -> Array:

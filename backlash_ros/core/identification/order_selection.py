@@ -23,24 +23,29 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.identification.gap_search import FILTERS, steiglitz_mcbride
 from backlash_ros.core.identification.output_error import (
     Fit,
     Point,
     Samples,
     Structure,
+    best_start,
     fit,
-    squares_of,
+    solved,
+    triangle,
 )
-from backlash_ros.core.identification.starting_models import steiglitz_mcbride
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
 WITHIN = 1.05  # times the least held-out error: equally good
-STARTS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)  # places in the gap at which p may begin
+STARTS = (0.0, 0.33, 0.67, 1.0)  # places in the gap at which p may begin
 CANCELS = 0.02  # distance of a pole and a zero that cancel, relative to that of the pole from 1
 SLOWEST = 0.01  # ... which counts as this much at least: a zero at 1 cancels an integrator
-EPS = float(np.finfo(float).eps)
+EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
+RACE = 1200  # rows that tell which structures may be the best
+FEW_STEPS = 4  # of a fit that tells whether a structure may be the best
+FINALISTS = 4  # by the criterion, and as many by prediction
 ROUNDED = 2.0  # the simulated y, and the measured one, which may be a simulation as well
 AS_WELL = 4.0  # ratio of the squares left over: without noise, it shows a pole that is cancelled
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
@@ -68,38 +73,62 @@ def compare(
 ) -> Generator[None, None, list[Compared]]:
     """Fit every structure, from gaps and starts that are about right; yields between them.
 
-    held_out: share at the end of the record that is compared on.
+    A few steps tell which structures may be the best; only these are fitted to the end. held_out:
+    share at the end of the record that is compared on.
     """
     cut = samples.last - round(held_out * samples.count)
     train, later = samples.part(samples.first, cut), samples.part(cut, samples.last)
-    found: list[tuple[float, Fit, Fit]] = []
-    for integrator in integrators:
-        for delay in delays:
-            below: Fit | None = None
-            for order in orders:
-                if order < integrator:
-                    continue
-                structure = Structure(order, delay, integrator)
-                below = _fit_from(train, structure, candidates, below)
-                whole = fit(samples, structure, below.point)
-                found.append((held_out_rms(below, later), below, whole))
-                yield
-    best = min((whole for _, _, whole in found), key=lambda whole: whole.squares)
-    rows = effective_rows(samples, best)
-    smallest = np.finfo(float).tiny
-    return [
-        Compared(
-            whole.structure, rms, trained, whole,
-            rows * float(np.log(max(whole.squares, smallest)))
-            + whole.structure.unknowns * float(np.log(len(samples.known))),
-            whole.rms <= rounding(samples, whole),
-        )
-        for rms, trained, whole in found
+    structures = [
+        Structure(order, delay, integrator) for integrator in integrators for delay in delays
+        for order in orders if order >= integrator
     ]
+    coarse = train.coarse(RACE)
+    first: dict[Structure, Compared] = {}
+    for structure in structures:
+        begin = _modelled(coarse, structure, candidates[0], FILTERS[1:2])
+        found = fit(coarse, structure, begin, iterations=FEW_STEPS)
+        first[structure] = _compared(found, found, coarse, later)
+        yield
+    done: dict[Structure, Compared] = {}
+    for structure in _finalists(first):
+        begins = [first[structure].trained.point]
+        begins += [_modelled(train, structure, point) for point in candidates[1:]]
+        below = done.get(structure._replace(order=structure.order - 1))
+        if below is not None:
+            begins += _with_a_pole(below.trained.point)
+        some = [fit(train, structure, begin, iterations=FEW_STEPS) for begin in begins]
+        found = fit(train, structure, min(some, key=lambda one: one.squares).point)
+        done[structure] = _compared(found, fit(samples, structure, found.point), samples, later)
+        yield
+    # What was not fitted to the end is shown alone.
+    return [done.get(structure, first[structure]._replace(criterion=inf, exact=False))
+            for structure in structures]
+
+
+def _compared(trained: Fit, whole: Fit, samples: Samples, later: Samples) -> Compared:
+    rows = effective_rows(samples, whole)
+    return Compared(
+        whole.structure, held_out_rms(trained, later), trained, whole,
+        rows * float(np.log(max(whole.squares, TINY)))
+        + whole.structure.unknowns * float(np.log(len(samples.target))),
+        whole.rms <= rounding(samples, whole),
+    )
+
+
+def _finalists(first: dict[Structure, Compared]) -> list[Structure]:
+    """Structures that may be the best by either measure, with those that they may give way to."""
+    by_criterion = sorted(first, key=lambda s: first[s].criterion)
+    by_prediction = sorted(first, key=lambda s: first[s].held_out)
+    good = {*by_criterion[:FINALISTS], *by_prediction[:FINALISTS]}
+    good |= {best._replace(delay=s.delay) for best in by_criterion[:1] for s in first}
+    for s in list(good):
+        good |= {Structure(s.order - 1, s.delay, also) for also in (False, s.integrator)}
+    return [structure for structure in first if structure in good]
 
 
 def selected(compared: Sequence[Compared]) -> Compared:
     """The structure that is taken."""
+    compared = [one for one in compared if np.isfinite(one.criterion)]
     needed = [one for one in compared if not gives_way(one.fit, compared)]
     # What a pole near 1 rounds may hide noise: without it, y is explained as well.
     exact = [one for one in compared if one.exact and not gives_way(one.fit, [
@@ -160,30 +189,31 @@ def equal_delays(compared: Sequence[Compared], chosen: Compared) -> list[int]:
     })
 
 
-def _fit_from(
-    samples: Samples, structure: Structure, candidates: Sequence[Point], below: Fit | None,
-) -> Fit:
-    fits: list[Fit] = []
-    for point in candidates:
-        p = samples.play.output(point.gap, point.start).p
-        a = steiglitz_mcbride(samples, structure, p)[0]
-        v0 = float(samples.v[0])
-        # A state of fewer numbers does not hide a start that is wrong.
-        starts = [point.start, *(v0 + share * point.gap for share in STARTS)]
-        fits.append(fit(samples, structure, min(
-            (Point(a, point.gap, start) for start in starts),
-            key=lambda one: squares_of(samples, structure, one),
-        )))
-    if below is not None and below.structure.free_poles == structure.free_poles - 1:
-        for pole in (0.3, 0.85):
-            a = np.convolve(np.append(1.0, below.point.a), (1.0, -pole))[1:]
-            fits.append(fit(samples, structure, below.point._replace(a=a)))
-    return min(fits, key=lambda found: found.squares)
+def _modelled(
+    samples: Samples, structure: Structure, point: Point, filters: Sequence[float] = FILTERS,
+) -> Point:
+    """A model for a gap, and where p began with it."""
+    p = samples.played(point.gap, point.start)
+    models = steiglitz_mcbride(samples, structure, p, filters)[:1]
+    if len(point.a) == structure.free_poles:
+        models.append(point.a)
+    # A state of fewer numbers does not hide a start that is wrong.
+    v0 = float(samples.v[0])
+    starts = [point.start, *(v0 + share * point.gap for share in STARTS)]
+    return best_start(samples, structure, models, point.gap, starts)
+
+
+def _with_a_pole(point: Point) -> list[Point]:
+    """Points of the next order."""
+    return [
+        point._replace(a=np.convolve(np.append(1.0, point.a), (1.0, -pole))[1:])
+        for pole in (0.3, 0.85)
+    ]
 
 
 def held_out_rms(found: Fit, later: Samples) -> float:
     """Error of what the fit predicts for later samples."""
-    residual = later.target - predicted(found, later)[later.known]
+    residual = (later.y - predicted(found, later))[later.known]
     rms = float(np.sqrt(np.mean(residual**2)))
     return rms if np.isfinite(rms) else inf
 
@@ -191,33 +221,30 @@ def held_out_rms(found: Fit, later: Samples) -> float:
 def predicted(found: Fit, later: Samples) -> Array:
     """Simulation over samples (M,), begun in the state and with the offset that fit them best."""
     structure, count = found.structure, later.count
-    inputs = np.zeros((2, count))
-    p = later.play.output(found.point.gap, found.point.start).p
-    inputs[0] = later.delayed(p, structure.delay) - found.centre
-    inputs[1, 0] = 1.0
+    one = np.zeros(count)
+    one[0] = 1.0
+    p = later.delayed(later.played(found.point.gap, found.point.start), structure.delay)
     denominator = found.denominator
-    simulated = lfilter(found.numerator, denominator, inputs[0])
-    impulse = lfilter([1.0], denominator, inputs[1])
-    columns = np.zeros((count, 1 + structure.state_terms))
-    columns[:, 0] = np.cumsum(impulse)
+    simulated = lfilter(found.numerator, denominator, p - found.centre) + later.middle
+    impulse = lfilter([1.0], denominator, one)
+    rows = np.zeros((1 + structure.state_terms, count))
+    rows[0] = np.cumsum(impulse)
     for i in range(structure.state_terms):
-        columns[i:, 1 + i] = impulse[:count - i]
-    scale = np.sqrt(np.einsum('ij,ij->j', columns, columns))
-    columns /= np.where(scale > 0.0, scale, 1.0)
-    error = later.target - simulated[later.known]
-    best = np.linalg.lstsq(columns[later.known], error, rcond=None)[0]
-    return np.asarray(simulated + columns @ best)
+        rows[1 + i, i:] = impulse[:count - i]
+    error = np.where(np.isfinite(later.y), later.y - simulated, 0.0)
+    r, scale = triangle(np.vstack([later.reduced(rows), later.reduced(error)]))
+    return np.asarray(simulated + (solved(r[:-1, :-1], r[:-1, -1]) * scale[-1] / scale[:-1]) @ rows)
 
 
 def effective_rows(samples: Samples, found: Fit) -> float:
     """N' of the formula above."""
     r = lag_one(samples, found)
-    return len(samples.known) * (1.0 - r) / (1.0 + r)
+    return len(samples.target) * (1.0 - r) / (1.0 + r)
 
 
 def lag_one(samples: Samples, found: Fit) -> float:
-    """Correlation of the residuals of successive readings, lost ones left out, at least 0."""
-    residual = samples.target - found.simulated[samples.known]
+    """Correlation of the residuals of successive rows, lost ones left out, at least 0."""
+    residual = samples.target - samples.reduced(found.simulated - samples.middle)
     energy = float(np.mean(residual**2))
     if energy == 0.0 or len(residual) < 2:
         return 0.0

@@ -17,12 +17,11 @@ from scipy.special import gammaincc
 from backlash_ros.core.identification.output_error import (
     Fit,
     Samples,
-    linear_columns,
-    slopes,
+    linear_rows,
+    slope_rows,
 )
 
 Array = NDArray[np.float64]
-
 
 
 class Covariance(NamedTuple):
@@ -84,11 +83,9 @@ def ljung_box(residual: Array) -> float:
 
 def covariance_of(samples: Samples, found: Fit) -> Covariance:
     """Covariance of everything that was fitted."""
-    structure, a = found.structure, found.point.a
-    columns = np.column_stack([
-        slopes(samples, structure, a, found.play, found.numerator, found.simulated),
-        linear_columns(samples, structure, a, found.play.p),
-    ])
+    columns = np.vstack([
+        slope_rows(samples, found), linear_rows(samples, found.structure, found.point.a, found.p),
+    ]).T
     residual = samples.y - found.simulated
     columns[~np.isfinite(residual)] = 0.0
     size = np.sqrt(np.einsum('ij,ij->j', columns, columns))
@@ -115,12 +112,13 @@ def covariance_of(samples: Samples, found: Fit) -> Covariance:
 
 def crossings_covariance(found: Fit, covariance: Covariance) -> Array:
     """Covariance of (gap, c_r), shape (2, 2)."""
-    taps = found.structure.numerator_taps
-    total, offset = float(found.numerator.sum()), float(found.linear[taps])
+    total, offset = float(found.numerator.sum()), found.offset
     jacobian = np.zeros((2, len(covariance.matrix)))
     jacobian[0, covariance.gap] = 1.0
     jacobian[1, covariance.numerator] = offset / total**2
     jacobian[1, covariance.offset] = -1.0 / total
+    if not found.structure.integrator:  # A(1) times the middle of y is part of the offset
+        jacobian[1, :covariance.poles] = -found.middle / total
     return np.asarray(jacobian @ covariance.matrix @ jacobian.T)
 
 

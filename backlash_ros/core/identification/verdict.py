@@ -88,8 +88,8 @@ class Findings(NamedTuple):
     evidence: log-likelihood by which the fit beats a u that stands still. correlation: of
     successive residuals beyond chance. held_out, trained: rms of the errors on the samples held out
     and on the others. rivals: other gaps with the log-likelihood by which they fall behind.
-    reversals: of p. quantum: of y, 0 for none. cancelled: poles that zeros cancel. delay, and the
-    longest one that was compared.
+    reversals: of p. quantum: of y, 0 for none. cancelled: poles that zeros cancel. delay [samples],
+    delay_open: whether it is the longest that was compared, and a longer one fits as well.
     """
 
     observed: Observed
@@ -110,17 +110,12 @@ class Findings(NamedTuple):
     quantum: float
     cancelled: Sequence[str]
     delay: int
-    longest_delay: int
+    delay_open: bool
 
     @property
     def swing(self) -> float:
         """Of v."""
         return float(np.ptp(self.observed.v))
-
-    @property
-    def delay_at_edge(self) -> bool:
-        """Whether a longer delay may do better."""
-        return self.delay == self.longest_delay > 0
 
     @property
     def rms(self) -> float:
@@ -143,7 +138,7 @@ def judge(f: Findings) -> Verdict:
     """The answers to three questions."""
     others = [_parted(text) for text in what_it_is(f.observed)]
     spread = float(np.hypot(f.gap_std, PER_UNEXPLAINED * f.unexplained))
-    if f.delay_at_edge:
+    if f.delay_open:
         # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
         spread = float(np.hypot(spread, np.abs(np.diff(f.observed.v)).mean()))
     remarks = list(_remarks(f))
@@ -292,7 +287,7 @@ def _remarks(f: Findings) -> list[str]:
     found = []
     if f.static < 0.0 and f.gain_std <= PRECISE:
         found.append('y moves against v: the gain of G is negative')
-    if f.delay_at_edge:
+    if f.delay_open:
         found.append(
             f'the delay of {f.delay} samples is the longest that was compared, and the gap may '
             f'have some of a longer one: try --delay {f.delay}-{min(2 * f.delay + 4, 40)}'

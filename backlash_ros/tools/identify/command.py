@@ -46,9 +46,9 @@ def make_parser() -> argparse.ArgumentParser:
                         help='of several: the one that is meant')
     parser.add_argument('--order', type=_range_to(6, 0), default=(0, 1, 2, 3, 4),
                         metavar='N[-N]', help='numbers of poles that are compared (default: 0-4)')
-    parser.add_argument('--delay', type=_range_to(40, 0), default=(0, 1, 2, 3),
-                        metavar='N[-N]',
-                        help='delays that are compared [samples] (default: 0-3)')
+    parser.add_argument('--delay', type=_range_to(40, 0), default=(), metavar='N[-N]',
+                        help='delays that are compared [samples] (default: 0-3, and those up to '
+                             '40 if they fit better)')
     parser.add_argument('--integrator', choices=sorted(INTEGRATORS), default='auto',
                         help='whether G has a pole at 1 (default: auto)')
     parser.add_argument('--slope', type=positive, default=1.0, metavar='M',

@@ -207,7 +207,7 @@ def draw_loop(found: Identification, details: Details) -> Figure:
     v = details.samples.v[-LOOP_POINTS:]
     left.plot(v, details.samples.whole_y[-LOOP_POINTS:], color=HUES['y'], linewidth=0.8)
     label(left, 'As measured', 'y', 'v')
-    u = found.m * (details.fit.play.p[-LOOP_POINTS:] - found.c_r)
+    u = found.m * (details.fit.p[-LOOP_POINTS:] - found.c_r)
     right.plot(v, u, color='#222222', linewidth=1.2, label='u', zorder=3)
     ends = np.array([v.min(), v.max()])
     for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):

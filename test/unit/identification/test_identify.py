@@ -127,7 +127,7 @@ def test_a_bad_file_is_told_in_one_line(
 
 
 @pytest.mark.parametrize('arguments', [
-    [], ['nowhere.csv'], ['--drive', 'a.csv'], ['a.csv', '--order', '0'],
+    [], ['nowhere.csv'], ['--drive', 'a.csv'], ['a.csv', '--order', '7'],
     ['a.csv', '--order', '4-2'], ['a.csv', '--delay', 'x'], ['a.csv', '--slope', '0'],
     ['a.csv', '--held-out', '0.9'], ['a.csv', '--from', '3', '--to', '2'],
     ['a.csv', '--integrator', 'perhaps'], ['a.csv', '--precision', '200%'],

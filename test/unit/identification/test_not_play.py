@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from backlash_ros.core.estimation import play as operator
 from backlash_ros.core.identification.not_play import (
     Observed,
     coasting,
@@ -20,7 +21,6 @@ from backlash_ros.core.identification.not_play import (
     varies,
     what_it_is,
 )
-from backlash_ros.core.identification.play_record import PlayRecord
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ PLANTS: dict[str, tuple[list[float], list[float]]] = {
 
 
 def play(v: Array, gap: float) -> Array:
-    return np.asarray(PlayRecord(v).output(gap, float(v[0]) + 0.5 * gap).p - 0.5 * gap)
+    return operator.play(v, gap, float(v[0]) + 0.5 * gap) - 0.5 * gap
 
 
 def dead_zone(v: Array) -> Array:

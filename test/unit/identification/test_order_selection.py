@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from backlash_ros.core.estimation.play import play
 from backlash_ros.core.identification.identification import Options, identify
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.order_selection import (
@@ -19,10 +20,8 @@ from backlash_ros.core.identification.order_selection import (
     selected,
 )
 from backlash_ros.core.identification.output_error import Fit, Point, Structure
-from backlash_ros.core.identification.play_record import PlayOutput, PlayRecord
 
 Array = NDArray[np.float64]
-NOTHING = PlayOutput(np.empty(0), np.empty(0), np.empty(0), 0)
 
 
 def fit_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Fit:
@@ -31,7 +30,8 @@ def fit_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Fit:
     a = np.real(np.poly(poles))[1:] if poles else np.empty(0)
     b = np.zeros(structure.order)
     b[structure.order - 1 - len(zeros):] = np.real(np.poly(zeros))
-    return Fit(structure, Point(a, 1.0, 0.0), np.append(b, 0.0), np.empty(0), NOTHING, 0.0, 1.0, 1)
+    return Fit(structure, Point(a, 1.0, 0.0), np.append(b, 0.0), np.empty(0), np.empty(0),
+               0.0, 0.0, 1.0, 1)
 
 
 def compared(fit: Fit, held_out: float, criterion: float, exact: bool = False) -> Compared:
@@ -85,7 +85,7 @@ def test_a_slow_motion_of_a_motor_shows_no_integrator() -> None:
     """The rounding of a slow y drifts, which an integrator without effect would follow."""
     period, step = 0.005, 2.0 * np.pi / 2**14
     v: Array = np.array(list(islice(strokes(-9.0, 11.0, 200.0, period, 60.0, 0.0), 2700)))
-    u = 0.098 * (PlayRecord(v).output(0.9, 0.55).p - 0.55)
+    u = 0.098 * (play(v, 0.9, 0.55) - 0.55)
     y = lfilter([0.0, 0.1568, 0.1269], [1.0, -1.2498, 0.5335], u)
     found = identify(v, step * np.round(y / step), period, Options((2, 3, 4), (0,)))
     assert found.reasons == ()
@@ -97,7 +97,7 @@ def test_a_slow_motion_of_a_motor_shows_no_integrator() -> None:
 def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
     rng = np.random.default_rng(8)
     v = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
-    u = PlayRecord(v).output(0.4, 0.2).p - 0.1
+    u = play(v, 0.4, 0.2) - 0.1
     y = np.append(np.zeros(3), 1.7 * u[:-3]) + 0.002 * rng.standard_normal(len(v))
     found = identify(v, y, 0.02, Options((0, 1), (1, 2, 3)))
     assert found.usable
@@ -108,3 +108,14 @@ def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
     edge = identify(v, y, 0.02, Options((0, 1), (0, 1)))
     assert edge.std['gap'] > 0.9 * np.abs(np.diff(v)).mean()
     assert any('longest that was compared' in text for text in edge.remarks)
+
+
+def test_a_delay_beyond_those_that_are_compared_first_is_found() -> None:
+    rng = np.random.default_rng(8)
+    v = np.array(list(islice(strokes(-2.0, 2.0, 8.0, 0.02, 20.0, 0.0), 1000)))
+    u = play(v, 0.4, 0.2) - 0.1
+    y = lfilter([0.0, 0.3], [1.0, -0.7], np.append(np.zeros(12), u[:-12]))
+    found = identify(v, y + 0.002 * rng.standard_normal(len(v)), 0.02, Options((1, 2)))
+    assert found.delay == 12
+    assert found.gap == pytest.approx(0.4, abs=4.0 * found.std['gap'])
+    assert found.std['gap'] < 0.01
