@@ -92,9 +92,9 @@ MOTORS = {
 }
 
 
-@pytest.mark.parametrize('take_up', [30.0, 100.0, np.inf])
+@pytest.mark.parametrize('take_up', [30.0, np.inf])
 @pytest.mark.parametrize('motor', MOTORS)
-@pytest.mark.parametrize('stop', [2.5, 3.5, 3.7, 4.0])
+@pytest.mark.parametrize('stop', [2.5, 3.7])
 def test_v_rests_however_long_it_takes_to_cross_the_gap(
     motor: str, stop: float, take_up: float,
 ) -> None:
@@ -128,7 +128,7 @@ def test_slow_crossing_of_the_gap_leaves_the_loop_stable(law: str, take_up: floa
     assert np.abs(run.column('y')[500:]).max() < 0.25
 
 
-@pytest.mark.parametrize('seed', range(21, 27))
+@pytest.mark.parametrize('seed', range(21, 24))
 def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
     sigma = 1e-3
     t = np.arange(1600) * 0.01
@@ -173,7 +173,7 @@ def resting(std: float) -> tuple[Rest, BacklashInverse, Estimate]:
     return Rest(design(model, Weights(1e-2, 0.0, 10)), 1e-3), inverse, estimate
 
 
-@pytest.mark.parametrize('seed', [14, 87, 107, 136, 319, 328])
+@pytest.mark.parametrize('seed', [14, 107, 319])
 def test_reference_that_begins_slowly_is_followed_from_two_seconds_on(seed: int) -> None:
     # v meets the far side of the gap after 1.5 s. Filters that know nothing of x before that
     # believe a wrong gap with these noises; the fit of all samples does not.

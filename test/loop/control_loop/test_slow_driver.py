@@ -15,8 +15,8 @@ from backlash_ros.core.parameters import Parameters
 LATENCY = 0.1  # of a period, from y to v
 
 
-@pytest.mark.parametrize('period_s', [0.02, 0.01, 0.002])
-@pytest.mark.parametrize('share', [0.0, 0.003, 0.03, 0.059, 0.09])
+@pytest.mark.parametrize('period_s', [0.02, 0.002])
+@pytest.mark.parametrize('share', [0.0, 0.03, 0.09])
 @pytest.mark.parametrize('numbered', [True, False])
 def test_only_the_rate_is_named(period_s: float, share: float, numbered: bool) -> None:
     p = Parameters({'sample_period': period_s, 'estimator.law': 'lms'})

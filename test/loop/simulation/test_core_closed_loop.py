@@ -118,7 +118,7 @@ def test_every_sample_is_announced_and_every_loss_counted() -> None:
     ('moving_horizon', 'proportional'), ('moving_horizon', 'tracking'), ('lms', 'proportional'),
     ('printed', 'proportional'), ('fixed', 'tracking'), ('gradient', 'pole_placement'),
 ])
-@pytest.mark.parametrize('size', [5e-324, 1e-162, 1e-155, 1e-130, 1e-100])
+@pytest.mark.parametrize('size', [5e-324, 1e-155, 1e-130])
 def test_commands_whose_square_is_hardly_a_number_are_harmless(
     law: str, structure: str, size: float,
 ) -> None:

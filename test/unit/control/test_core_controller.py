@@ -126,19 +126,6 @@ def test_new_estimates_move_v_no_faster_than_the_gap_is_crossed(f: float) -> Non
     assert abs(c.step(0.0, y_m + 1e-6).v - before) <= 0.1 * (1.0 + 1e-9)
 
 
-@given(move=st.floats(0.1, 3.0), y_m=st.floats(-20.0, 20.0), f=st.sampled_from([0.0, 0.22]),
-       band=st.sampled_from([0.0, 0.5]))
-def test_rate_limit_delays_v_but_does_not_stop_it_on_its_way(
-    move: float, y_m: float, f: float, band: float,
-) -> None:
-    estimate = replace(PAPER, f=f)
-    target = controller(Notebook(estimate), inverse=BacklashInverse(band)).step(0.0, y_m).v
-    limited = controller(Notebook(estimate), Limits(move=move), BacklashInverse(band))
-    for _ in range(int(abs(target) / move) + 2):
-        v = limited.step(0.0, y_m).v
-    assert v == pytest.approx(target)
-
-
 @pytest.mark.parametrize('bad', [nan, inf, -inf])
 @pytest.mark.parametrize('name', ['y', 'y_m', 'applied'])
 def test_input_that_is_not_finite_is_refused_and_changes_nothing(name: str, bad: float) -> None:

@@ -74,20 +74,6 @@ def test_v_satisfies_the_printed_inverse_at_the_same_time(
         u_d_before, v_before = command.u_d, command.v
 
 
-@given(
-    play=usual_plays(), share=st.floats(-0.8, LARGEST_SHARE), y_m=st.floats(-100.0, 100.0),
-    band=st.sampled_from([0.0, 0.5]),
-)
-def test_a_constant_reference_holds_v(play: Play, share: float, y_m: float, band: float) -> None:
-    """Holding is a solution of (3.2) and (2.3) as well, and the smallest move of all."""
-    inverse = BacklashInverse(direction_band=band)
-    estimate = estimate_of(play, share)
-    first = control(y_m, estimate, inverse)
-    for _ in range(5):
-        again = control(y_m, estimate, inverse)
-        assert again.v == pytest.approx(first.v, abs=tolerance(play, y_m, first.u_d))
-
-
 @given(play=usual_plays(), y_m=st.floats(-100.0, 100.0),
        share=st.one_of(st.just(1.0), st.floats(0.99, 1.01), st.floats(0.8, 100.0)))
 def test_f_near_or_beyond_m_is_limited(play: Play, y_m: float, share: float) -> None:

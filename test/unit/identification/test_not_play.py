@@ -126,10 +126,6 @@ def test_noise_that_is_not_white_is_no_nonlinearity(noise: float) -> None:
     assert saturation(o) == ''
 
 
-def test_a_dead_zone_before_an_integrator_is_named() -> None:
-    assert 'a dead zone' in other_nonlinearity(observed(V, behind(dead_zone(V), 'integrator')))
-
-
 @pytest.mark.parametrize('side', ['both', 'one'])
 def test_a_y_that_is_at_its_end_is_named(side: str) -> None:
     y = np.minimum(behind(play(V, GAP), 'lag', 0.0), 0.9)

@@ -86,13 +86,3 @@ def test_guarded_law_stays_finite_and_within_its_bounds(data: list[tuple[float, 
         assert -0.5 <= e.f <= 0.5
     # The paper's first sample, u = y_m = 0, leads to 0/0 in m and c.
     assert estimator.skipped >= 1
-
-
-def test_rising_u_moves_c_r_only_and_falling_u_moves_c_l_only() -> None:
-    """f and m at their bounds leave the rest of e to the crossing of the active side."""
-    narrow = Bounds((0.69, 0.7), (0.0, 50.0), (-50.0, 0.0))
-    estimator = law(bounds=narrow, f_bounds=(0.2, 0.3))
-    first = feed(estimator, 5.0, 3.0)
-    assert (first.c_r != START.c_r, first.c_l) == (True, START.c_l)
-    second = feed(estimator, 4.0, 6.0)
-    assert (second.c_r, second.c_l != first.c_l) == (first.c_r, True)

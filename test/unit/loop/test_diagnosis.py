@@ -170,12 +170,6 @@ def test_a_rival_whose_name_is_not_known_yet_is_no_line_of_the_log_at_once() -> 
         assert not first(replace(WELL, rivals=('/b',), standing_down=standing_down)).lasting
 
 
-def test_lateness_is_no_excuse_for_a_contradiction_that_lasts() -> None:
-    findings = findings_of(replace(INCONSISTENT, late=30, inconsistent_s=10.0))
-    assert [finding.kind for finding in findings] == ['model', 'late']
-    assert findings[0].level == Level.ERROR
-
-
 @pytest.mark.parametrize('changes', [
     {'still': 200, 'v_swing': 2.0, 'gap': 1.0}, {'limited': 400}, {'late': 3},
     {'output': output_from(DRIVER, OTHER)},
@@ -260,7 +254,3 @@ def test_no_text_is_cut_off_by_a_terminal() -> None:
     (finding, *_) = findings_of(replace(WELL, rivals=(long_name,)))
     assert len(finding.text) <= LONGEST_TEXT
     assert all(len(text) <= LONGEST_TEXT for *_, text in CASES)
-
-
-def test_messages_that_are_under_way_for_a_moment_are_no_matter() -> None:
-    assert first(replace(WELL, age_s=0.0004)).kind == 'learned'

@@ -19,8 +19,8 @@ def stamped(ticks: Iterable[float], period_s: float) -> DriverPeriod:
     return sender
 
 
-@pytest.mark.parametrize('nominal_s', [0.02, 0.01, 0.002])
-@pytest.mark.parametrize('slow', [-0.05, 0.0, 0.005, 0.03, 0.059, 0.09])
+@pytest.mark.parametrize('nominal_s', [0.02, 0.002])
+@pytest.mark.parametrize('slow', [-0.05, 0.005, 0.059])
 @pytest.mark.parametrize(('lost', 'twice', 'jitter'), [
     (0.0, 0.0, 0.0), (0.0, 0.0, 0.2), (0.1, 0.0, 0.05), (0.0, 0.1, 0.05),
 ])

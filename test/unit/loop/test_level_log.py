@@ -31,11 +31,6 @@ def test_another_cause_at_the_same_level_is_told() -> None:
     assert [text for _, text in lines_of(findings)] == ['too slow', 'no number']
 
 
-def test_new_figures_of_the_same_cause_are_not_told() -> None:
-    findings = [(float(t), SLOW._replace(text=f'{t} Hz')) for t in range(30)]
-    assert lines_of(findings) == [(Level.WARN, '0 Hz')]
-
-
 def test_what_comes_and_goes_is_told_once_per_while() -> None:
     findings = [(0.5 * n, WRONG if n % 2 else WELL) for n in range(50)]
     assert lines_of(findings) == [(Level.ERROR, 'the model is wrong')]

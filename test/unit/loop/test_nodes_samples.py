@@ -51,16 +51,6 @@ def test_outputs_never_published_show_in_time_though_the_numbers_have_no_gap(
     assert [arrival.unsent for arrival in arrivals] == [0, *gaps]
 
 
-@given(gaps, delays)
-def test_outputs_lost_on_their_way_were_sent(gaps: list[int], delays: list[float]) -> None:
-    counter, sequence, arrivals = SampleCounter(PERIOD_S), 1, []
-    for stamp, gap in zip(stamps_of(gaps, delays), [*gaps, 0], strict=True):
-        arrivals.append(counter.count(stamp, sequence))
-        sequence += 1 + gap
-    assert [arrival.missing for arrival in arrivals] == [0, *gaps]
-    assert not any(arrival.unsent for arrival in arrivals)
-
-
 @given(gaps)
 def test_a_gap_in_the_numbers_counts_though_messages_come_in_a_burst(gaps: list[int]) -> None:
     counter = SampleCounter(PERIOD_S)
@@ -70,12 +60,6 @@ def test_a_gap_in_the_numbers_counts_though_messages_come_in_a_burst(gaps: list[
         counted.append(counter.count(START_NS, sequence).missing)
     assert counted == [0, *gaps]
     assert counter.index == sequence - 1
-
-
-def test_a_sender_that_was_restarted_is_counted_by_time() -> None:
-    counter = SampleCounter(PERIOD_S)
-    counter.count(START_NS, 500)
-    assert counter.count(START_NS + 5 * PERIOD_NS, 1) == Arrival(True, 4, restarted=True)
 
 
 def over(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, nan
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller, build_plant, build_reference
@@ -68,6 +68,7 @@ def test_unknown_name_is_refused_with_the_nearest_valid_one(misspelt: str, meant
     assert f'did you mean {meant}?' in refusal_of(misspelt, 1.0)
 
 
+@settings(max_examples=20)
 @given(name=st.text(max_size=30).filter(lambda name: name not in BY_NAME))
 def test_any_unknown_name_is_refused_with_a_valid_one(name: str) -> None:
     with pytest.raises(ParameterError) as refusal:

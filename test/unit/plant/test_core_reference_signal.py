@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.reference.signal import SHAPES, ReferenceSignal
 
@@ -83,10 +82,3 @@ def test_file_holds_its_last_sample() -> None:
 def test_unknown_waveform_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"waveform='sin' must be one of sine, "):
         ReferenceSignal('sin')
-
-
-def test_the_table_offers_exactly_the_waveforms_there_are() -> None:
-    for waveform in SHAPES:
-        assert Parameters({'waveform': waveform})['waveform'] == waveform
-    with pytest.raises(ParameterError, match='must be one of ' + ', '.join(SHAPES)):
-        Parameters({'waveform': 'sawtooth'})

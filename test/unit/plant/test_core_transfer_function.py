@@ -35,13 +35,6 @@ def test_frequency_response_agrees_with_scipy(model: TransferFunction) -> None:
     np.testing.assert_allclose(model.response(np.exp(1j * w)), expected, rtol=1e-6, atol=1e-12)
 
 
-@given(scale=st.floats(0.01, 100.0))
-def test_common_factor_of_both_polynomials_cancels(scale: float) -> None:
-    model = TransferFunction([2.0 * scale, scale], [4.0 * scale, -2.0 * scale, 0.5 * scale])
-    assert model.denominator == pytest.approx([1.0, -0.5, 0.125])
-    assert model.numerator == pytest.approx([0.0, 0.5, 0.25])
-
-
 @pytest.mark.parametrize(
     ('numerator', 'delay'), [([1.0, 0.5], 1), ([0.0, 0.0, 3.0, 1.0], 1), ([0.0, 2.0], 2)],
 )

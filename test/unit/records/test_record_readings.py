@@ -30,15 +30,6 @@ def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
     assert found.period == pytest.approx(times * 0.005)
 
 
-def test_a_sensor_with_another_clock_than_the_log_repeats_unevenly() -> None:
-    at = np.floor(T / 0.0233) * 0.0233
-    y = np.round(500.0 * np.sin(3.0 * at))
-    found = held(T, y)
-    assert found is not None
-    assert found.period == pytest.approx(0.0233, rel=0.1)
-    assert np.count_nonzero(found.own) == pytest.approx(T[-1] / 0.0233, rel=0.05)
-
-
 def test_at_rest_one_reading_a_period_is_taken() -> None:
     y = repeated(5)
     y[1000:2000] = y[1000]

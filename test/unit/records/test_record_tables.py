@@ -103,13 +103,6 @@ def test_what_was_guessed_is_said_and_can_be_chosen(tmp_path: Path) -> None:
     assert 'y is' not in record.notes[0]
 
 
-def test_columns_without_names_go_by_their_number(tmp_path: Path) -> None:
-    path = written(tmp_path / 'a.csv', rows())
-    with pytest.raises(InputError, match='columns are 1, 2, 3; name them'):
-        read_record(path)
-    assert read_record(path, columns={'t': '1', 'v': '2', 'y': '3'}).y.tolist() == Y.tolist()
-
-
 @pytest.mark.parametrize(('names', 'said'), [
     (('time', 'target pos (5)', 'pos (5)', 'target pos (3)', 'pos (3)'), 'several columns may be'),
     (('t', 'voltage', 'y'), 'no column is v'), (('t', 'v', 'speed'), 'no column is y'),

@@ -127,6 +127,7 @@ def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path)
     assert found.notes[0].startswith('2 samples were left out')
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_report_without_truth_shows_estimates_and_innovation(
     run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -219,6 +220,7 @@ def test_file_of_another_kind_is_refused(tmp_path: Path) -> None:
         read_run(tmp_path / 'notes.txt')
 
 
+@pytest.mark.usefixtures('undrawn')
 def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
     run = build_closed_loop(PARAMETERS).run(1)
     assert report.write_report(Run(run, PARAMETERS), tmp_path)['samples'] == 1

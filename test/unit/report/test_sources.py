@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_bags import PARAMETERS, write_bag
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin
 
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
@@ -41,18 +41,3 @@ def test_a_lone_file_of_a_bag_is_a_bag(
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         'bag', 'out', 'parameters.yaml', lone.name,
     ]
-
-
-def test_compressed_chunks_are_read(
-    tmp_path: Path, run: RunRecord, monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    opened = Writer.open
-
-    def open_compressed(writer: Writer) -> None:
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        opened(writer)
-
-    monkeypatch.setattr(Writer, 'open', open_compressed)
-    bag = write_bag(tmp_path / 'bag', run)
-    assert b'zstd' in next(bag.glob('*.mcap')).read_bytes()
-    np.testing.assert_array_equal(read_run(bag).record.column('v'), run.column('v'))

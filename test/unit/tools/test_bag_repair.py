@@ -24,7 +24,7 @@ from backlash_ros.bags.writer import STORAGE, Bag
 
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 CDR = b'\x00\x01\x00\x00'
-MESSAGES, PER_FLUSH = 400, 40
+MESSAGES, PER_FLUSH = 200, 40
 PAGE = 4096  # of SQLite
 MAGIC = b'\x89MCAP0\r\n'
 
@@ -143,7 +143,7 @@ def test_mcap_cut_at_any_record_keeps_every_block_before_it(
             assert len(found) >= whole.numbers_within(size), size
 
 
-@settings(max_examples=40)
+@settings(max_examples=20)
 @given(st.data())
 def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_error(
     finished: dict[str, Finished], data: st.DataObject,

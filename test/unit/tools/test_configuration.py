@@ -251,14 +251,6 @@ def test_setting_of_an_axis_goes_before_one_for_all_in_any_order(config: Path) -
         assert effective_parameters(config, settings, axis='y')['seed'] == 4
 
 
-def test_driver_of_one_axis_goes_before_that_of_all(config: Path) -> None:
-    written(config, '/bringup: {ros__parameters: {axes: [x, y], driver: all}}\n'
-                    '/x/bringup: {ros__parameters: {driver: own}}')
-    configuration = read_configuration(config)
-    drivers = [configuration.parameters(axis)['driver'] for axis in configuration.axes]
-    assert drivers == ['own', 'all']
-
-
 @pytest.mark.parametrize(
     ('section', 'message'),
     [

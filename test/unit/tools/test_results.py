@@ -60,14 +60,6 @@ def test_samples_are_written_in_full_precision(run: RunRecord, tmp_path: Path) -
         np.testing.assert_array_equal(again.column(name), run.column(name))
 
 
-def test_gaps_in_samples_are_lost_samples(run: RunRecord, tmp_path: Path) -> None:
-    assert run.lost_samples > 0
-    results.write_run(run, tmp_path)
-    again = results.read_samples(tmp_path / 'samples.csv')
-    assert again.sample_period == pytest.approx(0.01)
-    assert again.lost_samples == run.lost_samples
-
-
 def test_u_is_left_empty_where_it_is_unknown(run: RunRecord, tmp_path: Path) -> None:
     results.write_run(without_truth(run), tmp_path)
     with (tmp_path / 'samples.csv').open(newline='') as file:
