@@ -24,7 +24,7 @@ from backlash_ros.bags.writer import STORAGE, Bag
 
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 CDR = b'\x00\x01\x00\x00'
-MESSAGES, PER_FLUSH = 200, 40
+MESSAGES, PER_FLUSH = 300, 60
 PAGE = 4096  # of SQLite
 MAGIC = b'\x89MCAP0\r\n'
 
