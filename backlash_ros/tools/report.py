@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
@@ -191,7 +192,8 @@ def main(args: Sequence[str] | None = None) -> int:
     return run_tool('report', lambda: _report(args))
 
 
-def _report(args: Sequence[str] | None) -> None:
+def make_parser() -> argparse.ArgumentParser:
+    """The options of `report`."""
     parser = OptionParser('report', description=__doc__)
     parser.add_argument(
         'path', type=Path, help='a bag or its .mcap file, a folder of results, or samples.csv'
@@ -204,6 +206,11 @@ def _report(args: Sequence[str] | None) -> None:
     add_span_options(parser)
     parser.add_argument('--axis', default='', metavar='NAME',
                         help='of a bag with several: the one to report (default: the first)')
+    return parser
+
+
+def _report(args: Sequence[str] | None) -> None:
+    parser = make_parser()
     options = parser.parse_args(args)
     run = read_run(options.path.resolve(), options.config, span_of(parser, options), options.axis)
     if run.record.samples == 0:

@@ -84,7 +84,7 @@ def estimate_cells(summary: Mapping[str, Any], name: str) -> tuple[str, ...]:
     known = f'{final:.6g}', f'{std:.2g}' if isfinite(std) else NOTHING
     if truth is None:
         return *known, NOTHING, NOTHING, NOTHING
-    error = f'{100.0 * (final - truth) / abs(truth):+.2g} %' if truth else NOTHING
+    error = f'{100.0 * (final - truth) / abs(truth):+.3g} %' if truth else NOTHING
     return *known, f'{truth:.6g}', error, 'never' if settled is None else f'{settled:.4g} s'
 
 

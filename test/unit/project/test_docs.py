@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -22,6 +23,8 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.nodes.driver_check.options import parse_options
 from backlash_ros.tools import batch
+from backlash_ros.tools import compare as compare
+from backlash_ros.tools import report as report
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.bringup import __main__ as bringup
 from backlash_ros.tools.config import effective_parameters
@@ -50,16 +53,24 @@ def of_every_page(pattern: re.Pattern[str]) -> Iterator[tuple[Path, str]]:
 
 
 def shell_commands() -> list[list[str]]:
-    """Return the words of each command in the shell blocks of all pages and in `simulate -...`."""
-    lines = [
-        line
+    """The words of each command in blocks of shell and text and in the lines of all pages."""
+    scripts = '|'.join(console_scripts())
+    command = re.compile(
+        rf'(make [a-z]|(.venv/bin/)?(python3? (?!-m)\S+|({scripts}) [-\w])|ros2 run backlash_ros)'
+    )
+    found = [
+        (language, line)
         for page in PAGES for language, text in BLOCK.findall(page.read_text())
-        if language in ('bash', 'sh')
+        if language in ('bash', 'sh', 'text')
         for line in text.replace('\\\n', ' ').splitlines()
     ]
-    lines += [code for _, code in of_every_page(CODE) if code.startswith('simulate -')]
-    words = [shlex.split(line, comments=True) for line in lines]
-    return [line for line in words if line]
+    found += [('text', code) for _, code in of_every_page(CODE)]
+    lines = [
+        line for language, line in found if language != 'text'
+        or (command.match(line) and not re.search(r'NAME|FILE|HOST|\.\.\.|[^ -~]', line))
+    ]
+    words = {line: shlex.split(line, comments=True) for line in lines}
+    return [line for line in words.values() if line]
 
 
 def console_scripts() -> set[str]:
@@ -139,9 +150,11 @@ def test_command_exists_and_takes_its_arguments(words: list[str]) -> None:
         if program == 'cp':
             shipped = arguments[0].removeprefix('$(ros2 pkg prefix --share backlash_ros)/')
             assert (ROOT / shipped).is_file()
-    elif program == '.venv/bin/python':
-        # test_driver_examples.py runs them.
-        assert arguments[0] == '-c' or (ROOT / arguments[0]).is_file()
+    elif program.removeprefix('.venv/bin/') in ('python', 'python3'):
+        if arguments[0] != '-c':
+            source = (ROOT / arguments[0]).read_text()
+            options = {word for word in arguments if word.startswith('--')}
+            assert {option for option in options if option not in source} == set()
     else:
         assert program.removeprefix('.venv/bin/') in console_scripts()
         check_tool(program.removeprefix('.venv/bin/'), arguments)
@@ -149,35 +162,55 @@ def test_command_exists_and_takes_its_arguments(words: list[str]) -> None:
 
 def check_tool(program: str, arguments: list[str]) -> None:
     """Let the tool itself parse its options, and the core build what they describe."""
-    if program == 'report':
-        assert len(arguments) == 1
+    if program in ('monitor', 'live'):
         return
     if program in ('controller', 'plant', 'reference', 'recorder'):
         assert arguments[:2] == ['--ros-args', '--params-file']
         assert (ROOT / arguments[2]).is_file()
         return
-    if 'identified/identified.yaml' in arguments:
-        # The command before it writes that file, and test_driver_examples.py runs both.
-        assert bringup.parse_options(arguments).config == Path('identified/identified.yaml')
-        return
-    if program in ('identify', 'replay'):
-        parser = identify.make_parser() if program == 'identify' else replay.make_parser()
-        config = parser.parse_args(arguments).config
-        assert config is None or (ROOT / config).is_file()
-        return
-    if program == 'check_driver':
-        config = parse_options(arguments).config
-        assert config is None or (ROOT / config).is_file()
-        return
+    tool: dict[str, Any] = {
+        'compare': compare, 'report': report, 'identify': identify, 'replay': replay,
+        'simulate': simulate,
+    }
     options = (
-        simulate.make_parser().parse_args(arguments) if program == 'simulate'
-        else bringup.parse_options(arguments)
+        bringup.parse_options(arguments) if program == 'bringup' else
+        parse_options(arguments) if program == 'check_driver' else
+        tool[program].make_parser().parse_args(arguments)
     )
-    build_controller(effective_parameters(
-        options.config, options.settings, options.seed, getattr(options, 'axis', '')
-    ))
+    # Another command, or the user, writes these files.
+    elsewhere = ('identified.yaml', 'limits.yaml', 'my_actuator.yaml')
+    if options.config is not None and Path(options.config).name in elsewhere:
+        return
+    if program in ('simulate', 'bringup'):
+        build_controller(effective_parameters(
+            options.config, options.settings, options.seed, options.axis
+        ))
+    else:
+        assert options.config is None or (ROOT / options.config).is_file()
     for sweep in getattr(options, 'sweep', []):
         batch.parse_sweep(sweep)
+
+
+@pytest.mark.usefixtures('undrawn')
+def test_commands_that_need_no_ros_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0}, raising=False)
+    mains: dict[str, Callable[[list[str]], int]] = {
+        'simulate': simulate.main, 'report': report.main, 'replay': replay.main,
+    }
+    done = []
+    # `replay` needs a run, of which a sweep of simulations leaves none.
+    for program, *arguments in sorted(
+        shell_commands(), key=lambda words: 'simulate' not in words[0] or '--sweep' not in words
+    ):
+        main = mains.get(program.removeprefix('.venv/bin/'))
+        if main is None or {'log.csv', 'bag', 'results/latest/identified.yaml'} & set(arguments):
+            continue  # those of a user
+        arguments = [a.replace('config/', '') for a in arguments]  # as it is shipped
+        short = ['--duration', '0.5'] if main is simulate.main else []
+        assert main([*arguments, *short]) == 0, arguments
+        done.append(program)
+    assert len(done) > 10
 
 
 def blocks(*languages: str) -> list[str]:
