@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from concurrent.futures import Future
 from math import isfinite, nan
-from typing import Any
+from typing import NamedTuple
 
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
@@ -38,16 +38,50 @@ from backlash_ros.nodes.control.last_commands import LastCommandSender
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.control.services import offer_services
-from backlash_ros.nodes.runtime.driver_io import DriverIo, Reports
+from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.lifecycle import ManagedNode
 from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, stamp_ns_of
-from backlash_ros.nodes.runtime.parameters import LiveParameters
+from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import emit, run
 
 # Share of a period for which the controller sleeps after the command: on a busy processor the
 # driver, woken by the command, would have to wait for it otherwise.
 POST_COMMAND_SLEEP = 0.05
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
+
+
+class LockstepQueues(NamedTuple):
+    """Ticks of /clock [ns], references and outputs that wait for each other."""
+
+    ticks: deque[int]
+    references: deque[float]
+    outputs: deque[JointOutputs]
+
+
+class SpareTime:
+    """What the controller does between a command and the next output.
+
+    Where the next output is waiting already, there is no time for what may be put off.
+    """
+
+    def __init__(self, sample_period_s: float) -> None:
+        self._period_ns, self._sleep_s = sample_period_s * 1e9, POST_COMMAND_SLEEP * sample_period_s
+        self._budget_s = REFINE_SHARE * sample_period_s
+        self._behind = 0  # outputs in a row that were answered after the next one had come
+        self._turn = 0  # of the joint that fits next
+
+    def let_the_driver_go_on(self, received_ns: int) -> None:
+        """Sleep a little. received_ns: when the output came that was answered."""
+        behind = 0 < received_ns < time.time_ns() - self._period_ns
+        self._behind = self._behind + 1 if behind else 0
+        if not behind:
+            time.sleep(self._sleep_s)
+
+    def refine(self, loops: Sequence[ControlLoop]) -> None:
+        """Let the next loop take up and submit fits."""
+        if self._behind % PUT_OFF == 0:
+            self._turn = (self._turn + 1) % len(loops)
+            loops[self._turn].core.refine(self._budget_s)
 
 
 class ControllerNode(ManagedNode):
@@ -70,49 +104,47 @@ class ControllerNode(ManagedNode):
             for warning in warnings_of(own, with_reference=False):
                 self.log.warning(f'{joint}: {warning}' if joint else warning)
         self.loops: JointLoops | None = None  # None while unconfigured
-        self._lockstep = p.lockstep
         # A fit that shared the process of the loop would hold up its commands.
         self._executor: Executor = (
-            InlineExecutor() if self._lockstep else WorkerExecutor(WORKER_MODULES)
+            InlineExecutor() if p.lockstep else WorkerExecutor(WORKER_MODULES)
         )
-        self._behind = 0  # outputs in a row that were answered after the next one had come
-        self._turn = 0  # of the joint that fits next
         self._io = DriverIo(self, p)
+        if not p.lockstep:
+            # The first command begins with what the driver reports, even if it is not learned from.
+            self._io.listen_to_reports()
         # Whoever waits for the others begins with them; who does not may have been restarted.
-        self._set_up(
-            p, from_zero=not self._lockstep and p.wait_for_subscribers > 0
+        self._counter = SampleCounter(
+            p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
-        self._saved_at = time.monotonic()
-        self._queues: tuple[deque[Any], deque[Any], deque[Any]] = (deque(), deque(), deque())
-        self._ticks, self._references, self._outputs = self._queues
+        self._spare_time = SpareTime(p.sample_period)
+        self._pairs = LockstepQueues(deque(), deque(), deque())
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._last_commands = LastCommandSender(self, self._io)
         self.joints: list[Joint] = []
         self._rivals = RivalWatch(
             self, self._io.topics.control, self._io.advertise, self._mind_rivals
         )
-        self._told_rivals = self._rivals.found
         self._commands_of_rivals: Subscription | None = None  # heard while standing down
         self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
-        self._reference = self._io.listen_to_references(
-            self._on_reference, KEPT_QOS if self._lockstep else 1
+        references = self._io.listen_to_references(
+            self._on_reference, KEPT_QOS if p.lockstep else 1
         )
-        # The first command begins with what the driver reports, even if it is not learned from.
-        self._reports = None if self._lockstep else Reports(self, self._io, p.joint_names)
         self.joints += [
-            Joint(self, joint, p.of_joint(joint), self._io, self._reports,
-                  self._reference.qos_profile, speaks=joint == p.joint_names[0])
+            Joint(self, joint, p.of_joint(joint), self._io, references.qos_profile)
             for joint in p.joint_names
         ]
-        if self._lockstep:
+        if p.lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
-        offer_services(self, self)
-        self._live = LiveParameters(
-            self, p, self._check_change, self._take_up, lambda: self.loops is None
+        offer_services(
+            self, lambda: self.configured, self.save_estimates,
+            lambda: ', '.join(joint.saver.file for joint in self.joints),
+        )
+        let_parameters_change(
+            self, self._check_change, self._take_up, lambda: self.loops is None
         )
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
-        if not self._lockstep:
+        if not p.lockstep:
             self.create_timer(0.05, self._look_for_silence, clock=self.steady_clock)
         self._announce()
         if p.autostart:
@@ -136,23 +168,16 @@ class ControllerNode(ManagedNode):
         """The loops, none while there are none."""
         return [] if self.loops is None else list(self.loops.by_name.values())
 
-    @property
-    def estimates_files(self) -> str:
-        """Where estimates are saved, empty for nowhere."""
-        return ', '.join(joint.saver.file for joint in self.joints)
-
     def save_estimates(self) -> list[Future[str]]:
         """Begin to save what is worth it; each result says why it failed, empty if it did not."""
         return [saved for joint in self.joints if (saved := joint.save()) is not None]
 
     def configure(self) -> None:
-        p = self._live.parameters
         before = {joint.name: known_before(joint.p) for joint in self.joints}
         self.loops = JointLoops(
-            p, self._io.publish, self._io.now_ns, before, self._counter,
+            self.settings, self._io.publish, self._io.now_ns, before, self._counter,
             {joint.name: joint.first_command.v_at_start(joint.p) for joint in self.joints},
-            self._reports.of if self._reports is not None else lambda joint: (),
-            self._executor,
+            self._io.reports_of, self._executor,
         )
         for joint in self.joints:
             joint.begin(self.loops.by_name[joint.name], before[joint.name])
@@ -166,7 +191,7 @@ class ControllerNode(ManagedNode):
                 loop.renew(loop.estimate)
                 loop.heard_at = None
             return
-        if self._lockstep:  # simulated time hurts nobody
+        if self.settings.lockstep:  # simulated time hurts nobody
             self._await_loop()
         else:
             self.call_when(
@@ -177,7 +202,7 @@ class ControllerNode(ManagedNode):
 
     def _knows_rivals(self) -> bool:
         """Whether no controller of this machine has still to be found that may be in charge."""
-        return self._rivals.complete or self._live.parameters.on_rival == 'warn'
+        return self._rivals.complete or self.settings.on_rival == 'warn'
 
     def _await_loop(self) -> None:
         """Listen to plant_output as soon as everybody is there."""
@@ -189,12 +214,13 @@ class ControllerNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Send the last command as on_stop says, and save what was learned."""
-        loops, p = self.loops, self._live.parameters
+        loops, p = self.loops, self.settings
         assert loops is not None
         self._last_commands.end()
         if any(loop.last is not None for loop in self.configured):
             # Before a ramp: whoever stops this process may not wait for its end.
-            self._save()
+            for joint in self.joints:
+                joint.save()
             self._last_commands.send_all(
                 loops, p.on_stop, p.timeout.ramp, self._diagnose
             )
@@ -221,14 +247,15 @@ class ControllerNode(ManagedNode):
 
     def _conditions_of_start(self) -> list[Callable[[], bool]]:
         """What has to be there before plant_output is listened to, for that starts the loop."""
-        wanted = max(self.settings.wait_for_subscribers, int(self._lockstep))
+        lockstep = self.settings.lockstep
+        wanted = max(self.settings.wait_for_subscribers, int(lockstep))
         if not wanted:
             return []
         return [
             lambda: self._io.listeners >= wanted,
             # Beside the driver, those who listen want to hear everything.
             lambda: self._steps.listeners >= wanted - 1,
-            (lambda: self._reference.get_publisher_count() > 0) if self._lockstep
+            (lambda: self.count_publishers(self._io.topics.reference) > 0) if lockstep
             else (lambda: all(joint.reference_at is not None for joint in self.joints)),
         ]
 
@@ -248,27 +275,26 @@ class ControllerNode(ManagedNode):
         for joint in self.joints:
             if joint.name in taken:
                 joint.reference_at = now
-        if self._lockstep:
-            self._references.append(self.loops.by_name[''].y_m)
+        if self.settings.lockstep:
+            self._pairs.references.append(self.loops.by_name[''].y_m)
             self._pair()
 
     def _on_clock(self, message: Clock) -> None:
-        self._ticks.append(stamp_ns_of(message))
+        self._pairs.ticks.append(stamp_ns_of(message))
         self._pair()
 
     def _on_output(self, outputs: JointOutputs) -> None:
         loops = self.loops
         if loops is None:
-            if self._reports is not None:
-                self._reports.forget()
+            self._io.forget_reports()
             return
         for loop in loops.by_name.values():
             if loop.begins or not self.active:
                 loop.hear_reports()
         if not self.active:
             return
-        if self._lockstep:
-            self._outputs.append(outputs)
+        if self.settings.lockstep:
+            self._pairs.outputs.append(outputs)
             self._pair()
             return
         waiting = self._waiting(loops, outputs)
@@ -276,24 +302,18 @@ class ControllerNode(ManagedNode):
             return
         silent = {joint for joint, loop in loops.by_name.items() if loop.silent}
         steps = loops.answer(outputs, waiting)
-        # Where the next output is waiting already, there is no time for what may be put off.
-        behind = 0 < outputs.received_ns < time.time_ns() - self._period_ns
-        if steps and not behind:
-            time.sleep(self._post_command_sleep_s)
+        if steps:
+            self._spare_time.let_the_driver_go_on(outputs.received_ns)
         back = [loops.by_name[joint] for joint in silent if not loops.by_name[joint].silent]
         if back:
             self._last_commands.end(*back)
-        if not steps:
-            return
-        self._behind = self._behind + 1 if behind else 0
-        if self._behind % PUT_OFF == 0:
-            self._turn = (self._turn + 1) % len(self.joints)
-            self.configured[self._turn].core.refine(self._refine_budget_s)
-        self._follow_up(loops, steps, silent)
+        if steps:
+            self._spare_time.refine(self.configured)
+            self._follow_up(loops, steps, silent)
 
     def _waiting(self, loops: JointLoops, outputs: JointOutputs) -> Set[str]:
         """Joints of a message that are not answered yet: what to begin with is not known."""
-        if self._together and any(
+        if self.settings.io.together and any(
             loop.silent and not isfinite(outputs.y.get(joint, nan))
             for joint, loop in loops.by_name.items()
         ):
@@ -307,11 +327,11 @@ class ControllerNode(ManagedNode):
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
-        while self.loops is not None and self.active and all(self._queues):
+        while self.loops is not None and self.active and all(self._pairs):
             loop = self.loops.by_name['']
-            arrival = self.loops.counter.count(self._ticks.popleft())
-            y_m = self._references.popleft()
-            step = loop.step(self._outputs.popleft().of(''), arrival, y_m)
+            ticks, references, outputs = self._pairs
+            arrival = self.loops.counter.count(ticks.popleft())
+            step = loop.step(outputs.popleft().of(''), arrival, references.popleft())
             self.loops.send()
             if step is not None:
                 loop.core.refine()
@@ -331,27 +351,19 @@ class ControllerNode(ManagedNode):
         for joint in self.joints:
             joint.check_change(p.of_joint(joint.name))
 
-    def _take_up(self, p: Parameters) -> None:
-        before, self.settings = self.settings, p
+    def _take_up(self, before: Parameters) -> None:
+        """Use the settings, which have changed."""
+        p = self.settings
         for joint in self.joints:
             joint.take_up(p.of_joint(joint.name))
-        if self.loops is None and p['sample_period'] != before['sample_period']:
-            self._set_up(p, from_zero=False)
+        if self.loops is None and p.sample_period != before.sample_period:
+            self._counter = SampleCounter(p.sample_period)
+            self._spare_time = SpareTime(p.sample_period)
         self._mind_rivals()
-
-    def _set_up(self, p: Parameters, from_zero: bool) -> None:
-        """Take up what follows from the sample period."""
-        period = p.sample_period
-        self._together = p.io.together
-        self._post_command_sleep_s, self._period_ns = POST_COMMAND_SLEEP * period, period * 1e9
-        self._refine_budget_s = REFINE_SHARE * period
-        self._counter = SampleCounter(period, from_zero)
 
     def _mind_rivals(self) -> None:
         """Stand down or command again, as on_rival says, and tell of it."""
-        found = self._rivals.found
-        on_rival = self._live.parameters.on_rival
-        stand_down = on_rival == 'stand_down' and not self._rivals.came_first
+        stand_down = self.settings.on_rival == 'stand_down' and not self._rivals.came_first
         changing = [loop for loop in self.configured if loop.standing_down != stand_down]
         if changing and stand_down:
             self._last_commands.end()
@@ -363,10 +375,6 @@ class ControllerNode(ManagedNode):
             self.destroy_subscription(self._commands_of_rivals)
             for loop in changing:
                 loop.resume()
-        if found != self._told_rivals:
-            self._told_rivals = found
-            if not found:
-                self.log.info(f'nobody else publishes {self._rivals.topic} any more')
         self._diagnose()
 
     def _hear_rival(self, commands: Mapping[str, float]) -> None:
@@ -378,31 +386,19 @@ class ControllerNode(ManagedNode):
         loops = self.loops
         if loops is None or not self.active:
             return
-        self._save_now_and_then()
+        for joint in self.joints:
+            joint.save_now_and_then()
         overdue = [joint for joint in self.joints if joint.is_overdue()]
         if overdue:
             # An arm of which one joint is lost stops as one, unless told otherwise.
             ending = [
-                joint.loop for joint in (self.joints if self._together else overdue)
+                joint.loop for joint in (self.joints if self.settings.io.together else overdue)
                 if joint.loop is not None and not joint.loop.silent
             ]
             for loop in ending:
                 loop.give_up()
-            on_timeout = self._live.parameters.on_timeout
-            self._last_commands.begin(loops, ending, on_timeout)
+            self._last_commands.begin(loops, ending, self.settings.on_timeout)
             self._diagnose()
-
-    def _save_now_and_then(self) -> None:
-        period = self._live.parameters.estimates.save_period
-        if period > 0.0 and time.monotonic() > self._saved_at + period:
-            self._saved_at = time.monotonic()
-            self._save()
-
-    def _save(self) -> None:
-        for saving in self.save_estimates():
-            saving.add_done_callback(
-                lambda saved: self.log.error(saved.result()) if saved.result() else None
-            )
 
     def _diagnose(self) -> None:
         for joint in self.joints:

@@ -29,7 +29,7 @@ from backlash_ros.nodes.runtime.messages import (
     arrival_ns,
     clock_message,
 )
-from backlash_ros.nodes.runtime.parameters import LiveParameters
+from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run, spin_paced
 
 # Share of a period after which it is too late to publish an output: it would look like the next.
@@ -57,7 +57,6 @@ class PlantNode(ProcessNode):
         self._sample_period = p.sample_period
         self._lockstep = p.lockstep
         self._samples = p.samples
-        self._loss = p.output_loss
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.seed, 1])
         self._started = False
@@ -81,7 +80,7 @@ class PlantNode(ProcessNode):
         if self._lockstep:
             self._time = self.create_publisher(Clock, topics.CLOCK, KEPT_QOS)
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
-        LiveParameters(self, p, build_plant, self._take_up)
+        let_parameters_change(self, build_plant, self._take_up)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         name, outputs = self.resolve_topic_name, topics.PLANT_OUTPUT
         self.log.info(
@@ -109,10 +108,10 @@ class PlantNode(ProcessNode):
             f'{self._plant.sample} samples' + (f', {counts}' if counts else '')
         )
 
-    def _take_up(self, p: Parameters) -> None:
-        plant = build_plant(p)
+    def _take_up(self, before: Parameters) -> None:
+        plant = build_plant(self.settings)
         plant.go_on_from(self._plant)
-        self._plant, self._loss = plant, p.output_loss
+        self._plant = plant
 
     def _has_listeners(self) -> bool:
         wanted = self.settings.wait_for_subscribers
@@ -182,7 +181,8 @@ class PlantNode(ProcessNode):
         """Measure y and publish it unless it is lost on purpose."""
         sample = self._plant.sample
         self._output_message.data = self._plant.measure()
-        if sample > 0 and self._loss > 0.0 and float(self._loss_rng.random()) < self._loss:
+        loss = self.settings.output_loss
+        if sample > 0 and loss > 0.0 and float(self._loss_rng.random()) < loss:
             return False
         if self._lockstep:
             self._time.publish(clock_message(round(sample * self._sample_period * 1e9)))

@@ -19,7 +19,7 @@ from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import Inbox, NodeExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH, KEPT_QOS, arrival_ns, stamp_ns_of
-from backlash_ros.nodes.runtime.parameters import LiveParameters
+from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
 LONGEST_SLEEP_S = 0.05  # so that signals and requests are noticed
@@ -57,7 +57,7 @@ class ReferenceNode(ProcessNode):
             self._sample_period, begins_with_output=listeners > 0, now_s=time.monotonic(),
             own_clock=not self._io.simulated_time,
         )
-        LiveParameters(self, p, build_reference, self._take_up)
+        let_parameters_change(self, build_reference, self._take_up)
         name = self.resolve_topic_name
         self.log.info(
             f'started: {name(self._io.topics.output)} in, {name(topics.REFERENCE)} out: '
@@ -130,9 +130,9 @@ class ReferenceNode(ProcessNode):
             for status in message.status if status.hardware_id == loop for value in status.values
         )
 
-    def _take_up(self, p: Parameters) -> None:
+    def _take_up(self, before: Parameters) -> None:
         """Use another signal from the next sample on; a sine goes on without a jump."""
-        before, self._signal = self._signal, build_reference(p)
+        self._signal = build_reference(self.settings)
         if self._signal.waveform in PERIODIC:
             t = self._newest * self._sample_period
             phase = before.frequency * (t + self._offset_s)

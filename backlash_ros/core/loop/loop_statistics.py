@@ -83,11 +83,11 @@ class LoopStatistics:
         self.dropped += 1
         self.bad_references += 1
 
-    def latency_ms(self, share: float) -> float:
-        """Latency that this share of the latest commands stayed below; nan without any."""
+    def latencies_ms(self, *shares: float) -> list[float]:
+        """Latencies that these shares of the latest commands stayed below; nan without any."""
         if not self.latencies:
-            return nan
-        return float(np.percentile(self.latencies, 100.0 * share)) * 1e3
+            return [nan] * len(shares)
+        return [float(each) * 1e3 for each in np.quantile(self.latencies, shares)]
 
     def intervals_s(self) -> tuple[float, float, float]:
         """Newest intervals between messages of y: low, mean and high [s]; nan while few.

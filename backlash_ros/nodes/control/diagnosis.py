@@ -14,13 +14,23 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.diagnosis import LONGEST_TEXT, findings_of
-from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD
-from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer, TopicFigures
+from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD, Period
+from backlash_ros.core.loop.figures import (
+    OF_MESSAGES,
+    Finding,
+    Level,
+    LoopFigures,
+    Peer,
+    TopicFigures,
+)
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.run_record import stated_deviations
-from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.control.rivals import RivalWatch
+from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
+from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
+from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 def publishers_of(
@@ -79,33 +89,45 @@ ABSENT = 5  # messages in a row without a joint that is not there
 class Diagnosis:
     """Collects what is known of a loop and its neighbours, and says what is wrong with it.
 
-    joint: of the loop. output_qos, reference_qos: with which the controller listens.
+    joint: of the loop. about: what the messages are about, empty for the command. references: with
+    which quality of service the controller listens to them.
     """
 
     def __init__(
-        self, node: Node, io: DriverIo, joint: str, output_qos: QoSProfile,
-        reference_qos: QoSProfile,
+        self, node: ProcessNode, io: DriverIo, joint: str, about: str, references: QoSProfile,
     ) -> None:
-        self._node, self._io, self._joint = node, io, joint
-        self._output_qos, self._reference_qos = output_qos, reference_qos
+        self._node, self._io, self._joint, self._references = node, io, joint, references
         self._lately = Lately()
         self._consistent_at = time.monotonic()  # the newest look at which it was, or there was none
+        self._publisher = DiagnosticsPublisher(node, about or io.publisher.topic_name, part=joint)
 
-    def findings(
-        self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
-        rivals: tuple[str, ...],
-    ) -> tuple[list[Finding], dict[str, object]]:
-        """What is to be said of an active loop, the likeliest cause first; details to it.
-
-        reference_at_s: when the newest y_m came, on the steady clock. rivals: who else publishes
-        the command.
-        """
-        figures = self._figures(loop, p, reference_at_s, rivals)
-        findings = [*self._of_messages(p), *findings_of(figures)]
-        return findings, _details(findings, figures)
+    def tell(
+        self, loop: ControlLoop | None, p: Parameters, reference_at_s: float | None,
+        rivals: RivalWatch, active: bool,
+    ) -> None:
+        """Publish what is going on. reference_at_s: when the newest y_m came, steady clock."""
+        claim = rivals.claim
+        period = UNKNOWN_PERIOD if loop is None else loop.counter.sender.newest()
+        if loop is None:
+            self._publisher.publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), claim)
+        elif not active:
+            text = f'inactive: no {self._io.topics.control} is published'
+            values = values_of(loop, period)
+            self._publisher.publish(Finding(Level.OK, 'inactive', text), {**values, **claim})
+        else:
+            figures = self._figures(
+                loop, p, period, reference_at_s, tuple(rival.name for rival in rivals.found)
+            )
+            findings = [*self._of_messages(p), *findings_of(figures)]
+            finding, values = worst(findings), values_of(loop, period)
+            # What is true of all joints the first one says in the log.
+            speaks = self._joint == self._io.joint_names[0] or finding.kind not in OF_MESSAGES
+            self._publisher.publish(
+                finding, {**_details(findings, figures), **values, **claim}, logs=speaks
+            )
 
     def _figures(
-        self, loop: ControlLoop, p: Parameters, reference_at_s: float | None,
+        self, loop: ControlLoop, p: Parameters, period: Period, reference_at_s: float | None,
         rivals: tuple[str, ...],
     ) -> LoopFigures:
         statistics, io, node = loop.statistics, self._io, self._node
@@ -129,9 +151,9 @@ class Diagnosis:
         control = io.topics.control
         return LoopFigures(
             p.sample_period,
-            publishers_of(node, io.topics.output, io.topics.output_type, self._output_qos),
+            publishers_of(node, io.topics.output, io.topics.output_type, output_qos(p, DEPTH)),
             publishers_of(
-                node, io.topics.reference, io.topics.reference_type, self._reference_qos
+                node, io.topics.reference, io.topics.reference_type, self._references
             ),
             subscribers_of(node, control, io.topics.control_type), rivals,
             standing_down=loop.standing_down,
@@ -144,8 +166,8 @@ class Diagnosis:
             reference_silent_s=timeout if overdue else 0.0,
             # In lockstep the outputs come as fast as the machine goes.
             intervals_s=(nan, nan, nan) if p.lockstep else statistics.intervals_s(),
-            period=UNKNOWN_PERIOD if p.lockstep else loop.counter.sender.newest(),
-            repeats_stamps=io.repeats_stamps,
+            period=UNKNOWN_PERIOD if p.lockstep else period,
+            repeats_stamps=io.stamps.repeated,
             # Stamps of simulated time have nothing to do with the time of arrival.
             age_s=nan if p.lockstep or io.simulated_time else statistics.age_s(),
             still=statistics.still,
@@ -206,11 +228,12 @@ def counts_of(loop: ControlLoop) -> dict[str, int]:
     }
 
 
-def values_of(loop: ControlLoop) -> dict[str, object]:
-    """Counts, estimates and what tells how well the loop runs."""
+def values_of(loop: ControlLoop, period: Period) -> dict[str, object]:
+    """Counts, estimates and what tells how well the loop runs. period: that of the driver."""
     statistics, e = loop.statistics, loop.estimate
     gap, swing = e.c_r - e.c_l, statistics.swing()
-    mean_s = loop.counter.sender.newest().mean
+    p50_ms, p99_ms = statistics.latencies_ms(0.5, 0.99)
+    mean_s = period.mean
     if isnan(mean_s):
         _, mean_s, _ = statistics.intervals_s()
     return {
@@ -224,8 +247,7 @@ def values_of(loop: ControlLoop) -> dict[str, object]:
         # Above 1 the gap is crossed, without which nothing can be learned of it.
         'excitation: swing of v / gap': swing / gap if gap > 0.0 else swing,
         'rate [Hz]': 0.0 if isnan(mean_s) or mean_s <= 0.0 else 1.0 / mean_s,
-        'latency p50 [ms]': statistics.latency_ms(0.5),
-        'latency p99 [ms]': statistics.latency_ms(0.99),
+        'latency p50 [ms]': p50_ms, 'latency p99 [ms]': p99_ms,
     }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from math import isfinite
 from pathlib import Path
@@ -14,34 +15,38 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.figures import OF_MESSAGES, Finding, Level
 from backlash_ros.core.loop.phase import Phase
 from backlash_ros.core.loop.report_use import awaited_reports
 from backlash_ros.core.loop.sample_counter import JointOutputs, Output
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.nodes.control.diagnosis import Diagnosis, counts_of, values_of, worst
+from backlash_ros.nodes.control.diagnosis import Diagnosis, counts_of
 from backlash_ros.nodes.control.publishing import ModelPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
-from backlash_ros.nodes.runtime.driver_io import DriverIo, Reports, output_qos
-from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
+from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class EstimateSaver:
-    """Writes to one file, one writing after the other.
+    """Writes estimates to one file, one writing after the other, without holding up the loop.
 
     file: path, empty for none.
     """
 
-    def __init__(self, file: str) -> None:
-        self.file = file
+    def __init__(self, file: str, complain: Callable[[str], object]) -> None:
+        self.file, self._complain = file, complain
         # A disk that is slow to confirm a file would cost samples.
         self._thread = ThreadPoolExecutor(1, thread_name_prefix='estimates')
+        self._saved_at = time.monotonic()
 
     def save(self, estimate: Estimate, p: Parameters) -> Future[str]:
         """Begin to save; the result says why it failed, empty if it did not."""
+        self._saved_at = time.monotonic()
         return self._thread.submit(self._write, estimate, p)
+
+    def is_due(self, period_s: float) -> bool:
+        """Whether the newest saving is so long ago; never with 0."""
+        return 0.0 < period_s < time.monotonic() - self._saved_at
 
     def close(self) -> None:
         """Wait until everything is written."""
@@ -51,20 +56,20 @@ class EstimateSaver:
         try:
             save_estimate(Path(self.file), estimate, p)
         except OSError as error:
-            return f'estimates.file={self.file!r} cannot be written: {error.strerror}'
+            text = f'estimates.file={self.file!r} cannot be written: {error.strerror}'
+            self._complain(text)
+            return text
         return ''
 
 
 class FirstCommand:
-    """Decides when the loop may begin.
+    """Which v the first command goes on from, and whether the loop may begin with it.
 
-    reports: those of the driver, None in lockstep. before: v before a cleanup, None without one.
+    before: v before a cleanup, None without one.
     """
 
-    def __init__(
-        self, node: ProcessNode, io: DriverIo, reports: Reports | None, joint: str = '',
-    ) -> None:
-        self._node, self._io, self._reports, self._joint = node, io, reports, joint
+    def __init__(self, node: ProcessNode, io: DriverIo, joint: str) -> None:
+        self._node, self._io, self._joint = node, io, joint
         self.before: float | None = None
         self._warned: set[str] = set()  # texts
         self._unanswered = 0  # outputs that were not answered because v was not known yet
@@ -73,9 +78,8 @@ class FirstCommand:
         """The v that acts as far as this node can know, None if it cannot."""
         if self.before is not None:
             return self.before
-        initial = p.control.initial
         # In lockstep there is the simulated plant alone, which begins at 0.
-        return initial if isfinite(initial) and self._reports is not None else None
+        return p.control.initial if isfinite(p.control.initial) and not p.lockstep else None
 
     def may_follow(self, loop: ControlLoop, output: Output, p: Parameters) -> bool:
         """Whether it is known from which v the first command goes on, or waiting is in vain."""
@@ -88,9 +92,8 @@ class FirstCommand:
             )
         if loop.learn_v(output.stamp_ns):
             return True
-        reported = self._reports is not None and self._reports.publishers > 0
         self._unanswered += 1
-        if reported and self._unanswered <= awaited_reports(p):
+        if self._io.has_reports and self._unanswered <= awaited_reports(p):
             return False
         if self._io.in_joint_space:
             # v and y are the same angle but for the gap: the joint holds where it stands.
@@ -112,26 +115,21 @@ class Joint:
     """What the controller has of each joint; a single one is nameless.
 
     p: its parameters. loop: None while the node is unconfigured. reference_at: when the newest y_m
-    came, on the steady clock [s]. speaks: whether it says in the log what is true of all joints.
+    came, on the steady clock [s].
     """
 
     def __init__(
-        self, node: ProcessNode, name: str, p: Parameters, io: DriverIo, reports: Reports | None,
-        reference_qos: QoSProfile, speaks: bool,
+        self, node: ProcessNode, name: str, p: Parameters, io: DriverIo, references: QoSProfile,
     ) -> None:
         self.name, self.p = name, p
-        self._speaks = speaks
         self.loop: ControlLoop | None = None
         self.reference_at: float | None = None
         self.model = ModelPublisher(node, name)
-        self.first_command = FirstCommand(node, io, reports, name)
-        self.saver = EstimateSaver(p.estimates.file)
-        self._node, self._io = node, io
+        self.first_command = FirstCommand(node, io, name)
+        self.saver = EstimateSaver(p.estimates.file, node.log.error)
+        self._node = node
         self._told: Status | None = None  # the newest one that /diagnostics has
-        self._diagnosis = Diagnosis(node, io, name, output_qos(p, DEPTH), reference_qos)
-        self._diagnostics = DiagnosticsPublisher(
-            node, p.io.joint or io.publisher.topic_name, part=name
-        )
+        self._diagnosis = Diagnosis(node, io, name, p.io.joint, references)
 
     def begin(self, loop: ControlLoop, before: Estimate) -> None:
         """Take a new loop."""
@@ -164,10 +162,10 @@ class Joint:
 
     def is_overdue(self) -> bool:
         """Whether its driver has been silent for too long, and that is new."""
-        loop, timeout = self.loop, self.p.timeout.plant_output
+        loop = self.loop
         return loop is not None and loop.heard_at is not None \
             and loop.phase in (Phase.BEGINS, Phase.RUNS) \
-            and 0.0 < timeout < time.monotonic() - loop.heard_at
+            and 0.0 < self.p.timeout.plant_output < time.monotonic() - loop.heard_at
 
     def check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loop cannot take up."""
@@ -194,25 +192,14 @@ class Joint:
             return None
         return self.saver.save(self.loop.estimate, self.p)
 
+    def save_now_and_then(self) -> None:
+        """Begin to save as often as estimates.save_period says."""
+        if self.saver.is_due(self.p.estimates.save_period):
+            self.save()
+
     def diagnose(self, rivals: RivalWatch, active: bool) -> None:
         """Publish what is going on to /diagnostics."""
-        loop, claim = self.loop, rivals.claim
-        if loop is None:
-            self._diagnostics.publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), claim)
-        elif not active:
-            text = f'inactive: no {self._io.topics.control} is published'
-            self._diagnostics.publish(
-                Finding(Level.OK, 'inactive', text), {**values_of(loop), **claim}
-            )
-        else:
-            findings, details = self._diagnosis.findings(
-                loop, self.p, self.reference_at, tuple(rival.name for rival in rivals.found)
-            )
-            finding = worst(findings)
-            self._diagnostics.publish(
-                finding, {**details, **values_of(loop), **claim},
-                logs=self._speaks or finding.kind not in OF_MESSAGES,
-            )
+        self._diagnosis.tell(self.loop, self.p, self.reference_at, rivals, active)
 
     def sum_up(self) -> None:
         """Say in the log what was counted."""

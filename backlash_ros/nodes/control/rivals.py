@@ -210,6 +210,8 @@ class RivalWatch:
             self._others, self._hello_until = frozenset(others), now + HELLO_S
         self._listen(bool(others))
         self.found = self._rivals.among(others, now)
+        if before and not self.found:
+            self._node.log.info(f'nobody else publishes {self.topic} any more')
         if self.found != before or (others and now < self._hello_until):
             self._changed()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future as Writing
-from typing import Protocol, cast
+from typing import cast
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -17,29 +17,21 @@ from backlash_ros.core.loop.control_loop import ControlLoop
 UNCONFIGURED = 'the controller is unconfigured: configure it first'
 
 
-class Served(Protocol):
-    """What the services are about."""
+def offer_services(
+    node: Node, loops_of: Callable[[], Sequence[ControlLoop]],
+    save_estimates: Callable[[], list[Writing[str]]], files: Callable[[], str],
+) -> None:
+    """Create ~/freeze_adaptation, ~/enable_compensation, ~/reset_estimates, ~/save_estimates.
 
-    @property
-    def configured(self) -> Sequence[ControlLoop]:
-        """The loops, none while there are none."""
-
-    def save_estimates(self) -> list[Writing[str]]:
-        """Begin to save what is worth it; each result says why it failed, empty if it did not."""
-
-    @property
-    def estimates_files(self) -> str:
-        """Where to, empty for nowhere."""
-
-
-def offer_services(node: Node, served: Served) -> None:
-    """Create ~/freeze_adaptation, ~/enable_compensation, ~/reset_estimates, ~/save_estimates."""
+    loops_of: the loops, none while there are none. save_estimates: begins to save what is worth
+    it; each result says why it failed, empty if it did not. files: where to, empty for nowhere.
+    """
 
     def when_configured(
         response: SetBool.Response | Trigger.Response, action: Callable[[ControlLoop], None],
         done: str,
     ) -> None:
-        loops = served.configured
+        loops = loops_of()
         for loop in loops:
             action(loop)
         response.success = bool(loops)
@@ -68,21 +60,21 @@ def offer_services(node: Node, served: Served) -> None:
         return response
 
     async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not served.configured:
+        if not loops_of():
             response.message = UNCONFIGURED
-        elif not served.estimates_files:
+        elif not files():
             response.message = 'estimates.file is empty, so there is nowhere to save: start with ' \
                 '-p estimates.file:=PATH, or set it while unconfigured'
-        elif not any(worth_saving(loop.estimate) for loop in served.configured):
+        elif not any(worth_saving(loop.estimate) for loop in loops_of()):
             response.message = 'nothing was learned yet'
         else:
             # The loop goes on while the disk takes its time.
             reasons = []
-            for saved in served.save_estimates():
+            for saved in save_estimates():
                 reasons.append(await _result_of(saved))
             why = '; '.join(filter(None, reasons))
             response.success = not why
-            response.message = why or f'saved in {served.estimates_files}'
+            response.message = why or f'saved in {files()}'
         return response
 
     node.create_service(SetBool, '~/freeze_adaptation', freeze)

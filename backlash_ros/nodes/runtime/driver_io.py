@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -81,25 +80,22 @@ class DriverIo:
 
     Joints are told apart by name; the only one of a controller without `joints` is nameless, and
     io.joint says what it is called in messages. skipped: messages in a row without a joint. seen:
-    the joints of the newest of these. repeats_stamps: whether the driver has sent a stamp twice;
-    since then the time of sending counts. simulated_time: whether stamps are those of /clock.
+    the joints of the newest of these. simulated_time: whether stamps are those of /clock.
     """
 
     def __init__(self, node: ProcessNode, p: Parameters) -> None:
         self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
-        self.repeats_stamps = False
-        self._header_ns = self._number = 0  # of the newest message with a joint
+        self.stamps = HeaderStamps()
         self._node, self._p = node, p
         self.topics = driver_topics(p)
-        self._field = p.io.field
-        self._joints = p.joint_names
-        self._called = {joint: joint or p.io.joint for joint in p.joint_names}
-        self._joint_of = {called: joint for joint, called in self._called.items()}
+        self.joint_names = p.joint_names
+        self._joint_of = {joint or p.io.joint: joint for joint in p.joint_names}
         # On simulated time the stamps of the middleware, which are real time, say nothing.
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
         self._publisher: Publisher | None = None
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointState()  # the newest message of references
+        self._reports: Reports | None = None
 
     @property
     def publisher(self) -> Publisher:
@@ -144,14 +140,17 @@ class DriverIo:
 
         def hear_joints(message: JointState, info: dict[str, Any]) -> None:
             values = self.values(message)
-            for joint in self._joints:
+            for joint in self.joint_names:
                 self.skipped[joint] = 0 if joint in values else self.skipped[joint] + 1
-            if len(values) < len(self._joints):
+            if len(values) < len(self.joint_names):
                 self.seen = ', '.join(message.name)
             if not values:
                 return
             stamp, number = message.header.stamp, info['publication_sequence_number']
-            stamp_ns = self._header_stamp_ns(stamp.sec * 10**9 + stamp.nanosec, number)
+            stamp_ns = self.stamps.told(
+                stamp.sec * 10**9 + stamp.nanosec, number,
+                lambda: self._node.count_publishers(self.topics.output),
+            )
             # Drivers that leave the header empty are known by the stamp of the middleware.
             hear(JointOutputs(
                 values, stamp_ns or self.stamp_ns(info), info['source_timestamp'],
@@ -182,9 +181,9 @@ class DriverIo:
         if isinstance(message, Float64):
             return {'': message.data}
         if isinstance(message, Float64MultiArray):
-            fits = len(message.data) == len(self._joints)
-            return dict(zip(self._joints, message.data, strict=True)) if fits else {}
-        values = getattr(message, self._field)
+            fits = len(message.data) == len(self.joint_names)
+            return dict(zip(self.joint_names, message.data, strict=True)) if fits else {}
+        values = getattr(message, self._p.io.field)
         if '' in self._joint_of:
             return {'': values[0]} if len(values) == 1 else {}
         return {
@@ -215,19 +214,19 @@ class DriverIo:
             self._publisher.publish(self._joint_state(commands))
         else:
             self._newest.update(commands)
-            if len(self._newest) == len(self._joints):
-                data = array('d', map(self._newest.__getitem__, self._joints))
+            if len(self._newest) == len(self.joint_names):
+                data = array('d', map(self._newest.__getitem__, self.joint_names))
                 self._publisher.publish(Float64MultiArray(data=data))
 
     def _joint_state(self, commands: Mapping[str, float]) -> JointState:
         """v, and what the newest reference says of the joints besides."""
-        names = [self._called[joint] for joint in commands]
+        names = [joint or self._p.io.joint for joint in commands]
         message = JointState(name=names)
         message.header.stamp = self._node.get_clock().now().to_msg()
         row = {name: i for i, name in enumerate(self._referred.name)}
         for field in ('position', 'velocity', 'effort'):
             passed = getattr(self._referred, field)
-            if field == self._field:
+            if field == self._p.io.field:
                 setattr(message, field, list(commands.values()))
             elif all(row.get(name, len(passed)) < len(passed) for name in names):
                 setattr(message, field, [passed[row[name]] for name in names])
@@ -237,24 +236,56 @@ class DriverIo:
         """Wait until the driver has confirmed the newest v, or the timeout is over."""
         self.publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
 
-    def _header_stamp_ns(self, stamp_ns: int, number: int) -> int:
-        """The stamp in the header of a message with this number; 0 where it tells no time."""
-        repeated = stamp_ns == self._header_ns != 0 and number == self._number + 1
-        if repeated and not self.repeats_stamps:
-            # Two publishers with the same stamps are told apart by their numbers, mostly.
-            self.repeats_stamps = self._node.count_publishers(self.topics.output) == 1
-        self._header_ns, self._number = stamp_ns, number
-        return 0 if self.repeats_stamps else stamp_ns
+    @property
+    def has_reports(self) -> bool:
+        """Whether the driver reports what it has applied."""
+        return self._reports is not None and self._reports.publishers > 0
+
+    def listen_to_reports(self) -> None:
+        """Keep what the driver reports until somebody asks for it."""
+        self._reports = Reports(self._node, self)
+
+    def reports_of(self, joint: str) -> Iterator[tuple[float, int]]:
+        """v and stamp [ns] of what the driver has reported of a joint since the last call."""
+        return iter(()) if self._reports is None else self._reports.of(joint)
+
+    def forget_reports(self) -> None:
+        """Drop them all: they are of no use to a loop that begins later."""
+        if self._reports is not None:
+            self._reports.forget()
+
+
+class HeaderStamps:
+    """Stamps in the headers of the driver's messages, as far as they tell the time.
+
+    repeated: whether a stamp came twice; since then the time of sending counts.
+    """
+
+    def __init__(self) -> None:
+        self.repeated = False
+        self._stamp_ns = self._number = 0  # of the newest message
+
+    def told(self, stamp_ns: int, number: int, publishers: Callable[[], int]) -> int:
+        """The stamp of a message with this number; 0 where it tells no time.
+
+        publishers: how many there are: two with the same stamps are told apart by their numbers,
+        mostly.
+        """
+        again = stamp_ns == self._stamp_ns != 0 and number == self._number + 1
+        if again and not self.repeated:
+            self.repeated = publishers() == 1
+        self._stamp_ns, self._number = stamp_ns, number
+        return 0 if self.repeated else stamp_ns
 
 
 class Reports:
-    """Taken when a loop looks for them: v and stamp [ns] of each joint since its last look."""
+    """What the driver reports to have applied, by joint, since somebody has looked."""
 
-    def __init__(self, node: Node, io: DriverIo, joints: tuple[str, ...]) -> None:
+    def __init__(self, node: ProcessNode, io: DriverIo) -> None:
         self._io = io
         self._inbox = Inbox(node, io.topics.applied_type, io.topics.applied, REMEMBERED)
         self._new: dict[str, deque[tuple[float, int]]] = {
-            joint: deque(maxlen=REMEMBERED) for joint in joints
+            joint: deque(maxlen=REMEMBERED) for joint in io.joint_names
         }
 
     @property
@@ -270,7 +301,7 @@ class Reports:
             yield new.popleft()
 
     def forget(self) -> None:
-        """Drop them all: they are of no use to a loop that begins later."""
+        """Drop them all."""
         self._look()
         for new in self._new.values():
             new.clear()

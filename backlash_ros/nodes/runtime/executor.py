@@ -61,6 +61,8 @@ class Inbox:
 KNOWN_RCLPY = ('7.1.',)  # begin of the versions: those of ROS 2 Jazzy
 # Services and events may wait so long.
 LOOK_NS = 50_000_000
+# What is due so soon after a message is done at once: later it might hold up the next message.
+AHEAD_NS = 5_000_000
 
 
 class NodeExecutor(SingleThreadedExecutor):
@@ -71,11 +73,12 @@ class NodeExecutor(SingleThreadedExecutor):
         self._served_node = node
         self.add_node(node)
 
-    def serve_urgent(self, wait_ns: int) -> None:
+    def serve_urgent(self, wait_ns: int) -> bool:
         """Serve one message of each topic, and wait for the first one so long at most."""
         self.spin_once(timeout_sec=wait_ns / 1e9)
         for _ in list(self._served_node.subscriptions)[1:]:
             self.spin_once(timeout_sec=0.0)
+        return True
 
     def look_if_due(self) -> None:
         """Serve what is not urgent, if it is time for that."""
@@ -143,16 +146,19 @@ class PromptExecutor(NodeExecutor):
         wait_ns = self._look_at_ns - time.monotonic_ns()
         if timeout_sec is not None:
             wait_ns = min(wait_ns, int(timeout_sec * 1e9))
-        self.serve_urgent(max(wait_ns, 0))
-        self.look_if_due()
+        self._look(AHEAD_NS if self.serve_urgent(max(wait_ns, 0)) else 0)
 
     def look_if_due(self) -> None:
         """Serve what is not urgent, if it is time for that."""
+        self._look(0)
+
+    def _look(self, ahead_ns: int) -> None:
+        """Serve what is not urgent and due within so long."""
         now = time.monotonic_ns()
-        if now < self._look_at_ns:
+        if now + ahead_ns < self._look_at_ns:
             return
-        self._call_timers()
-        if now >= self._rclpy_at_ns:
+        self._call_timers(ahead_ns)
+        if now + ahead_ns >= self._rclpy_at_ns:
             self._rclpy_at_ns = now + (0 if self._serve_rest() else LOOK_NS)
         due = [timer.time_until_next_call() for timer in self._served_node.timers]
         wait_ns = min((ns for ns in due if ns is not None), default=LOOK_NS)
@@ -163,8 +169,11 @@ class PromptExecutor(NodeExecutor):
         self._wait_set = None
         return bool(super().shutdown(timeout_sec))
 
-    def serve_urgent(self, wait_ns: int) -> None:
-        """Serve one message of each topic, and wait for the first one so long at most."""
+    def serve_urgent(self, wait_ns: int) -> bool:
+        """Serve one message of each topic, and wait for the first one so long at most.
+
+        Returns whether there was any.
+        """
         self._prepare()
         wait_set = self._wait_set
         wait_set.clear_entities()
@@ -174,6 +183,7 @@ class PromptExecutor(NodeExecutor):
             wait_set.add_guard_condition(guard.handle)
         wait_set.wait(wait_ns)
         ready = wait_set.get_ready_entities('subscription')
+        served = bool(ready)
         for pointer, take, message_type, raw, callback, with_info in self._served:
             if pointer in ready and (taken := take(message_type, raw)) is not None:
                 if with_info:
@@ -184,6 +194,7 @@ class PromptExecutor(NodeExecutor):
         for guard in self._guards:
             if guard.handle.pointer in ready:
                 guard.callback()
+        return served
 
     def _prepare(self) -> None:
         """Make a wait set for what the node has now."""
@@ -205,10 +216,11 @@ class PromptExecutor(NodeExecutor):
             len(self._subscriptions), len(guards), 0, 0, 0, 0, self._served_node.context.handle
         )
 
-    def _call_timers(self) -> None:
+    def _call_timers(self, ahead_ns: int) -> None:
         for timer in list(self._served_node.timers):
             try:
-                if not timer.is_ready():
+                due_ns = timer.time_until_next_call()
+                if due_ns is None or due_ns > ahead_ns:
                     continue
                 timer.handle.call_timer()
             except InvalidHandle:  # the callback of another one has destroyed it

@@ -29,6 +29,12 @@ from backlash_ros.core.parameters.table import CONTROLLER, NODES, PARAMETERS
 ROS_OWN = {'use_sim_time', 'start_type_description_service'}
 
 
+class ParameterNode(Node):
+    """A node with a complete, checked set of parameters."""
+
+    settings: Parameters
+
+
 def declare_parameters(
     node: Node, executable: str, reconfigurable: bool = False,
 ) -> Parameters:
@@ -104,44 +110,41 @@ def describe(
     return descriptor
 
 
-class LiveParameters:
-    """Lets parameters change in a running node, all or nothing.
+def let_parameters_change(
+    node: ParameterNode, check: Callable[[Parameters], object],
+    apply: Callable[[Parameters], None], is_free: Callable[[], bool] = lambda: False,
+) -> None:
+    """Let parameters change in a running node, all or nothing.
 
-    check: raises ParameterError for a set that the node cannot take up. apply: takes it up.
-    is_free: whether those may change as well that are not live: the node is unconfigured.
+    check: raises ParameterError for a set that the node cannot take up. apply: takes up the new
+    settings of the node, given the ones before. is_free: whether those may change as well that are
+    not live: the node is unconfigured.
     """
+    def changed(changes: list[RosParameter]) -> Parameters:
+        return node.settings.replaced(
+            {change.name: change.value for change in changes if entry_of(change.name) is not None}
+        )
 
-    def __init__(
-        self, node: Node, parameters: Parameters, check: Callable[[Parameters], object],
-        apply: Callable[[Parameters], None], is_free: Callable[[], bool] = lambda: False,
-    ) -> None:
-        self.parameters = parameters
-        self._check, self._apply, self._is_free = check, apply, is_free
-        node.add_on_set_parameters_callback(self._on_set)
-        node.add_post_set_parameters_callback(self._post_set)
-
-    def _on_set(self, changes: list[RosParameter]) -> SetParametersResult:
+    def on_set(changes: list[RosParameter]) -> SetParametersResult:
         for change in changes:
             entry = entry_of(change.name)
-            if entry is not None and not (entry.live or self._is_free()):
+            if entry is not None and not (entry.live or is_free()):
                 return SetParametersResult(successful=False, reason=(
                     f'{change.name} is read-only while the node is configured: deactivate it and '
                     'clean it up first'
                 ))
         try:
-            self._check(self._with(changes))
+            check(changed(changes))
         except ParameterError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def _post_set(self, changes: list[RosParameter]) -> None:
-        self.parameters = self._with(changes)
-        self._apply(self.parameters)
+    def post_set(changes: list[RosParameter]) -> None:
+        before, node.settings = node.settings, changed(changes)
+        apply(before)
 
-    def _with(self, changes: list[RosParameter]) -> Parameters:
-        return self.parameters.replaced(
-            {change.name: change.value for change in changes if entry_of(change.name) is not None}
-        )
+    node.add_on_set_parameters_callback(on_set)
+    node.add_post_set_parameters_callback(post_set)
 
 
 def _given_value(parameter: RosParameter) -> object:

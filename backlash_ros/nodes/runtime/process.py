@@ -36,7 +36,12 @@ from backlash_ros.core.parameters.parameter import as_yaml
 from backlash_ros.core.parameters.table import PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.runtime.executor import NodeExecutor, make_executor
-from backlash_ros.nodes.runtime.parameters import changed_values, complaints, declare_parameters
+from backlash_ros.nodes.runtime.parameters import (
+    ParameterNode,
+    changed_values,
+    complaints,
+    declare_parameters,
+)
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 
 
@@ -120,7 +125,7 @@ START_REMIND_S = 5.0  # between two lines that say what start-up waits for
 NAP_NS = 3_000_000
 
 
-class ProcessNode(Node):
+class ProcessNode(ParameterNode):
     """A node that is the purpose of its process: parameters checked, then work until stopped."""
 
     def __init__(

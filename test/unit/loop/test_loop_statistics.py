@@ -14,7 +14,7 @@ def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> No
     for latency in latencies:
         statistics.note(0.0, 0.0, False, float(latency))
     reported = latency_ms(latencies)
-    assert reported == {'p50': statistics.latency_ms(0.5), 'p99': statistics.latency_ms(0.99)}
+    assert reported == dict(zip(('p50', 'p99'), statistics.latencies_ms(0.5, 0.99), strict=True))
 
 
 def test_what_was_gained_lately_is_never_negative_after_a_new_beginning() -> None:
