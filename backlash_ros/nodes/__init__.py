@@ -18,5 +18,7 @@ def _end(number: int, frame: FrameType | None) -> None:
 if sys.argv and (sys.argv[0] == '-m' or os.path.basename(sys.argv[0]) in EXECUTABLES):
     for _number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(_number, _end)
+    # Whoever starts a node may hold them back until here, where they end it well.
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, signal.SIGTERM))
     if ros_is_missing():
         sys.exit(ROS_MISSING)

@@ -64,7 +64,7 @@ class Presence:
 # before it. Controllers of this machine are waited for however long it takes.
 DISCOVERY_S = 0.7
 HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
-OWN_S = 1.0  # for the graph to show a publisher of this very process
+OWN_ENDPOINT_S = 10.0  # longest wait for the graph to show a publisher of this very process
 # Keys in /diagnostics by which controllers know each other.
 ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
 
@@ -267,11 +267,13 @@ def identity_made_by(
 
     own_name, before = node.get_fully_qualified_name(), set(map(identity_of, seen()))
     advertise()
-    deadline = time.monotonic() + OWN_S
+    deadline = time.monotonic() + OWN_ENDPOINT_S
     while time.monotonic() < deadline:
         # A namesake that is discovered at this very moment has no name yet.
         for info in seen():
             if identity_of(info) not in before and name_of(info) == own_name:
                 return identity_of(info)
         time.sleep(1e-3)
-    raise RuntimeError(f'the graph does not show the own publisher of {topic} within {OWN_S:g} s')
+    raise RuntimeError(
+        f'the graph does not show the own publisher of {topic} within {OWN_ENDPOINT_S:g} s'
+    )

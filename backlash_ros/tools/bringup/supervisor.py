@@ -34,9 +34,9 @@ class ProcessPlan:
     """What to start.
 
     name: in messages. axis: that its events are about. foreign: no node of this package: all that
-    it prints goes to its log. spectator: the run goes on without it. settle_s: time that passes
-    before it is stopped, in which what was stopped before still has an effect on it. grace_s: time
-    that it needs for its end beyond what any process gets.
+    it prints goes to its log, and signals reach it from the very start. spectator: the run goes on
+    without it. settle_s: time that passes before it is stopped, in which what was stopped before
+    still has an effect on it. grace_s: time that it needs for its end beyond what any process gets.
     """
 
     name: str
@@ -188,6 +188,9 @@ class ProcessSupervisor:
         return last_words
 
     def _start(self, plan: ProcessPlan) -> Child:
+        # A node lets them through when it knows what to do with them: see nodes/__init__.py.
+        held_back = () if plan.foreign else (signal.SIGINT, signal.SIGTERM)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
         try:
             with plan.log.open('ab') as log:
                 process = subprocess.Popen(
@@ -199,6 +202,8 @@ class ProcessSupervisor:
             raise BrokenOffError(
                 f'{plan.name} does not start: {plan.command[0]}: {error.strerror}'
             ) from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         child = Child(plan, process)
         if process.stdout is not None:
             self._selector.register(process.stdout, selectors.EVENT_READ, child)

@@ -143,3 +143,12 @@ def test_a_process_whose_main_thread_has_ended_is_waited_for(tmp_path: Path) -> 
         supervisor.stop()
         (child,) = supervisor.children
         assert child.process.returncode == 0
+
+
+def test_a_node_that_is_told_to_end_before_it_has_begun_ends_well(tmp_path: Path) -> None:
+    command = (sys.executable, '-m', 'backlash_ros.nodes.reference')
+    plan = ProcessPlan('', command, tmp_path / 'log', child_environment(tmp_path, None))
+    with ProcessSupervisor([[plan]], lambda: False) as supervisor:
+        supervisor.stop()
+        (child,) = supervisor.children
+        assert child.process.returncode == 0
