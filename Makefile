@@ -19,7 +19,8 @@ endif
 
 RUN := .venv/bin/python
 # A worker per processor; tests of one file share what their fixtures have made.
-WORKERS := -n auto --dist loadfile
+# Long ones first, in the order of the rooms, so that no worker waits for another at the end.
+WORKERS := -n auto --dist loadfile --no-loadscope-reorder
 # A Python that was not asked for by name leaves an existing .venv of another Python as it is.
 KEEP := $(if $(filter file,$(origin PYTHON)),--keep-python)
 # A sourced ROS 2 brings its own numpy, and each numpy has other types than the pinned one.
