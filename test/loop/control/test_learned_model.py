@@ -18,8 +18,6 @@ from waiting import wait_until
 from backlash_ros.core.control.controller import LONGEST_WAIT, AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.control.pole_placement import PolePlacement
-from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.protocol import Structure
 from backlash_ros.core.control.tracking.design import (
     TrackingDesign,
@@ -35,7 +33,6 @@ from backlash_ros.core.estimation.worker import WorkerExecutor
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import Backlash
-from backlash_ros.core.plant.four_blocks import place_poles
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -237,27 +234,7 @@ def test_feedback_softens_until_the_loop_is_as_safe_as_the_one_it_replaces() -> 
     assert softer.gains.preview == pytest.approx(nominal.gains.preview)
 
 
-def test_feedback_does_not_fade_from_one_redesign_to_the_next() -> None:
-    """Each has to be as safe as the one before: what it is safer by would be asked of the next."""
-    weights = Weights(1e-2, 1e-3, 60)
-    first = chosen = redesigned(motor(), motor(0.5), weights)
-    for k in range(20):
-        model = StateModel(motor(0.5 * (1.0 + 1e-3 * (-1) ** k)))
-        assert chosen is not None
-        chosen = better_design(model, weights, chosen)
-    assert first is not None
-    assert chosen is not None
-    assert np.linalg.norm(chosen.feedback.gain) > 0.95 * np.linalg.norm(first.feedback.gain)
-
-
 def test_a_model_without_gains_is_refused() -> None:
     # The zero cancels the pole at 1.2, which no feedback can move then.
     unmoved = TransferFunction([1.0, -1.2], [1.0, -1.7, 0.6])
     assert redesigned(motor(), unmoved, WEIGHTS) is None
-
-
-def test_only_structures_that_depend_on_a_model_refuse_one() -> None:
-    model = StateModel(motor(1.2))
-    assert Proportional().redesign(model)() is not None
-    closed = np.poly([0.5, 0.5])
-    assert PolePlacement(place_poles(motor(), closed, 0.2)).redesign(model)() is None

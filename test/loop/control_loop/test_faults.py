@@ -33,34 +33,6 @@ def test_absurd_numbers_are_dropped_counted_and_change_nothing() -> None:
     world.check_sanity()
 
 
-@pytest.mark.parametrize('action', ['hold', 'zero', 'ramp'])
-def test_a_silent_driver_brings_the_configured_command_and_a_return_without_a_jump(
-    action: str,
-) -> None:
-    world = SimulatedLoop(**{
-        'on_timeout': action, 'timeout.plant_output': 0.2, 'control.rate_max': RATE_MAX,
-    })
-    world.learn()
-    while abs(world.sent[-1]) < 5.0:
-        world.run(1)
-    world.fault = lambda k, output: []
-    world.run(19)
-    assert not world.loop.silent
-    answered = len(world.sent)
-    world.run(30)
-    assert world.loop.silent
-    assert (world.sent[-1] == 0.0) == (action != 'hold')
-    assert len(world.sent) - answered == 0 if action == 'hold' else len(world.sent) > answered
-    ended = len(world.sent)
-    world.fault = lambda k, output: [output]
-    world.run(150)
-    assert len(world.sent) == ended + 150
-    assert world.loop.statistics.interruptions == 1
-    assert world.error() < 0.05
-    assert np.abs(np.diff(world.sent)).max() <= STEP
-    world.check_sanity()
-
-
 @pytest.mark.parametrize('share', [0.01, 0.1, 0.3])
 @pytest.mark.parametrize('published', [True, False])
 def test_lost_outputs_leave_the_estimates_within_5_percent(share: float, published: bool) -> None:
@@ -187,27 +159,6 @@ def test_a_second_driver_is_not_listened_to() -> None:
     assert world.loop.statistics.extra == 200
     assert world.error() < 0.02
     world.check_sanity()
-
-
-@pytest.mark.parametrize('clean_up', [False, True])
-@pytest.mark.parametrize('structure', ['proportional', 'tracking'])
-def test_a_loop_that_ended_goes_on_from_its_last_command_and_counts_on(
-    structure: str, clean_up: bool,
-) -> None:
-    # With the amplitude of the example tracking would ask for more than the rate allows.
-    world = SimulatedLoop(structure=structure, **{
-        'control.rate_max': RATE_MAX, 'on_stop': 'ramp',
-        'amplitude': 0.2 if structure == 'tracking' else 10.0,
-    })
-    world.learn()
-    index, rows = world.loop.counter.index, len(world.rows)
-    world.controller.cycle(clean_up)
-    assert world.sent[-1] == 0.0
-    world.run(100)
-    assert world.loop.counter.index == index + 100
-    if not clean_up:
-        assert all(abs(row.m / 1.3 - 1.0) < 0.05 for row in world.rows[rows:])
-    assert np.abs(np.diff(world.sent)).max() <= STEP
 
 
 STANDING = 5.13  # v at which the driver is found

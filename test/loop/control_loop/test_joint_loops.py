@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from math import inf, isnan, nan
 
 import numpy as np
-import pytest
 
 from backlash_ros.core.assembly import first_guess
 from backlash_ros.core.loop.joint_loops import JointLoops
@@ -94,10 +93,3 @@ def test_a_joint_in_an_arm_is_the_loop_that_it_is_alone() -> None:
     for joint in JOINTS:
         one = run(lambda k, y, joint=joint: {joint: y[joint]}, 400)  # type: ignore[misc]
         assert one[joint] == together[joint]
-
-
-def test_a_joint_that_nobody_describes_gets_its_reference() -> None:
-    commands = run(lambda k, y: y, 400)['gripper']
-    assert commands[100:] == pytest.approx(
-        [0.5 * np.sin(0.02 * k + 3) for k in range(100, 400)], abs=1e-12
-    )

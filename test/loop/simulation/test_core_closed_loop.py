@@ -103,17 +103,6 @@ def test_one_seed_gives_one_run_to_the_last_bit() -> None:
     assert rows(3).shape != rows(4).shape or not np.array_equal(rows(3), rows(4), equal_nan=True)
 
 
-def test_every_sample_is_announced_and_every_loss_counted() -> None:
-    loop = build_closed_loop(paper_example())
-    loop.lose = every(10, burst=2)
-    announced: list[int] = []
-    run = loop.run(100, announced.append)
-    assert announced == list(range(100))
-    assert run.samples + run.lost_samples == 100
-    received = np.round(run.column('t') / 0.01).astype(int)
-    assert not set(received) & {k for k in range(1, 100) if k % 10 >= 8}
-
-
 @pytest.mark.parametrize(('law', 'structure'), [
     ('moving_horizon', 'proportional'), ('moving_horizon', 'tracking'), ('lms', 'proportional'),
     ('printed', 'proportional'), ('fixed', 'tracking'), ('gradient', 'pole_placement'),

@@ -52,14 +52,6 @@ def test_run_writes_its_results_and_prints_a_table(
     assert lines[-1] == f'report: {tmp_path / "report.html"}'
 
 
-def test_seed_decides_every_sample() -> None:
-    def final(seed: int) -> Outcome:
-        [job] = batch.make_jobs(noisy(), [{}], [seed], 0.5)
-        return batch.run_job(job)
-    assert repr(final(1)) == repr(final(1))  # repr, as nan differs from itself
-    assert final(1)['m'] != final(2)['m']
-
-
 def test_parallel_runs_equal_serial_ones() -> None:
     jobs = batch.make_jobs(noisy({'output_loss': 0.1}), [{}], range(5, 9), 0.8)
     serial = batch.run_jobs(jobs, workers=1)

@@ -67,23 +67,6 @@ def test_noise_within_the_direction_band_never_turns_v(
         v_before = v
 
 
-@given(
-    play=usual_plays(), band=st.floats(0.1, 10.0), sign=st.sampled_from([1.0, -1.0]),
-    peak=st.floats(11.0, 50.0),
-)
-def test_a_turn_beyond_the_direction_band_changes_the_line(
-    play: Play, band: float, sign: float, peak: float,
-) -> None:
-    inverse = BacklashInverse(direction_band=band)
-    far = play.c_l if sign > 0.0 else play.c_r
-    top = inverse.step(sign * peak, play.m, play.c_r, play.c_l)
-    assert inverse.step(sign * (peak - 0.9 * band), play.m, play.c_r, play.c_l) == top
-    u_d = sign * (peak - 1.1 * band)
-    assert inverse.step(u_d, play.m, play.c_r, play.c_l) == u_d / play.m + far
-    u_d -= sign * 0.01 * band  # going on is not a turn: the band does not delay it
-    assert inverse.step(u_d, play.m, play.c_r, play.c_l) == u_d / play.m + far
-
-
 @given(play=usual_plays(), take_up=st.floats(0.1, 10.0), u_d=st.floats(0.5, 50.0),
        signal=signals())
 def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(

@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 
 from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
-from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 
 @given(st.one_of(st.floats(), st.just(1e300)), st.floats(-10.0, 10.0), st.floats(-20.0, 5.0),
@@ -97,13 +95,3 @@ def test_the_last_commands_brake(action: str) -> None:
     v += last_commands(action, motion, lambda: limits)
     assert max(accelerations([*v, v[-1]])) <= 0.3 + 1e-9
     assert v[-1] == (0.0 if action != 'hold' else max(v))
-
-
-def test_a_loop_keeps_the_acceleration_it_is_told() -> None:
-    p = Parameters({
-        'structure': 'tracking', 'amplitude': 0.2, 'estimator.law': 'fixed',
-        'estimator.initial.m': 1.3, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0,
-        'control.acceleration_max': 2e4,
-    })
-    v = build_closed_loop(p).run(300).column('v')
-    assert np.abs(np.diff(v, 2, prepend=[0.0])).max() == pytest.approx(2.0)

@@ -60,15 +60,6 @@ def test_lag_and_wind_up_of_the_motor_are_made_up_for() -> None:
     assert error < 0.4 * ignorant
 
 
-@pytest.mark.parametrize('last', [0, 600])
-def test_the_loop_goes_on_without_reports_from_where_the_command_takes_the_motor(
-    last: int,
-) -> None:
-    error, estimate = follow(TRUE, lambda k: k < last)
-    assert (estimate.c_r, estimate.c_l) == pytest.approx((0.15, -0.1), rel=0.01)
-    assert error < 0.025
-
-
 def test_lost_outputs_are_stepped_over() -> None:
     loop = build_closed_loop(TRUE.replaced({
         'output_loss': 0.2, 'tracking.input_weight': 0.1,

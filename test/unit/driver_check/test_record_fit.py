@@ -139,15 +139,6 @@ def test_a_long_record_is_fitted_as_a_whole() -> None:
     assert fit.std_gap < short.std_gap
 
 
-def test_outliers_are_left_out_and_counted() -> None:
-    v, y = record(500)
-    y[50::60] += 0.5
-    fit = of(v, y)
-    assert fit.outliers == len(y[50::60])
-    assert_is(fit, TRUTH)
-    assert fit.noise_std == pytest.approx(NOISE, rel=0.25)
-
-
 @pytest.mark.parametrize('seed', range(6))
 def test_one_side_alone_does_not_identify_the_gap(seed: int) -> None:
     v = np.linspace(0.0, 5.0, 400)

@@ -179,24 +179,6 @@ def test_a_bag_holds_v_and_y(tmp_path: Path, report: bool) -> None:
     assert np.delete(found.y, 120).tolist() == np.delete(y, 120).tolist()
 
 
-def test_late_samples_are_numbered_by_the_last_of_their_heap() -> None:
-    # The third and fourth sample come with the fifth.
-    at = (np.array([0.0, 1.0, 3.9, 3.95, 4.0, 5.0]) * PERIOD_S * 1e9).astype(np.int64)
-    late = from_messages({
-        topics.PLANT_OUTPUT: (at, np.arange(6.0)), topics.CONTROL: (at + 1, np.arange(6.0)),
-    }, PERIOD_S)
-    assert late.y.tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-
-
-def test_a_lost_sample_leaves_its_place_empty() -> None:
-    at = (np.array([0.0, 1.0, 3.0, 4.0]) * PERIOD_S * 1e9).astype(np.int64)
-    found = from_messages({
-        topics.PLANT_OUTPUT: (at, np.arange(4.0)), topics.CONTROL: (at + 1, np.arange(4.0)),
-    }, PERIOD_S)
-    assert np.isnan(found.y).tolist() == [False, False, True, False, False]
-    assert found.v.tolist() == [0.0, 1.0, 1.0, 2.0, 3.0]
-
-
 def test_delays_of_single_samples_do_not_add_up_to_a_lost_one() -> None:
     # A driver that keeps its time, and is late by up to 0.6 of a period: steps of 1.6, 0.7, 0.7.
     late = np.tile([0.0, 0.6, 0.3], 40)

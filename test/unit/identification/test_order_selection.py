@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -71,14 +70,6 @@ def test_it_gives_way_to_nothing_else_than_the_structure_without_it() -> None:
     assert selected([PLAIN, NEITHER]) is NEITHER
     later = PLAIN._replace(structure=PLAIN.structure._replace(delay=1))
     assert not gives_way(NO_INTEGRATOR.fit, [later, NO_INTEGRATOR])
-
-
-def test_without_noise_nothing_gives_way_to_what_does_not_explain_y() -> None:
-    exact = NO_INTEGRATOR._replace(exact=True, fit=replace(NO_INTEGRATOR.fit, squares=1e-20))
-    assert selected([PLAIN, exact]) is exact
-    # What only the rounding of its slow poles makes exact explains no more than without them.
-    alike = NO_INTEGRATOR._replace(exact=True)
-    assert selected([PLAIN, alike]) is PLAIN
 
 
 def test_a_slow_motion_of_a_motor_shows_no_integrator() -> None:

@@ -7,7 +7,6 @@ from backlash_ros.core.loop.level_log import AGAIN_S, LASTS_S, LevelLog
 
 WELL = Finding(Level.OK, 'learned', 'learned')
 WRONG = Finding(Level.ERROR, 'model', 'the model is wrong')
-SLOW = Finding(Level.WARN, 'rate', 'too slow')
 WAITING = Finding(Level.WARN, 'waiting', 'waiting', lasting=True)
 
 
@@ -24,11 +23,6 @@ def test_a_change_of_level_is_one_line_and_one_when_all_is_well_again() -> None:
     assert lines_of(findings) == [
         (Level.ERROR, 'the model is wrong'), (Level.OK, 'well again: learned'),
     ]
-
-
-def test_another_cause_at_the_same_level_is_told() -> None:
-    findings = [(0.0, SLOW), (0.5, SLOW._replace(kind='bad', text='no number')), (1.0, SLOW)]
-    assert [text for _, text in lines_of(findings)] == ['too slow', 'no number']
 
 
 def test_what_comes_and_goes_is_told_once_per_while() -> None:

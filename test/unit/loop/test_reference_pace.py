@@ -88,14 +88,6 @@ def test_a_single_late_output_is_waited_for_and_then_answered_at_once() -> None:
     assert at == pytest.approx(arrivals[20], abs=2 * STEP_S)
 
 
-def test_silence_is_gone_through_by_the_own_clock_and_leaves_no_shift() -> None:
-    arrivals = [at for at in times(300) if not 50 * PERIOD_S < at < 200 * PERIOD_S]
-    sent = messages_of(arrivals, 300 * PERIOD_S)
-    check_rate(sent, 300 * PERIOD_S)
-    assert len(sent) == pytest.approx(300, abs=3)
-    assert sent[-1][1] == pytest.approx(299, abs=1)
-
-
 def test_a_node_that_waits_for_nobody_goes_on_by_its_own_clock() -> None:
     pace = ReferencePace(PERIOD_S, begins_with_output=False, now_s=0.0)
     sent = [pace.sample_to_send(k * STEP_S) for k in range(1000)]

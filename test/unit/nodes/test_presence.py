@@ -11,7 +11,6 @@ import pytest
 from backlash_ros.nodes.control.rivals import LISTED, Presence
 
 DOMAIN = os.getpid() + 1000  # of no ROS, so of nobody else
-LONG = '/a_name' * 30
 
 pytestmark = pytest.mark.skipif(not LISTED.exists(), reason='needs Linux')
 
@@ -36,9 +35,3 @@ def test_other_domains_and_topics_are_nobodys_business(
 ) -> None:
     with closing(Presence(DOMAIN + offset, topic, 'b')) as other:
         assert here.others() == other.others() == frozenset()
-
-
-def test_a_topic_may_have_a_long_name() -> None:
-    with closing(Presence(DOMAIN, LONG, 'a' * 32)), \
-            closing(Presence(DOMAIN, LONG, 'b' * 32)) as other:
-        assert other.others() == {'a' * 32}

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-import yaml
-from places import ROOT
 
 from backlash_ros.nodes.runtime.parameters import unused
-
-CONFIGS = sorted((ROOT / 'config').glob('*.yaml'))
 
 
 @pytest.mark.parametrize(('sections', 'full_name', 'cure'), [
@@ -33,10 +27,3 @@ def test_section_that_does_not_reach_its_node_is_named(
 ])
 def test_other_sections_are_no_concern(sections: list[str], full_name: str) -> None:
     assert list(unused(sections, 'plant', full_name)) == []
-
-
-@pytest.mark.parametrize('path', CONFIGS, ids=lambda path: path.name)
-def test_shipped_sections_reach_their_nodes_in_any_namespace(path: Path) -> None:
-    sections = list(yaml.safe_load(path.read_text()))
-    for node in ('controller', 'plant', 'reference', 'recorder'):
-        assert list(unused(sections, node, f'/arm/{node}')) == []

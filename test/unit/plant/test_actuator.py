@@ -46,14 +46,6 @@ def test_in_front_of_g_without_a_gap_is_what_both_do_one_after_the_other() -> No
         assert x[0] == pytest.approx(inner[0], abs=1e-12)
 
 
-def test_an_actuator_that_does_nothing_leaves_g_as_it_is() -> None:
-    nothing = Actuator(TransferFunction((1.0,), (1.0, 0.0), 'actuator'))
-    serial = nothing.in_front_of(MODEL)
-    np.testing.assert_allclose(serial.numerator, MODEL.numerator)
-    np.testing.assert_allclose(serial.denominator, MODEL.denominator)
-    assert nothing.crossings(1.0, -0.5) == (1.0, -0.5)
-
-
 def test_a_command_beyond_its_crossing_moves_y_and_within_does_not() -> None:
     c_r, c_l = ACTUATOR.crossings(1.0, -0.5)
     assert (c_r, c_l) == pytest.approx((0.8, -0.45))

@@ -50,15 +50,6 @@ def test_y_is_g_of_the_backlash_output_plus_the_disturbance(
     )
 
 
-def test_noise_has_the_given_spread_and_follows_the_seed() -> None:
-    noisy = Imperfections(output_noise_std=0.2)
-    y = outputs(plant(noisy), [0.0] * 4000)
-    assert np.std(y) == pytest.approx(0.2, rel=0.05)
-    assert np.mean(y) == pytest.approx(0.0, abs=0.02)
-    assert outputs(plant(noisy), [0.0] * 50) == y[:50]
-    assert outputs(plant(noisy, seed=2), [0.0] * 50) != y[:50]
-
-
 @given(control=signals(), quantum=st.floats(0.001, 1.0))
 def test_quantised_output_is_the_nearest_multiple(control: list[float], quantum: float) -> None:
     exact = outputs(plant(), control)

@@ -94,15 +94,6 @@ def test_what_was_not_read_is_lost(tmp_path: Path, word: str) -> None:
     assert record.v[40] == V[39]
 
 
-def test_what_was_guessed_is_said_and_can_be_chosen(tmp_path: Path) -> None:
-    text = 'time,goal,actual,motor\n' + rows('{t:.3f},{v:.3f},{y:.3f},{k}')
-    path = written(tmp_path / 'a.csv', text)
-    assert "t is 'time', v is 'goal', y is 'actual'" in read_record(path).notes[0]
-    record = read_record(path, columns={'y': 'motor'})
-    assert record.y.tolist() == list(range(COUNT))
-    assert 'y is' not in record.notes[0]
-
-
 @pytest.mark.parametrize(('names', 'said'), [
     (('time', 'target pos (5)', 'pos (5)', 'target pos (3)', 'pos (3)'), 'several columns may be'),
     (('t', 'voltage', 'y'), 'no column is v'), (('t', 'v', 'speed'), 'no column is y'),
@@ -119,11 +110,6 @@ def test_names_that_may_mean_several_columns_are_asked_for(
         choose_columns(names, {}, 'a')
     assert '--columns "t=…,v=…,y=…"' in str(told.value)
     assert all(name in str(told.value) for name in names)
-
-
-def test_a_column_that_does_not_exist_is_told_with_those_that_do() -> None:
-    with pytest.raises(InputError, match='v=goal: the columns are t, a, b'):
-        choose_columns(('t', 'a', 'b'), {'v': 'goal'}, 'a')
 
 
 @pytest.mark.parametrize(('text', 'given'), [

@@ -64,13 +64,6 @@ def test_page_holds_the_pictures_that_lie_beside_it(page: Path) -> None:
     }
 
 
-def test_summary_of_a_bag_tells_latency_losses_and_truth(page: Path) -> None:
-    summary = json.loads((page.parent / 'summary.json').read_text())
-    assert summary['loop_latency_ms'] == pytest.approx({'p50': 0.4, 'p99': 0.4})
-    assert (summary['samples'], summary['lost_samples']) == (119, 1)
-    assert summary['truth'] == {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
-
-
 def test_summary_of_a_bag_tells_the_newest_model(run: RunRecord, tmp_path: Path) -> None:
     models = {5: believed([1.0, -0.5]), 50: believed([1.0, -0.6, 0.2]), 70: believed([1.0, -0.7])}
     bag = write_bag(tmp_path / 'bag', run, models=models)
@@ -159,15 +152,6 @@ def test_saved_results_are_read_in_full(run: RunRecord, tmp_path: Path) -> None:
     source = read_run(saved(run, tmp_path / 'results'))
     np.testing.assert_array_equal(source.record.rows, run.rows)
     assert source.parameters == PARAMETERS
-
-
-def test_bag_in_the_results_goes_first(run: RunRecord, tmp_path: Path) -> None:
-    folder = saved(run, tmp_path / 'results')
-    write_bag(folder / 'bag', run)
-    for path in (folder, folder / 'bag'):
-        source = read_run(path)
-        assert source.latency_s is not None
-        assert source.parameters == PARAMETERS
 
 
 def broken_bag(path: Path, run: RunRecord) -> None:

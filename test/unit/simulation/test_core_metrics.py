@@ -46,11 +46,6 @@ def test_estimate_that_is_not_a_number_is_not_settled() -> None:
     assert settling_time(T, partly, ONES) == pytest.approx(3.0)
 
 
-def test_control_error_is_taken_over_the_last_second() -> None:
-    u = np.where(T > 8.995, 2.0, 50.0)
-    assert control_error_rms(run(u=u, u_d=0.0)) == pytest.approx(2.0)
-
-
 def test_tracking_error_is_relative_and_taken_over_the_last_half() -> None:
     y_m = 10.0 * np.sin(12.6 * T)
     y = np.where(T < 5.0, 99.0, 1.03 * y_m)

@@ -216,16 +216,6 @@ def test_rosbags_made_otherwise_still_records(
     assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
 
 
-def test_bag_that_is_whole_is_left_alone(
-    finished: dict[str, Finished], capsys: pytest.CaptureFixture[str],
-) -> None:
-    for whole in finished.values():
-        before = contents(whole.bag.parent)
-        assert repair_command(whole.bag) == 0
-        assert capsys.readouterr().out == f'{whole.bag} is complete: nothing to repair\n'
-        assert contents(whole.bag.parent) == before
-
-
 def nothing_flushed(bag: Path) -> None:
     file = message_file(bag)
     file.write_bytes(file.read_bytes()[:60])

@@ -20,6 +20,14 @@ from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs import files as results
 from backlash_ros.tools.runs.summary import summarise
 
+
+def without_truth(run: RunRecord) -> RunRecord:
+    rows = run.rows.copy()
+    for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):
+        rows[:, COLUMNS.index(name)] = nan
+    return RunRecord(rows, run.sample_period, run.lost_samples)
+
+
 OLD_HEADER = 't,y_m,y,u_d,v,u,m,c_r,c_l,f'  # of samples.csv before version 0.3
 FIELDS = [
     'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'began_with', 'final',
@@ -33,13 +41,6 @@ LEARNED = LearnedModel((0.1, 0.05), (1.0, -0.9), 1, (0.1, 0.2, 0.3, 0.4, nan), 1
 def run() -> RunRecord:
     lossy = Parameters({'output_loss': 0.1, 'estimator.law': 'lms'})
     return build_closed_loop(lossy).run(150)
-
-
-def without_truth(run: RunRecord) -> RunRecord:
-    rows = run.rows.copy()
-    for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):
-        rows[:, COLUMNS.index(name)] = nan
-    return RunRecord(rows, run.sample_period, run.lost_samples)
 
 
 def strict(text: str) -> object:
