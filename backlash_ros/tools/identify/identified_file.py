@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from backlash_ros.core.assembly import build_controller
+from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.identification.identification import Identification
 from backlash_ros.core.identification.least_response import known_up_to
@@ -72,7 +72,8 @@ def identified_parameters(
     if estimates is not None:
         values.update({'estimates.file': str(estimates), 'estimates.load': True})
     parameters = Parameters(values) if 'structure' in given else _with_structure(values)
-    build_controller(parameters)
+    # estimates.file is yet to be written, perhaps over that of another record.
+    build_controller(parameters, first_guess(parameters))
     return parameters
 
 
@@ -91,7 +92,7 @@ def _with_structure(values: dict[str, Any]) -> Parameters:
     """y follows y_m where gains for that can be designed, else u_d = y_m."""
     try:
         parameters = Parameters({**values, 'structure': 'tracking'})
-        build_controller(parameters)
+        build_controller(parameters, first_guess(parameters))
     except (ParameterError, ValueError, ArithmeticError, np.linalg.LinAlgError):
         return Parameters({**values, 'structure': 'proportional', 'proportional.f': 0.0})
     return parameters

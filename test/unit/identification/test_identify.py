@@ -13,7 +13,9 @@ from test_identification import PERIOD_S, motion, record
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.estimates_file import load_estimate
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimates_file import load_estimate, save_estimate
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import effective_parameters
@@ -41,8 +43,11 @@ def write_csv(path: Path, v: np.ndarray, y: np.ndarray) -> Path:
 
 @pytest.fixture(scope='module')
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of what a good record leads to."""
+    """The folder of what a good record leads to, after another record had led there."""
     folder = tmp_path_factory.mktemp('identify')
+    (folder / 'out').mkdir()
+    of_another = Estimate(0.7, 1.0, -1.0, 0.0, 0.1, 0.1, 0.1)
+    save_estimate(folder / 'out' / 'estimates.json', of_another, Parameters())
     config = folder / 'mine.yaml'
     config.write_text(
         '/**: {ros__parameters: {control: {min: -4.0, max: 4.0, rate_max: 40.0},'
