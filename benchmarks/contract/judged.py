@@ -80,8 +80,8 @@ class Judged:
         return ~(self.z.max(axis=1) <= BEYOND)
 
 
-def judged(run: Record, shift: float = 0.0) -> Judged:
-    """Beside the true backlash of the run. shift: constant on u over m, by which crossings move."""
+def judged(run: Record, shift: float | Array = 0.0) -> Judged:
+    """Beside the true backlash of the run. shift: of both crossings by what is added to u."""
     gap = run.column('true_c_r') - run.column('true_c_l')
     off = np.abs(np.column_stack(
         [run.column(name) - run.column(f'true_{name}') + shift for name in ('c_r', 'c_l')]))

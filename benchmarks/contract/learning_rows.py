@@ -59,14 +59,25 @@ def run_job(job: Job) -> Outcome:
     if job.coasts is not None:
         loop.plant = CoastingLoad(  # type: ignore[assignment]
             build_plant(p).backlash, period, quantum=p.output_quantum, **job.coasts)
+    disturbance: list[float] = [0.0]  # what is added to u moves both crossings
+    step = loop.plant.step
+
+    def recorded(v: float) -> float:
+        if job.coasts is None:
+            disturbance.append(loop.plant.disturbance)
+        return step(v)
+
+    loop.plant.step = recorded  # type: ignore[method-assign]
     try:
         with np.errstate(over='ignore', invalid='ignore'):
             run = loop.run(round(job.seconds / period) + 1)
     except BROKEN:
         return Outcome(job.group, None)
     error, bound = _beside_bound(p, run, job.marks_s)
+    rows = np.round(run.column('t') / period).astype(int)  # a lost y has none
+    added = np.array(disturbance)[np.minimum(rows, len(disturbance) - 1)]
     return Outcome(
-        job.group, judged(run, p.input_disturbance / p.backlash.m),
+        job.group, judged(run, added / p.backlash.m),
         error, bound, _follows(p, run),
     )
 

@@ -106,9 +106,9 @@ class MovingHorizon(Law):
 
     initial: a first guess, or with its deviations what was learned before. model: the nominal G.
     uncertainty: relative spread of its time constants, damping and delay, 0 where it is exact.
-    noise_std: of y, a first guess. walk_std: by which a disturbance of u walks within a record, a
-    first guess. drift_std: random walk of m, c_r, c_l per square root of a second. observer: gives
-    the state of G until the backlash is known, for structures that want it.
+    noise_std: of y, a first guess. walk_std, drift_std: random walks of u and of m, c_r, c_l, per
+    square root of a second; a walk_std of 0 is learned where the samples demand a walk. observer:
+    gives the state of G until the backlash is known, for structures that want it.
     """
 
     RETUNED = (
@@ -125,7 +125,8 @@ class MovingHorizon(Law):
         family = PlantFamily(model.transfer_function, uncertainty)
         self._setup = Setup(
             family, max(noise_std, SMALLEST_NOISE), bounds, bounds.c_r[1] - bounds.c_l[0],
-            initial.c_r - initial.c_l, walk_std, np.array(drift_std) * sample_period**0.5,
+            initial.c_r - initial.c_l, walk_std * sample_period**0.5,
+            np.array(drift_std) * sample_period**0.5,
         )
         self._channel = (executor or InlineExecutor()).open(3, CAPACITY)
         self._end = 0  # samples so far
@@ -245,9 +246,10 @@ class MovingHorizon(Law):
 
     def retune(self, p: Parameters) -> None:
         """Take another first guess of the noise, the walk and the drift; what was learned stays."""
-        drift = np.array(p.estimator.drift_std) * p.sample_period**0.5
+        root = p.sample_period**0.5
         self._setup = replace(
-            self._setup, walk_std=p.estimator.input_noise_std, drift=drift,
+            self._setup, walk_std=p.estimator.input_noise_std * root,
+            drift=np.array(p.estimator.drift_std) * root,
             noise_std=max(p.estimator.output_noise_std, SMALLEST_NOISE),
         )
 

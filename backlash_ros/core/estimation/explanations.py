@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from backlash_ros.core.estimate import Bounds
-from backlash_ros.core.estimation.fit import FIRST_STEPS, Fit, Prior, Problem
+from backlash_ros.core.estimation.fit import FIRST_STEPS, Fit, Prior, Problem, Start
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.settings import (
@@ -32,6 +33,8 @@ Flags = NDArray[np.bool_]
 
 CANDIDATES = 3  # best gaps of a search that are fitted
 BEGINNINGS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
+WALKS = (0.005, 0.02, 0.08)  # of u over the whole record, over m times the gap, that are compared
+WALKING = 30.0  # log-likelihood by which a walk must be better than none
 APART = 0.02  # relative difference of two gaps that are two candidates
 FAR_BEHIND = 30.0  # log-likelihood by which a candidate is given up after a few steps
 BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
@@ -93,22 +96,22 @@ def with_swapped(record: Record, numbers: frozenset[int]) -> Record:
 
 
 def problem_of(
-    setup: Setup, record: Record, older: Prior | None = None, walk_std: float = 0.0,
-    most_scale: float = np.inf,
+    setup: Setup, record: Record, older: Prior | None = None, start: Start | None = None,
+    most_scale: float = np.inf, walk_std: float = 0.0,
 ) -> Problem:
     """The fit of a record by this setup."""
-    return Problem(setup.family, record.v, record.y, setup.noise_std, older, None, most_scale,
-                   walk_std)
+    return Problem(setup.family, record.v, record.y, setup.noise_std, older, start, most_scale,
+                   max(walk_std, setup.walk_std))
 
 
 def afresh(
     setup: Setup, record: Record, of_xi: Prior | None = None, xi: Array | None = None,
-    most_scale: float = np.inf, also: Fit | None = None,
+    most_scale: float = np.inf, also: Fit | None = None, walks: bool = False,
 ) -> Fit | None:
     """The best fit from nothing, mixed with other gaps that fit about as well; None for none.
 
-    of_xi: rows on theta that are known, around xi (K,). also: where to begin as well. A fit with
-    m < 0 says that y goes the other way.
+    of_xi: rows on theta that are known, around xi (K,). also: where to begin as well. walks:
+    whether u may walk. A fit with m < 0 says that y goes the other way.
     """
     family = setup.family
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or np.ptp(record.v) == 0.0:
@@ -142,7 +145,28 @@ def afresh(
     if best.m < 0.0:
         return best
     best = _begun_elsewhere(p, best)
-    return replace(p.with_intervals(best), spread=spread(best, fits))
+    apart, best = spread(best, fits), p.with_intervals(best)
+    return replace(with_walk(p, best) if walks else best, spread=apart)
+
+
+def with_walk(p: Problem, f: Fit) -> Fit:
+    """The fit, or one where u walks as well if that explains why residuals are correlated.
+
+    One that walks already is compared with one that does not in the same way.
+    """
+    best = f
+    if f.walk_std:
+        still = p.walking(0.0)
+        best = still.with_intervals(still.fitted(replace(f, step=0.0, noise_std=f.noise)))
+    if not best.valid or best.count * best.correlation <= 1.0:
+        return best
+    for share in WALKS:
+        walking = p.walking(share * f.m * f.gap / sqrt(len(p.v)))
+        begin = replace(f, knots=np.zeros(0), step=0.0, noise_std=f.noise)
+        g = walking.with_intervals(walking.fitted(begin, FIRST_STEPS))
+        if g.valid and g.evidence > best.evidence + (0.0 if best.walk_std else WALKING):
+            best = g
+    return best
 
 
 def _begun_elsewhere(p: Problem, f: Fit) -> Fit:

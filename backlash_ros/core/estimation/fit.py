@@ -2,13 +2,13 @@
 
     y = G(z; xi) [m p(v; g, p0) - o + d] + X / A(z; xi) + e,   o = m c_r,   xi ~ N(0, s^2)
 
-Unknowns are the state X before the record, the knots of a disturbance d that walks, where the play
-began (p0), the slope m, the offset o, the gap g, and xi (plant_family.py). A step solves the
-linearized least squares by QR; the scale s and the noise are integrated out in closed form
-(Normal-Gamma) over a grid of s, whose prior is log-normal around 1: G is about as wrong as told.
-A leak has a prior of its own. The derivatives by g and p0 are those of the play: 1 where the left
-side was engaged last, and where none was. What older samples say is rows (R, d) on theta = (m, o,
-g, xi).
+Unknowns are the state X before the record, the knots of a disturbance d that walks to 0 at its end
+(o is that of its end), where the play began (p0), the slope m, the offset o, the gap g, and xi
+(plant_family.py). A step solves the linearized least squares by QR; the scale s and the noise are
+integrated out in closed form (Normal-Gamma) over a grid of s, whose prior is log-normal around 1:
+G is about as wrong as configured. A leak has a prior of its own. The derivatives by g and p0 are
+those of the play: 1 where the left side was engaged last, and where none was. What older samples
+say is rows (R, d) on theta = (m, o, g, xi).
 
 Residuals that are correlated do not average out: with rho of theirs, N count as
 N / (1 - rho + N rho) independent ones.
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 SCALES: Array = np.append(0.0, np.geomspace(1e-3, 10.0, 13))  # of the error of G that are weighed
 LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
-KNOTS = 12  # of a walk over a record
+KNOTS, KNOT_SAMPLES = 36, 8  # of a walk over a record at most, and samples between them at least
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 FAR_STEPS = 4  # the first of them, over which G is no further off than told
 # --- guards
@@ -63,8 +63,9 @@ class Start(NamedTuple):
 class Fit:
     """Values of all unknowns with their posterior; compared, sent and printed like a number.
 
-    x: state before the record. knots: of the walk (W,). p0: p before the record. theta: m, o, g,
-    xi. noise_std: beside a step. step: of the readings where they are taken for intervals, else 0.
+    x: state before the record. knots: of the walk (W,), and walk_std, 0 for none. p0: p before the
+    record. theta: m, o, g, xi. noise_std: beside a step. step: of the readings where they are
+    taken for intervals, else 0.
     scale: s, the likeliest. cov: of theta, as if residuals were white. prior: what the samples
     say of theta, without the prior of xi. evidence: log-likelihood with unknowns integrated out.
     correlation: rho. inflation: of cov, see above. count: of independent readings. rms: of the
@@ -76,6 +77,7 @@ class Fit:
     theta: Array
     noise_std: float
     knots: Array = field(default_factory=lambda: np.zeros(0))
+    walk_std: float = 0.0
     step: float = 0.0
     scale: float = 1.0
     cov: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -160,6 +162,13 @@ class Problem:
         self.step_of_readings = step_of(y)
         self.walk_std = walk_std
         self._hats = _hats(len(v)) if walk_std else np.zeros((0, len(v)))
+        self._knot_std = walk_std * sqrt(len(v) / max(len(self._hats), 1))
+
+    def walking(self, walk_std: float) -> Problem:
+        """The same for another walk of u."""
+        y = np.where(self.known, self.y, np.nan)
+        return Problem(self.family, self.v, y, self.nominal, self.older, self.start,
+                       self.most_scale, walk_std)
 
     # --- the model -----------------------------------------------------------------------------
 
@@ -167,21 +176,14 @@ class Problem:
         """p and u = m p - o + d over the record, both (N,)."""
         p = play(self.v, max(f.gap, 0.0), f.p0)
         u = f.m * p - f.theta[1]
-        if len(f.knots) and len(self._hats):
-            u += f.knots @ self._hats
+        if len(f.knots):
+            u += walk(f.knots, len(self.v))
         return p, u
 
     def output(self, f: Fit) -> Array:
         """y that is expected (N,)."""
         b, a = self.family.at(f.xi)
         return filtered(b, a, self.input(f)[1], f.x)[0]
-
-    def end(self, f: Fit) -> tuple[list[float], list[float], list[float], float, float]:
-        """b, a, the filter's state, p and d after the record."""
-        b, a = self.family.at(f.xi)
-        p, u = self.input(f)
-        d = float(f.knots[-1]) if len(f.knots) else 0.0
-        return b, a, filtered(b, a, u, f.x)[1].tolist(), float(p[-1]), d
 
     def residual(self, f: Fit) -> Array:
         """y minus what is expected (N,), nan where it was lost."""
@@ -212,6 +214,9 @@ class Problem:
             leak, xi = f.theta[3:3 + leaks], f.theta[3 + leaks:]
             value -= 0.5 * float(xi @ xi) / scale**2 + len(xi) * log(scale) + 0.5 * log(scale) ** 2
             value -= 0.5 * float(leak @ leak)
+            if len(self._hats):
+                moves = np.diff(self._knots_of(f), append=0.0) / self._knot_std
+                value -= 0.5 * float(moves @ moves)
         return value if isfinite(value) else -np.inf
 
     # --- a Gauss-Newton step --------------------------------------------------------------------
@@ -301,8 +306,8 @@ class Problem:
         if len(self._hats):
             walks = np.zeros((len(self._hats), size + 1))
             at = first - 1 - len(self._hats)
-            walks[:, at:first - 1] = np.eye(len(self._hats)) - np.eye(len(self._hats), k=-1)
-            rows.append(walks / (self.walk_std * sqrt(len(self.v) / len(self._hats))))
+            walks[:, at:first - 1] = np.eye(len(self._hats)) - np.eye(len(self._hats), k=1)
+            rows.append(walks / self._knot_std)
         return rows
 
     def _solved(self, f: Fit, r: Array, order: int, count: float, most_scale: float) -> Fit:
@@ -328,10 +333,10 @@ class Problem:
         beta = np.concatenate([by[:, -1] - by[:, :-1] @ xi, xi])
         volume -= float(np.log(np.maximum(diagonal, 1e-300)).sum())
         if len(self._hats):
-            volume -= len(self._hats) * log(self.walk_std * sqrt(len(self.v) / len(self._hats)))
+            volume -= len(self._hats) * log(self._knot_std)
         return replace(
-            f, x=beta[:order], knots=beta[order:at - 1], p0=float(beta[at - 1]), theta=beta[at:],
-            scale=scale, cov=cov[at:, at:], volume=volume,
+            f, x=beta[:order], knots=beta[order:at - 1], walk_std=self.walk_std,
+            p0=float(beta[at - 1]), theta=beta[at:], scale=scale, cov=cov[at:, at:], volume=volume,
             prior=Prior(r[at:size, at:size], r[at:size, size]),
         )
 
@@ -492,10 +497,16 @@ def state_columns(a: list[float], count: int) -> Array:
     ])
 
 
+def walk(knots: Array, count: int) -> Array:
+    """d (count,) of these knots (W,): straight from one to the next, and to 0 at the end."""
+    at = np.linspace(0.0, count - 1.0, len(knots) + 1)
+    return np.asarray(np.interp(np.arange(count), at, np.append(knots, 0.0)))
+
+
 def _hats(count: int) -> Array:
-    """Piecewise linear functions of a walk that begins at 0, shape (KNOTS, count)."""
-    at = np.linspace(0.0, count - 1.0, KNOTS + 1)
-    return np.array([np.interp(np.arange(count), at, row) for row in np.eye(KNOTS + 1)[1:]])
+    """How d depends on its knots, shape (W, count)."""
+    knots = min(max(count // KNOT_SAMPLES, 1), KNOTS)
+    return np.array([walk(row, count) for row in np.eye(knots)])
 
 
 def _towards(f: Fit, new: Fit, share: float = 1.0) -> Fit:

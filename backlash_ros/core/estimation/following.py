@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.explanations import Record
-from backlash_ros.core.estimation.fit import Fit, state_columns
+from backlash_ros.core.estimation.fit import Fit, state_columns, walk
 from backlash_ros.core.estimation.observer import Gains, Observer
 from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.settings import GATE, OUTLIERS
@@ -35,13 +35,12 @@ REMEMBERED = 1500  # samples from which the state of a G is found, at most
 class Place(NamedTuple):
     """Where play and G stand after sample `end`.
 
-    p: of the play operator. d: disturbance of u. u, y: over the newest samples (M,). x: state of
+    p: of the play operator. u, y: over the newest samples (M,). x: state of
     `model` in the observer form.
     """
 
     end: int
     p: float
-    d: float
     u: Array
     y: Array
     x: Array
@@ -54,10 +53,12 @@ def place_of(fit: Fit, record: Record, model: TransferFunction, memory: int) -> 
     memory: of G [samples].
     """
     p = play(record.v, max(fit.gap, 0.0), fit.p0)
-    d = float(fit.knots[-1]) if len(fit.knots) else 0.0
     count = min(len(p), 4 * memory, REMEMBERED)
-    u, y = fit.m * p[-count:] - fit.theta[1] + d, record.y[-count:]
-    return Place(record.end, float(p[-1]), d, u, y, state_after(model, u, y), model)
+    u, y = fit.m * p - fit.theta[1], record.y[-count:]
+    if len(fit.knots):
+        u += walk(fit.knots, len(u))
+    u = u[-count:]
+    return Place(record.end, float(p[-1]), u, y, state_after(model, u, y), model)
 
 
 def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
@@ -92,7 +93,6 @@ class Following:
         self._before = before
         self._observer: Observer | None = None
         self._p = self._v = nan
-        self._d = 0.0
         self._beyond = 0  # readings in a row beyond the gate
         self._u: deque[float] = deque(maxlen=REMEMBERED)  # over the newest samples
         self._y: deque[float] = deque(maxlen=REMEMBERED)
@@ -155,7 +155,7 @@ class Following:
         p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
         self.since_motion = self.since_motion + 1 if p == self._p else 0
         self._p = p
-        self.u = u = estimate.m * (p - estimate.c_r) + self._d
+        self.u = u = estimate.m * (p - estimate.c_r)
         self._u.append(u)
         self._y.append(nan if y is None else y)
         self._correct(observer, y, observer.predict(u))
@@ -193,7 +193,7 @@ class Following:
         else:
             observer.settle(noise_std)
         gap = estimate.c_r - estimate.c_l
-        p, self._d = place.p, place.d
+        p = place.p
         self._u.clear()
         self._y.clear()
         self._u.extend(place.u.tolist())
@@ -203,11 +203,11 @@ class Following:
             observer.place(place.x, known)
         for v, y in newer:
             p = clamp(p, v, v + gap)
-            u = estimate.m * (p - estimate.c_r) + place.d
+            u = estimate.m * (p - estimate.c_r)
             self._u.append(u)
             self._y.append(y)
             if follows:
                 innovation = y - observer.predict(u)
                 if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
                     observer.correct(innovation)
-        self._p, self.u = p, estimate.m * (p - estimate.c_r) + place.d
+        self._p, self.u = p, estimate.m * (p - estimate.c_r)

@@ -38,6 +38,7 @@ from backlash_ros.core.estimation.explanations import (
     outliers,
     problem_of,
     spread,
+    with_walk,
 )
 from backlash_ros.core.estimation.fit import FEW_STEPS, Fit, Prior, Problem, Start
 from backlash_ros.core.estimation.late_commands import likelier
@@ -176,7 +177,8 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
     count = len(record.v)
     after = replace(before, end=record.end,
                     next_at=record.end + max(int(count * (GROWTH - 1.0)), FEWEST))
-    found, part = afresh(setup, record, also=before.candidate or before.tried), record
+    found = afresh(setup, record, also=before.candidate or before.tried, walks=True)
+    part = record
     why = _why(setup, found, record, before)
     shorter = record
     while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 3 * SHORTEST:
@@ -254,10 +256,16 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
 
 def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
     """The fit of this record is what is believed."""
-    count = len(record.v)
+    count, must = len(record.v), before.must_predict
+    contradicted, noisier = before.fit, before.published is None or fit.walk_std > 0.0
+    if contradicted is not None and noisier and agree(
+        fit.crossings, contradicted.crossings, fit.crossings_cov + contradicted.crossings_cov
+    ):
+        must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
     after = replace(
-        before, state=State.KNOWN, fit=fit, first=record.first, end=record.end, candidate=None,
-        tried=None, doubt_from=None, next_at=record.end + max(count // BLOCKS, FEWEST),
+        before, state=State.KNOWN, must_predict=must, fit=fit, first=record.first, end=record.end,
+        candidate=None, tried=None, doubt_from=None,
+        next_at=record.end + max(count // BLOCKS, FEWEST),
         thorough_at=int(GROWTH * count), predicted=0, adopted_noise=fit.noise,
     )
     return _published(setup, after)
@@ -267,7 +275,8 @@ def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
 
 
 def _problem(setup: Setup, record: Record, belief: Belief) -> Problem:
-    return Problem(setup.family, record.v, record.y, setup.noise_std, belief.older, belief.start)
+    walk_std = belief.fit.walk_std if belief.fit is not None else 0.0
+    return problem_of(setup, record, belief.older, belief.start, walk_std=walk_std)
 
 
 def _known(setup: Setup, record: Record, before: Belief) -> Belief:
@@ -311,6 +320,7 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
             fit = _beside_others(setup, record, problem, fit)
         else:
             fit = replace(problem.with_intervals(fit), spread=fit.spread * 0.0)
+        fit = with_walk(problem, fit)
     else:
         fit = problem.finished(fit)
     after = replace(after, fit=fit)
@@ -383,8 +393,7 @@ def _shortened(setup: Setup, record: Record, belief: Belief, cut: int) -> Belief
     """Let the oldest samples go; what they say of theta stays, discounted as they were."""
     fit = belief.fit
     assert fit is not None
-    old = Problem(setup.family, record.v[:cut], record.y[:cut], setup.noise_std, belief.older,
-                  belief.start)
+    old = _problem(setup, record.until(record.first + cut), belief)
     prior = old.step(replace(fit, knots=np.zeros(0))).prior
     p, _ = old.input(fit)
     start = _start_after(record.v[:cut], p, fit.gap)
@@ -393,8 +402,10 @@ def _shortened(setup: Setup, record: Record, belief: Belief, cut: int) -> Belief
     if prior is not None:
         discount = sqrt(fit.inflation)
         older = _drifted(setup, fit, Prior(prior.rows / discount, prior.values / discount), cut)
+        if fit.walk_std:
+            older = _without_offset(older)
     for beside in ((older, start), (None, None)):
-        problem = Problem(setup.family, rest.v, rest.y, setup.noise_std, *beside)
+        problem = problem_of(setup, rest, *beside, walk_std=fit.walk_std)
         begin = replace(fit, p0=float(p[-1]), x=np.zeros(len(fit.x)), knots=np.zeros(0))
         shorter = problem.finished(problem.fitted(replace(begin, x=problem.state(begin))))
         if shorter.rms < 2.0 * fit.rms or beside[0] is None:
@@ -433,6 +444,15 @@ def _drifted(setup: Setup, fit: Fit, prior: Prior, samples: int) -> Prior | None
     return Prior(root, root @ theta)
 
 
+def _without_offset(prior: Prior | None) -> Prior | None:
+    """What a prior says of all but o, which has walked on since."""
+    if prior is None:
+        return None
+    rows = np.column_stack([prior.rows[:, 1], np.delete(prior.rows, 1, axis=1), prior.values])
+    r = np.asarray(np.linalg.qr(rows, mode='r'))[1:]
+    return Prior(np.insert(r[:, 1:-1], 1, 0.0, axis=1), r[:, -1])
+
+
 # --- what is published ------------------------------------------------------------------------
 
 
@@ -447,6 +467,8 @@ def _published(setup: Setup, belief: Belief) -> Belief:
     if belief.predicted < belief.must_predict:
         return belief
     cov = fit.crossings_cov + np.diag(setup.drift**2 * (belief.end - belief.first) / 3.0)
+    walked = (fit.walk_std / fit.m) ** 2 * (belief.next_at - belief.end)
+    cov += walked * np.array([[0.0, 0.0, 0.0], [0.0, 1.0, 1.0], [0.0, 1.0, 1.0]])
     return replace(belief, published=fit.crossings, cov=cov, reason=Status.TRACKING)
 
 
@@ -512,7 +534,9 @@ def _doubted(setup: Setup, record: Record, before: Belief) -> Belief:
     if newer >= PREDICTED:
         after = replace(after, reason=Status.INCONSISTENT)
     short = max(SHORT_SEARCH, 4 * setup.family.memory)
-    whole = afresh(setup, record) if count <= max(short, 4 * newer) and count < LONGEST else None
+    whole = None
+    if count <= max(short, 4 * newer) and count < LONGEST:
+        whole = afresh(setup, record, walks=newer >= 2 * PREDICTED)
     explained = AS_GOOD * held.noise
     known_xi = of_xi(held, setup.family.count)
     for first in (since, (since + record.end) // 2):

@@ -3,7 +3,8 @@
 A reading y of a sensor without a step is normal around the output. One with a step delta says that
 the output, blurred by noise of deviation sigma, lies within half a step of it:
 
-    P(y | output) = Phi((r + delta/2) / sigma) - Phi((r - delta/2) / sigma),   r = y - output
+    P(y | output) = [Phi((r + delta/2) / sigma) - Phi((r - delta/2) / sigma)] / delta
+    r = y - output
 
 Readings that repeat while the output stands still repeat one rounding: they are one reading.
 
@@ -14,7 +15,7 @@ Observations, Birkhaeuser 2010.
 from __future__ import annotations
 
 from functools import lru_cache
-from math import pi, sqrt
+from math import log, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,7 @@ REACH, PLACES = 6, 200  # of the average information: steps to both sides, and p
 
 
 class Told(NamedTuple):
-    """Of each reading (N,): log-likelihood, its derivative by the output, and information."""
+    """Of each reading (N,): log of its density, its derivative by the output, and information."""
 
     likelihood: Array
     score: Array
@@ -53,7 +54,7 @@ def told(r: Array, noise_std: float, step: float) -> Told:
     """What readings say of outputs that they are off from by r (N,); step 0: none."""
     if not step:
         return Told(
-            -0.5 * (r / noise_std) ** 2 - np.log(noise_std), r / noise_std**2,
+            -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
             np.full(len(r), noise_std**-2),
         )
     upper, lower = (r + 0.5 * step) / noise_std, (r - 0.5 * step) / noise_std
@@ -69,6 +70,8 @@ def told(r: Array, noise_std: float, step: float) -> Told:
     curvature = (at_lower - at_upper) ** 2 + upper * at_upper - lower * at_lower
     # Readings deep within their interval say nothing, and would leave unknowns open.
     least = mean_information(round(step / noise_std, 6)) / step**2
+    # As a density, to be compared with that of readings without a step.
+    likelihood = likelihood - log(step)
     return Told(likelihood, score, np.clip(curvature / noise_std**2, least, noise_std**-2))
 
 

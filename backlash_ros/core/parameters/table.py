@@ -86,8 +86,8 @@ class EstimatorOptions:
         'simulated noise and quantum if there is any; not live for every law', 'y', low=0.0,
         live=True)
     input_noise_std: float = option(
-        0.0, 'moving_horizon: first guess of how far a slow disturbance of u walks within a '
-        'record; learned from the data', 'u', low=0.0, live=True)
+        0.0, 'moving_horizon: random walk of a slow disturbance of u per square root of a second; '
+        '0: learned where the data demand one', 'u', low=0.0, live=True)
     drift_std: tuple[float, float, float] = option(
         (0.0, 0.0, 0.0), 'moving_horizon: random walk of m, c_r, c_l per square root of a second',
         low=0.0, live=True)

@@ -60,6 +60,11 @@ class SimulatedPlant:
         self._walk_rng = rng.spawn(1)[0] if self._walk_step > 0.0 else rng
         self._wears = any(self._extra.rate) or any(self._extra.jump)
 
+    @property
+    def disturbance(self) -> float:
+        """What is added to u: a constant and a walk."""
+        return self._extra.input_disturbance + self._walk
+
     def go_on_from(self, other: SimulatedPlant) -> None:
         """Take over the state, the time and the source of noise of a plant with the same G(z)."""
         self.sample, self._x, self._rng = other.sample, list(other._x), other._rng
@@ -85,11 +90,9 @@ class SimulatedPlant:
             v = self._motor.step(v, held.u / held.m, held.c_r, held.c_l)
         self.applied = v
         u = self.backlash.step(v)
-        disturbance = self._extra.input_disturbance
+        self._model.advance(self._x, u + self.disturbance)
         if self._walk_step > 0.0:
-            disturbance += self._walk
             self._walk += self._walk_step * float(self._walk_rng.standard_normal())
-        self._model.advance(self._x, u + disturbance)
         self.sample += 1
         return u
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import sin, sqrt
 
 import numpy as np
 import pytest
 from contract.judged import judged
 from contract.learning_rows import PAPER as EXACT
-from contract.learning_rows import Job, Outcome, run_job, run_random
+from contract.learning_rows import Job, Outcome, changes_jobs, run_job, run_random
 from scipy.special import chdtri
 
 from backlash_ros.core.control.controller import Limits
@@ -81,6 +82,22 @@ def test_wear_and_a_step_of_a_crossing_are_followed(seed: int) -> None:
     c_r = np.abs(run.column('c_r') / run.column('true_c_r') - 1.0)
     assert judged(run).m[100:].max() <= 0.02
     assert max(c_r[100:1000].max(), c_r[1100:].max()) <= 0.03
+
+
+@pytest.mark.parametrize('known', [False, True])
+def test_crossings_walk_with_a_disturbance_of_u(known: bool) -> None:
+    jobs = [job for job in changes_jobs(0.5) if job.group == 'walk']
+    runs = []
+    for job in jobs:
+        std = job.changes['truth.walk_std'] if known else 0.0
+        job = replace(job, changes={**job.changes, 'estimator.input_noise_std': std})
+        run = run_job(job).judged
+        assert run is not None
+        runs.append(run)
+    assert np.mean([run.tracking.mean() for run in runs]) > 0.6
+    assert np.mean([run.wrong for run in runs]) < 0.02
+    # Off by what the disturbance moves between two fits: 0.02 of the gap in a second.
+    assert np.median([run.error[run.tracking].mean() for run in runs]) < 0.02
 
 
 @pytest.mark.parametrize('what', ['never excited', 'v is limited', 'at rest'])

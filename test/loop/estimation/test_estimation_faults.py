@@ -85,8 +85,8 @@ def test_commands_that_never_act_and_that_nobody_reports_move_no_estimate() -> N
         ], axis=0)
         wrong.append(np.mean((tracking & (off > 5.0))[400:]))
         assert np.mean(record.column('status')[400:] == Status.INCONSISTENT) > 0.2
-        # A v that is held now and then looks like a wider gap for a while.
-        assert max(errors(record, k).max() for k in range(300, 1500)) < 0.2
+        # What is lost looks like a disturbance that walks: both crossings move, and say so.
+        assert max(errors(record, k).max() for k in range(300, 1500)) < 0.6
     assert np.mean(wrong) < 0.03
     # One in a hundred such records looks like another backlash for long.
     assert sorted(wrong)[-2] < 0.1
