@@ -12,7 +12,7 @@ from backlash_ros.tools.bringup import __main__ as bringup
 NO_PICTURE = b'\x89PNG'
 
 
-def leave_out(canvas: FigureCanvasAgg, file: IO[bytes]) -> None:
+def leave_out(canvas: FigureCanvasAgg, file: IO[bytes], **_: object) -> None:
     """In the place of FigureCanvasAgg.print_png."""
     file.write(NO_PICTURE)
 

@@ -36,9 +36,9 @@ NEAR = np.linspace(0.8, 1.2, 11)  # gaps around a minimum, relative
 STARTS = (0.0, 0.5, 1.0)  # places in the gap at which p may begin
 GAPS = 32  # that are compared over the swing of v
 MINIMA = 3  # that are looked at closely
-ANEW = 4  # gaps from one model from scratch to the next
+ANEW = 4  # gaps from one model from scratch to the next, three times as many near a known one
 INSIDE = 0.999  # a pole outside of the unit circle is put back to here
-FILTERS, STEPS = (0.5, 0.9, 0.98), 4  # poles of the first filter; steps from each
+FILTERS, STEPS = (0.6, 0.95), 4  # poles of the first filter; steps from each
 
 
 class Profile(NamedTuple):
@@ -87,7 +87,7 @@ def profile(
     models = [] if known is None else [known.point.a]
     for number, gap in enumerate(gaps.tolist()):
         starts = [v0 + share * gap for share in (STARTS if gap > 0.0 else STARTS[:1])]
-        if number % ANEW == 0 and (known is None or number):  # a model from scratch
+        if number % (ANEW if known is None else 3 * ANEW) == ANEW - 1 or not models:
             p = samples.played(gap, starts[len(starts) // 2])
             models = [*models, *steiglitz_mcbride(samples, structure, p)[:1]]
         best = best_start(samples, structure, models, gap, starts)

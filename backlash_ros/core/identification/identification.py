@@ -61,7 +61,10 @@ FEWEST = 8  # samples per unknown below which nothing is fitted
 EARLY, LATEST = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 WINDOW = 4  # delays from one look at later ones to the next
 SHORTEST = 20  # samples of a record for each of the delay, at least
-LATER = 5.0  # log-likelihood by which a later delay must fit better
+# A later delay: log-likelihood by which it must fit better; share of the residual of the earlier
+# ones that it leaves at most, or times the noise of y.
+LIKELIER, LATER, NOISY = 5.0, 0.8, 1.5
+ALIKE = 1.3  # ratio of the squares left over of delays that may be the right one
 ROWS = 1200  # in which gaps are compared: of more samples, neighbours are averaged
 SAME = 0.005  # relative distance of two gaps that are one
 NEAR = np.linspace(0.8, 1.2, 13)  # gaps around the best one, relative
@@ -252,22 +255,25 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
     samples = Samples(v, y, latest + 1, most=ROWS)
     gaps = np.append(early.best.point.gap * np.array([1.0, 0.75, 0.5]),
                      samples.swing * np.geomspace(0.01, 0.5, 5))
-    tried = []
+    left: dict[int, float] = {}
     for delay in range(0, latest, WINDOW):
         structure = _general(delay, delay + WINDOW)
         for gap in gaps.tolist():
             p = samples.played(gap, float(v[0]) + 0.5 * gap)
             a = steiglitz_mcbride(samples, structure, p)[0]
-            tried.append((squares_of(samples, structure, a, p), delay))
+            left[delay] = min(squares_of(samples, structure, a, p), left.get(delay, inf))
         yield 'searching later delays'
-    delay = min(tried)[1]
+    # Of a smooth motion many delays tell alike.
+    delay = min(delay for delay, squares in left.items() if squares <= ALIKE * min(left.values()))
     if not delay:
         return early
     window = range(delay - 1, min(delay + WINDOW + 2, latest) + 1)
     late = yield from _searched(v, y, options, window)
-    rows = effective_rows(late.samples, late.best)
-    better = rows * float(np.log(early.best.rms / max(late.best.rms, TINY)))
-    return late if better > LATER else early
+    better = effective_rows(late.samples, late.best) * np.log(early.best.rms / late.best.rms)
+    # What no G with a backlash explains, any delay explains a little better.
+    explains = late.best.rms < max(LATER * early.best.rms, NOISY * _noise(late.samples))
+    inner = late.best.structure.delay < max(window)
+    return late if inner and explains and better > LIKELIER else early
 
 
 def _general(first: int, last: int) -> Structure:
@@ -448,13 +454,15 @@ def _still(samples: Samples, best: Fit) -> float:
 
 def _observed(samples: Samples, best: Fit, step: float) -> Observed:
     """The signals of a fit, each where it acts on y."""
-    y = samples.y
-    noise = noise_of(samples.known.astype(float), y[samples.known])
     return Observed(
-        samples.v[samples.first:samples.last], y,
+        samples.v[samples.first:samples.last], samples.y,
         samples.delayed(best.p, best.structure.delay), best.simulated,
-        max(noise, step / np.sqrt(12.0)), best.point.gap,
+        max(_noise(samples), step / np.sqrt(12.0)), best.point.gap,
     )
+
+
+def _noise(samples: Samples) -> float:
+    return noise_of(samples.known.astype(float), samples.y[samples.known])
 
 
 def _proper(found: Fit) -> tuple[float, ...]:

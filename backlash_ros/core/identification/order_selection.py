@@ -85,7 +85,7 @@ def compare(
     coarse = train.coarse(RACE)
     first: dict[Structure, Compared] = {}
     for structure in structures:
-        begin = _modelled(coarse, structure, candidates[0], FILTERS[1:2])
+        begin = _modelled(coarse, structure, candidates[0], FILTERS[1:])
         found = fit(coarse, structure, begin, iterations=FEW_STEPS)
         first[structure] = _compared(found, found, coarse, later)
         yield

@@ -6,15 +6,26 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from backlash_ros.core.identification.identification import Details, Identification
 from backlash_ros.core.identification.uncertainty import response, response_std, root_covariances
-from backlash_ros.tools.figures import HUES, label, legend_above, new_figure
+from backlash_ros.tools.figures import HUES, label, legend_above
 
 Array = NDArray[np.float64]
 
 SURE = 2.0  # standard deviations that bands and ellipses reach
+
+
+def new_figure(height: float) -> Figure:
+    """Figure with margins that suit all of identify.html: a layout takes as long as to draw it."""
+    figure = Figure(figsize=(10.0, height), constrained_layout=False)
+    figure.subplots_adjust(
+        left=0.085, right=0.985, bottom=0.55 / height, top=1.0 - 0.4 / height, wspace=0.2,
+        hspace=0.4,
+    )
+    return figure
 
 
 def draw_poles(found: Identification, details: Details) -> Figure:
@@ -95,5 +106,7 @@ def draw_bode(found: Identification, details: Details) -> Figure:
                          linestyle=':', linewidth=1.0)
     label(upper, 'Magnitude', '|m G| [y/v]')
     label(lower, 'Phase', 'degrees', 'frequency [Hz]')
+    for axis in (upper.xaxis, upper.yaxis, lower.xaxis):
+        axis.set_minor_formatter(NullFormatter())
     upper.set_ylim(float(size.min()) / 3.0, float(size.max()) * 3.0)
     return figure

@@ -67,6 +67,7 @@ def write_outcome(
     parameters: Parameters | None = None
     out = result_directory(options.out)
     if found.usable:
+        (out / ESTIMATES).unlink(missing_ok=True)  # of a record before, if any
         try:
             parameters = identified_parameters(found, given, out.resolve() / ESTIMATES)
         except ParameterError as error:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -19,11 +21,9 @@ from backlash_ros.tools.figures import (
     label,
     legend_above,
     limits,
-    new_figure,
-    png,
     zero_line,
 )
-from backlash_ros.tools.identify.model_pictures import SURE, draw_bode, draw_poles
+from backlash_ros.tools.identify.model_pictures import SURE, draw_bode, draw_poles, new_figure
 from backlash_ros.tools.page import Picture
 
 Array = NDArray[np.float64]
@@ -43,42 +43,49 @@ def draw(found: Identification) -> Iterator[Picture]:
         'held_out.png', 'Measured and simulated y on samples that were held out',
         'Simulated from v alone, with a model that was fitted to the samples before: the lines '
         'should lie on each other, and the difference should look like noise.',
-        png(draw_held_out(found, details)),
+        _png(draw_held_out(found, details)),
     )
     yield Picture(
         'residual.png', 'Residual of the fit',
         'y minus the simulation of the whole record. Its autocorrelation should stay within the '
         'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
         'shape: a slope or a hook is a nonlinearity that is not in the model.',
-        png(draw_residual(found, details)),
+        _png(draw_residual(found, details)),
     )
     yield Picture(
         'gap.png', 'Misfit over the gap',
         'What is left over for each width of the gap, everything else refitted. One narrow '
         'valley: the gap is known. Two valleys of one depth: it is not.',
-        png(draw_profile(found, details)),
+        _png(draw_profile(found, details)),
     )
     yield Picture(
         'orders.png', 'Orders and delays compared',
         'Error on the samples held out. The ring marks the one that was taken. White: a zero '
         'cancels a pole, and the lower order without it is taken instead.',
-        png(draw_orders(details)),
+        _png(draw_orders(details)),
     )
     yield Picture(
         'poles_zeros.png', 'Poles and zeros of G',
         'Ellipses reach two standard deviations. A zero on a pole: a lower order does as well.',
-        png(draw_poles(found, details)),
+        _png(draw_poles(found, details)),
     )
     yield Picture(
         'bode.png', 'Frequency response of m G',
         'With a band of two standard deviations. Between the dotted lines y moved; outside of '
-        'them the record says little.', png(draw_bode(found, details)),
+        'them the record says little.', _png(draw_bode(found, details)),
     )
     yield Picture(
         'loop.png', 'The loop of v and y',
         'Left: v against y as measured. Right: v against the u that was found, between its two '
-        'lines.', png(draw_loop(found, details)),
+        'lines.', _png(draw_loop(found, details)),
     )
+
+
+def _png(figure: Figure) -> bytes:
+    """The figure as a PNG file, quickly rather than small."""
+    buffer = io.BytesIO()
+    FigureCanvasAgg(figure).print_png(buffer, pil_kwargs={'compress_level': 1})
+    return buffer.getvalue()
 
 
 def draw_held_out(found: Identification, details: Details) -> Figure:
@@ -171,8 +178,7 @@ def draw_orders(details: Details) -> Figure:
         _draw_orders(axes, details, integrator)
         label(axes, 'With an integrator' if integrator else 'Without integrator',
               'RMS on samples held out' if axes is rooms[0] else '', 'order: number of poles')
-    handles, labels = rooms[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside lower center', ncol=len(labels), frameon=False)
+    rooms[0].legend(frameon=False, ncol=2, fontsize=9)
     return figure
 
 
