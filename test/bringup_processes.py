@@ -1,7 +1,5 @@
 """Helpers for tests of bringup as a process: start it, and find all that it has started."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

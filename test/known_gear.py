@@ -1,7 +1,5 @@
 """A gear that was known before the run: the estimator that begins with it, and y behind its G."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter

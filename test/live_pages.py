@@ -1,7 +1,5 @@
 """Helpers for tests of the page in the browser: where it is, what it is sent, who listens."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

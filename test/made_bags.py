@@ -1,7 +1,5 @@
 """Bags as the recorder writes them, of runs that were simulated."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from math import nan
 from pathlib import Path

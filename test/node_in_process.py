@@ -5,8 +5,6 @@ back likewise: whatever else runs on the machine, every run is the same. Service
 diagnostics go through ROS. This is the one place that knows how the node is entered.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Records of v and y for the tests of the default law, simulated without its code."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

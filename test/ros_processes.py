@@ -1,7 +1,5 @@
 """Helpers for tests with real nodes: processes, and a node of the test among them."""
 
-from __future__ import annotations
-
 import importlib
 import io
 import json

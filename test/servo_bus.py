@@ -6,8 +6,6 @@ series (https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/). `python test/ser
 it for good, LINK being the port of the driver.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import struct

@@ -1,7 +1,5 @@
 """What the shipped layouts of PlotJuggler and Foxglove draw: topics, fields, indices."""
 
-from __future__ import annotations
-
 import json
 import re
 import xml.etree.ElementTree as ElementTree

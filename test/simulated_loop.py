@@ -3,8 +3,6 @@
 Plant, driver and clock are those of the fault campaign, benchmarks/fault_loop.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hypothesis strategies and stand-ins shared by the tests of the core."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from math import nan

@@ -1,7 +1,5 @@
 """Reports without what takes most of their time, for tests of all else; as a program, bringup."""
 
-from __future__ import annotations
-
 import sys
 from typing import IO
 

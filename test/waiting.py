@@ -1,7 +1,5 @@
 """Waiting on a condition: once, for all tests."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

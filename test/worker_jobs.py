@@ -1,7 +1,5 @@
 """Jobs for a worker process, which imports nothing else with them."""
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

@@ -3,8 +3,6 @@
 second: another publisher of y. best_effort: both publish so, and below /motor.
 """
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import sys

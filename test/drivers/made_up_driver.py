@@ -1,7 +1,5 @@
 """What a driver would send, made up without ROS; and the plant that all tests of it share."""
 
-from __future__ import annotations
-
 from math import pi
 
 import numpy as np

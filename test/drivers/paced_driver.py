@@ -1,7 +1,5 @@
 """A driver that the test plays in real time: a plant behind a backlash, and whatever goes wrong."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any

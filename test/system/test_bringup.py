@@ -1,7 +1,5 @@
 """bringup with real nodes: whole runs, several axes, drivers, interruptions, deaths."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex
@@ -125,9 +123,7 @@ def test_a_run_in_lockstep_equals_the_simulation_to_the_last_bit_and_leaves_no_p
             assert [m.data for *_, m in found] == simulated.column('v').tolist()
 
 
-def test_a_killed_controller_is_named_and_stops_every_axis_and_its_driver(
-    start: Callable[..., Session],
-) -> None:
+def test_a_killed_controller_is_named_and_stops_every_axis_and_its_driver(start):
     session = start(
         '--config', str(TWO_AXES), '--unlimited', '--driver', OF_AN_AXIS, '--duration', '100',
         '--set', 'bias=0.5', '--set', 'tilt/bias=0.25',
@@ -150,9 +146,7 @@ def test_a_killed_controller_is_named_and_stops_every_axis_and_its_driver(
         assert 'samples' in (session.out / axis / 'logs' / 'driver.log').read_text()
 
 
-def test_nothing_survives_a_killed_bringup_and_its_bag_is_whole(
-    start: Callable[..., Session],
-) -> None:
+def test_nothing_survives_a_killed_bringup_and_its_bag_is_whole(start):
     session = start('--unlimited', '--driver', f'sh -c "{PLANT}; true"', '--duration', '100')
     session.wait_for_samples()
     assert len(session.survivors()) > 4, 'bringup, its nodes, the shell and its driver'
@@ -162,9 +156,7 @@ def test_nothing_survives_a_killed_bringup_and_its_bag_is_whole(
     assert bag_counts(session.out / 'bag')[topics.PLANT_OUTPUT] > 0
 
 
-def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported(
-    start: Callable[..., Session], tmp_path: Path,
-) -> None:
+def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported(start, tmp_path):
     session = start(
         '--unlimited', '--driver', foreign_driver(tmp_path), '--duration', '100', '--seed', '3'
     )
@@ -182,9 +174,7 @@ def test_a_driver_that_dies_is_named_with_its_last_words_and_the_run_is_reported
     assert json.loads((session.out / 'summary.json').read_text())['samples'] > 0
 
 
-def test_the_last_command_of_the_controller_reaches_the_driver(
-    start: Callable[..., Session], tmp_path: Path,
-) -> None:
+def test_the_last_command_of_the_controller_reaches_the_driver(start, tmp_path):
     session = start(
         '--unlimited', '--driver', foreign_driver(tmp_path), '--duration', 'inf', '--no-record',
         '--set', 'on_stop=zero', '--set', 'bias=20',
@@ -264,9 +254,7 @@ JOINTS = """
 """
 
 
-def test_joints_of_an_arm_have_one_controller_and_a_report_each(
-    start: Callable[..., Session], tmp_path: Path,
-) -> None:
+def test_joints_of_an_arm_have_one_controller_and_a_report_each(start, tmp_path):
     (tmp_path / 'arm.py').write_text(ARM)
     (tmp_path / 'arm.yaml').write_text(JOINTS)
     session = start(

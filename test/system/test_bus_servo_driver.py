@@ -1,7 +1,5 @@
 """The driver of bus servos beside an emulated bus: messages, silence, a pulled plug, the end."""
 
-from __future__ import annotations
-
 import math
 import re
 import subprocess
@@ -91,9 +89,7 @@ class World:
         return self.log.read_text()
 
 
-def test_joints_follow_through_silence_and_a_pulled_plug_and_are_limp_at_the_end(
-    tmp_path: Path,
-) -> None:
+def test_joints_follow_through_silence_and_a_pulled_plug_and_are_limp_at_the_end(tmp_path):
     with ExitStack() as stack:
         arm = World(tmp_path, stack)
 

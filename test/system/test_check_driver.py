@@ -1,7 +1,5 @@
 """check_driver beside a driver in another process: each fault is told, and only that one."""
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -100,9 +98,7 @@ def subjects(told: str, mark: str) -> list[str]:
 
 
 # test_driver_judgement.py has what follows from the graph; here it has to be seen through ROS.
-def test_what_is_wrong_in_the_graph_is_seen_and_nothing_is_judged_of_a_mixture(
-    tmp_path: Path,
-) -> None:
+def test_what_is_wrong_in_the_graph_is_seen_and_nothing_is_judged_of_a_mixture(tmp_path):
     with bench(tmp_path, 'second best_effort') as beside:
         process = beside.start('--wait', str(DEADLINE_S), '--duration', '1')
         try:
@@ -160,9 +156,7 @@ def assert_within_rate(start: float, controls: list[Float64], rate: float) -> No
     assert max(abs(b - a) for a, b in pairwise(v)) <= rate * PERIOD_S * (1.0 + 1e-9)
 
 
-def test_a_good_driver_passes_and_what_cannot_be_driven_is_refused_or_ended(
-    tmp_path: Path,
-) -> None:
+def test_a_good_driver_passes_and_what_cannot_be_driven_is_refused_or_ended(tmp_path):
     with bench(tmp_path, 'none') as beside:
         code, told = beside.check('--drive', '--save', str(tmp_path / 'record.csv'))
         wrong = set(subjects(told, '✗'))

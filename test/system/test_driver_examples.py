@@ -1,7 +1,5 @@
 """The example drivers beside real nodes, and the commands that docs/driver.md prints."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """A controller whose fits are made by a worker: what the death of either costs the other."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path
@@ -32,9 +30,7 @@ def workers_of(controller: NodeProcess) -> list[int]:
     return found
 
 
-def test_a_worker_that_is_killed_costs_no_estimate_and_ends_with_its_controller(
-    tmp_path: Path,
-) -> None:
+def test_a_worker_that_is_killed_costs_no_estimate_and_ends_with_its_controller(tmp_path):
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world, reports_applied=True, **UNCERTAIN)
         driver.learn()

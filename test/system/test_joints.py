@@ -1,7 +1,5 @@
 """A controller with several joints, through the messages of topic-based hardware."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """`live` without a browser: what it sends, to whom, and what it does to a run."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal
@@ -14,7 +12,7 @@ from bringup_processes import Session, bringup_sessions, wait_until
 from live_pages import address_of, frames, listening_addresses
 from ros_processes import ros_world
 
-from backlash_ros.nodes.live.command import LABELS
+from backlash_ros.nodes.live.command import LIVE_LABELS
 
 LOOK_S = 0.02
 MODULE = 'live.command'
@@ -59,9 +57,7 @@ def test_alone_it_waits_for_a_controller_and_ends_with_ctrl_c(tmp_path: Path) ->
         assert live.stderr == ''
 
 
-def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without_it(
-    run: Session,
-) -> None:
+def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without_it(run):
     async def look() -> None:
         async with ClientSession(timeout=DEADLINE) as session, session.get(
             f'{address_of(run)}/events'
@@ -74,7 +70,7 @@ def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without
                 for portion in frame['portions']:
                     for name, curves in portion.items():
                         heard.setdefault(name, set()).update(curves)
-                complete = [labels for labels in heard.values() if {*LABELS, 'loop'} <= labels]
+                complete = [labels for labels in heard.values() if {*LIVE_LABELS, 'loop'} <= labels]
                 if len(complete) == 2 and len(sent_s) > 20:
                     break
             assert sorted(set(sent_s)) == sent_s

@@ -1,7 +1,5 @@
 """The page of `bringup --live` in a real browser."""
 
-from __future__ import annotations
-
 import asyncio
 import signal
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Parameters of reference and plant that change in a running node."""
 
-from __future__ import annotations
-
 from array import array
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Nodes of one machine do without shared memory, which a killed one could leave damaged."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from pathlib import Path
 

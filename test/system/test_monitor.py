@@ -1,7 +1,5 @@
 """`monitor` beside real controllers: on a terminal, over a pipe, its keys and its end."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pty

@@ -1,7 +1,5 @@
 """The nodes as processes: what they refuse and say, how they end, what goes on after them."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
@@ -180,9 +178,7 @@ def saved_error(file: Path) -> float:
     return max(abs(saved[name] / true - 1.0) for name, true in TRUTH.items())
 
 
-def test_a_killed_controller_goes_on_with_the_saved_estimates_and_without_a_jump(
-    tmp_path: Path,
-) -> None:
+def test_a_killed_controller_goes_on_with_the_saved_estimates_and_without_a_jump(tmp_path):
     file = tmp_path / 'estimates.json'
     keep = {'estimates.file': str(file), 'estimates.load': True, 'estimates.save_period': 0.2,
             'control.rate_max': RATE_MAX, **OF_THE_LOOP}
@@ -244,9 +240,7 @@ def test_each_cause_is_one_line_in_the_terminal_and_in_the_diagnostics(tmp_path:
         assert sum(line in each for each in controller.stderr.splitlines()) == 1
 
 
-def test_what_a_controller_publishes_is_what_layouts_show_and_latecomers_hear(
-    tmp_path: Path,
-) -> None:
+def test_what_a_controller_publishes_is_what_layouts_show_and_latecomers_hear(tmp_path):
     with ros_world(tmp_path) as world:
         controller, driver = controller_and_driver(world)
         late = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)

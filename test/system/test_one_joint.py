@@ -1,7 +1,5 @@
 """One joint of an arm as a lone actuator: what concerns it passes, and nothing else."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The package built by colcon and started from its installation."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The recorder as a process: killed, stopped, out of room; and what can still be had of its bag."""
 
-from __future__ import annotations
-
 import re
 import resource
 import signal
@@ -86,9 +84,7 @@ def recorder(*arguments: object) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_killed_recorder_loses_at_most_the_last_second(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_killed_recorder_loses_at_most_the_last_second(tmp_path, capsys):
     bag = tmp_path / 'bag'
     with ros_world(tmp_path) as world:
         probe = world.probe()
@@ -128,9 +124,7 @@ def test_killed_recorder_loses_at_most_the_last_second(
         assert {int(message.data[SAMPLE]) for *_, message in found} == kept
 
 
-def test_a_bag_is_read_while_it_is_recorded_and_complete_after_a_signal_amid_a_flood(
-    tmp_path: Path,
-) -> None:
+def test_a_bag_is_read_while_it_is_recorded_and_complete_after_a_signal_amid_a_flood(tmp_path):
     bag = tmp_path / 'bag'
     with ros_world(tmp_path) as world:
         probe = world.probe()

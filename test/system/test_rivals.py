@@ -1,11 +1,8 @@
 """Several publishers of the command: who is told, who stands down, and how it goes on."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from drivers.paced_driver import OF_THE_LOOP, PERIOD_S, PacedDriver
@@ -64,9 +61,7 @@ class Stage:
         return [message.data for message in self.driver.controls]
 
 
-def test_the_later_controller_stands_down_until_the_first_one_has_gone_or_is_dead(
-    tmp_path: Path,
-) -> None:
+def test_the_later_controller_stands_down_until_the_first_one_has_gone_or_is_dead(tmp_path):
     with ros_world(tmp_path) as world:
         stage = Stage(world)
         first = stage.start('first')
@@ -106,9 +101,7 @@ def test_the_later_controller_stands_down_until_the_first_one_has_gone_or_is_dea
     assert 'nobody else publishes /control any more' in second.stderr
 
 
-def test_another_program_is_given_way_to_where_it_was_first_and_named_where_not(
-    tmp_path: Path,
-) -> None:
+def test_another_program_is_given_way_to_where_it_was_first_and_named_where_not(tmp_path):
     with ros_world(tmp_path) as world:
         stage = Stage(world)
         other = world.probe()

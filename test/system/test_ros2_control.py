@@ -1,7 +1,5 @@
 """io.style: ros2_control, against a stand-in for joint_state_broadcaster and forward controller."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

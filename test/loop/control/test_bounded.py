@@ -1,7 +1,5 @@
 """What no loop does, however wrong what it is told of the plant: run away, or break a limit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from itertools import islice
@@ -76,9 +74,7 @@ def asked_by_the_reference(structure: str, start: float = 0.0) -> float:
     (law, structure) for structure in ('tracking', 'pole_placement') for law in LAWS
     if law_fits(law, structure)
 ])
-def test_u_d_stays_within_a_stated_multiple_of_what_is_asked(
-    law: str, structure: str, sensor: str,
-) -> None:
+def test_u_d_stays_within_a_stated_multiple_of_what_is_asked(law, structure, sensor):
     settings = {'structure': structure, 'estimator.law': law, 'amplitude': 0.2}
     p = Parameters({**settings, 'output_noise_std': 1e-3})
     controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
@@ -189,9 +185,7 @@ events = st.one_of(
     name=st.sampled_from(['proportional', 'tracking', 'pole_placement']),
     sequence=st.lists(events, max_size=40),
 )
-def test_every_command_keeps_the_limits_that_hold_at_that_moment(
-    name: str, sequence: list[tuple[Any, ...]],
-) -> None:
+def test_every_command_keeps_the_limits_that_hold_at_that_moment(name, sequence):
     limits, inverse = Limits(), BacklashInverse()
     core = AdaptiveController(Told(), structure_named(name), inverse, limits)
     v = 0.0

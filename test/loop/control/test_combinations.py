@@ -1,7 +1,5 @@
 """Every law in every structure, whatever is not as it should be: bounded, and no false claim."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from functools import cache

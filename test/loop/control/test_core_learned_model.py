@@ -1,7 +1,5 @@
 """What the controller believes of G, before and after it has learned."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -40,9 +38,7 @@ def report(loop: ClosedLoop) -> LawReport:
     st.lists(st.floats(0.1, 1.0), min_size=1, max_size=4), st.floats(-0.9, 0.9),
     st.integers(0, 3), st.integers(0, 3),
 )
-def test_a_model_without_its_delay_is_the_same_with_it(
-    taps: list[float], pole: float, delay: int, more: int,
-) -> None:
+def test_a_model_without_its_delay_is_the_same_with_it(taps, pole, delay, more):
     denominator = [1.0, -pole, *[0.0] * (delay + len(taps))]
     model = TransferFunction(taps, denominator[:max(len(taps) + 1, len(denominator) - more)])
     numerator, rest, samples = model.without_delay()

@@ -1,7 +1,5 @@
 """A better model of G in the middle of a loop: who designs for it, when it is used, and how."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Callable
@@ -170,9 +168,7 @@ def rest_after(k: int) -> float:
 @pytest.mark.parametrize('reference', [multisine, rest_after])
 @pytest.mark.parametrize('name', [name for name in TRUE if name != 'late'])
 @pytest.mark.parametrize('after', [601, 712])
-def test_no_move_at_a_swap_is_larger_than_the_largest_of_the_second_before(
-    name: str, after: int, reference: Callable[[int], float],
-) -> None:
+def test_no_move_at_a_swap_is_larger_than_the_largest_of_the_second_before(name, after, reference):
     swapped = run(motor(), TRUE[name], after, 900, reference)
     moves = np.abs(np.diff(swapped.v))
     at = swapped.learner.adopted_at

@@ -1,7 +1,5 @@
 """A controller that takes over from another one, as after a silence of the driver."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from copy import deepcopy
 

@@ -1,7 +1,5 @@
 """The tracking structure: y follows y_m as if there were no backlash."""
 
-from __future__ import annotations
-
 from math import inf
 
 import numpy as np
@@ -94,9 +92,7 @@ MOTORS = {
 @pytest.mark.parametrize('take_up', [30.0, np.inf])
 @pytest.mark.parametrize('motor', MOTORS)
 @pytest.mark.parametrize('stop', [2.5, 3.7])
-def test_v_rests_however_long_it_takes_to_cross_the_gap(
-    motor: str, stop: float, take_up: float,
-) -> None:
+def test_v_rests_however_long_it_takes_to_cross_the_gap(motor, stop, take_up):
     w, damping, lag = MOTORS[motor]
     w *= np.pi
     denominator = np.polymul([lag, 1.0], [1.0, 2.0 * damping * w, w * w])

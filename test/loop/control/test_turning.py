@@ -1,7 +1,5 @@
 """How often v crosses the gap in `tracking`: once per turn of what is asked for."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

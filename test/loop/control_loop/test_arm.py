@@ -1,7 +1,5 @@
 """An arm with play in six joints, as MuJoCo integrates it, behind the loops of one controller."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.txt)')

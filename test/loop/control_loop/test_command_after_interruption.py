@@ -1,7 +1,5 @@
 """Where the commands go on after an interruption: what is newer, a command or a report?"""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -1,7 +1,5 @@
 """Some of the sequences that benchmarks/faults.py plays by the thousand, and single faults."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from fault_loop.fault_controller import Controller

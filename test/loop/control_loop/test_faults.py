@@ -1,12 +1,10 @@
 """What a driver, a sensor or a network may do to the loop, and what is left of the estimates."""
 
-from __future__ import annotations
-
 from math import inf, nan
 
 import numpy as np
 import pytest
-from simulated_loop import Fault, SimulatedLoop
+from simulated_loop import SimulatedLoop
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.sample_counter import Output
@@ -76,9 +74,7 @@ class Swapped:
 
 
 @pytest.mark.parametrize(('fault', 'extra'), [(lost_in_bursts, 0), (doubled, 400), (Swapped(), 40)])
-def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent(
-    fault: Fault, extra: int,
-) -> None:
+def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent(fault, extra):
     world = SimulatedLoop()
     world.learn()
     world.fault = fault
@@ -91,9 +87,7 @@ def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent
 @pytest.mark.parametrize(('share', 'use'), [
     (0.01, 'auto'), (0.1, 'true'), (0.3, 'auto'), (0.3, 'true'),
 ])
-def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_percent(
-    share: float, use: str,
-) -> None:
+def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_percent(share, use):
     world = SimulatedLoop(reports=True, **{'estimator.use_applied_control': use})
     world.deaf = lambda: bool(world.rng.random() < share)
     world.run(400)
@@ -165,9 +159,7 @@ STANDING = 5.13  # v at which the driver is found
 
 
 @pytest.mark.parametrize(('reports', 'initial'), [(True, None), (True, -3.0), (False, STANDING)])
-def test_the_first_command_goes_on_from_what_is_known_of_v(
-    reports: bool, initial: float | None,
-) -> None:
+def test_the_first_command_goes_on_from_what_is_known_of_v(reports, initial):
     world = SimulatedLoop(reports, initial, **{'control.rate_max': RATE_MAX})
     world.driver.actuator.v = STANDING
     world.run(100)

@@ -1,7 +1,5 @@
 """Loops of several joints in one: each is the loop that it would be alone, whatever others do."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from math import inf, isnan, nan
 

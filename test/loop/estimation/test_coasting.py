@@ -1,7 +1,5 @@
 """A load that runs on within the gap is told from a gap, and from a lag, that were not known."""
 
-from __future__ import annotations
-
 from math import pi, sin
 
 import pytest

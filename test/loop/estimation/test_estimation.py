@@ -1,7 +1,5 @@
 """Short, seeded versions of what benchmarks/accuracy.py measures over many seeds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import sin, sqrt
 
@@ -136,9 +134,7 @@ def test_estimates_freeze_while_v_stays_within_the_gap(what: str) -> None:
         'plant.numerator': (1.994012e-7, 7.952171e-7, 1.982084e-7), 'amplitude': 20.0,
     }, True),
 ], ids=['triangle with bias', 'chirp', 'square', 'first guess off by 10', '1 kHz'])
-def test_ill_conditioned_data_neither_break_the_filters_nor_mislead(
-    changes: dict[str, object], learns: bool,
-) -> None:
+def test_ill_conditioned_data_neither_break_the_filters_nor_mislead(changes, learns):
     p = Parameters(changes)
     run = build_closed_loop(p).run(1000)
     assert np.isfinite(run.rows[:, :10]).all()

@@ -1,7 +1,5 @@
 """What the default law makes of data that do not fit."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

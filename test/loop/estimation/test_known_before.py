@@ -1,7 +1,5 @@
 """What was learned before the run: what confirms it, what replaces it, and what leaves it alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Learning from plants that differ from the nominal one, and from loads that coast."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from cases.geared_motor import motor, random_backlash

@@ -1,7 +1,5 @@
 """A controller that goes on with what was learned before, and one that is told not to learn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The controller as a managed node: its states, its services, its parameters, its last commands."""
 
-from __future__ import annotations
-
 import json
 import os
 import threading
@@ -65,9 +63,7 @@ def test_a_node_whose_activation_fails_is_not_active(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize('steps', [
     (DEACTIVATE, ACTIVATE), (DEACTIVATE, CLEANUP, CONFIGURE, ACTIVATE),
 ], ids=['deactivated', 'cleaned up'])
-def test_it_goes_on_from_its_last_command_and_uses_no_sample_number_twice(
-    steps: tuple[int, ...],
-) -> None:
+def test_it_goes_on_from_its_last_command_and_uses_no_sample_number_twice(steps):
     with bench(**{'control.rate_max': RATE_MAX, 'on_stop': 'hold'}) as made:
         made.run(300)
         known, index = estimates(made), made.loop.counter.index
@@ -137,9 +133,7 @@ def test_estimates_are_frozen_reset_and_compensated_with_as_is_asked() -> None:
         assert estimates(made)[0] == 0.696
 
 
-def test_estimates_are_saved_at_the_end_and_on_request_or_the_reason_is_told(
-    tmp_path: Path,
-) -> None:
+def test_estimates_are_saved_at_the_end_and_on_request_or_the_reason_is_told(tmp_path):
     file = tmp_path / 'estimates.json'
     with bench(**{'estimates.file': str(file), 'estimates.save_period': 0.0}) as made:
         made.run(50)
@@ -160,9 +154,7 @@ def test_estimates_are_saved_at_the_end_and_on_request_or_the_reason_is_told(
         assert 'cannot be written: No such file or directory' in answer.message
 
 
-def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_slow_disk_holds_up_the_answer_but_not_the_loop(tmp_path, monkeypatch):
     confirmed, fsync = threading.Event(), os.fsync
 
     def slowly(file: int) -> None:

@@ -1,7 +1,5 @@
 """A controller node with several joints, in simulated time: what one of them does to the others."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

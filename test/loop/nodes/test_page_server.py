@@ -1,7 +1,5 @@
 """The server of the live page: readers that are slow, too many, or come late."""
 
-from __future__ import annotations
-
 import asyncio
 import socket
 from math import nan

@@ -1,7 +1,5 @@
 """The executor of the nodes: messages at once, and nothing else forgotten over them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from importlib.metadata import PackageNotFoundError
@@ -67,9 +65,7 @@ def fast_loop() -> Iterator[Loop]:
         loop.close()
 
 
-def test_installed_rclpy_is_one_that_the_fast_executor_is_known_to_work_with(
-    fast_loop: Loop,
-) -> None:
+def test_installed_rclpy_is_one_that_the_fast_executor_is_known_to_work_with(fast_loop):
     warnings: list[str] = []
     executor = make_executor(fast_loop.node, warnings.append)
     executor.shutdown()
@@ -78,9 +74,7 @@ def test_installed_rclpy_is_one_that_the_fast_executor_is_known_to_work_with(
 
 
 @pytest.mark.parametrize('other', ['9.1.2', '7.0.4', None])
-def test_another_rclpy_serves_by_itself_and_one_warning_says_so(
-    fast_loop: Loop, monkeypatch: pytest.MonkeyPatch, other: str | None,
-) -> None:
+def test_another_rclpy_serves_by_itself_and_one_warning_says_so(fast_loop, monkeypatch, other):
     def version(name: str) -> str:
         assert name == 'rclpy'
         if other is None:
@@ -96,9 +90,7 @@ def test_another_rclpy_serves_by_itself_and_one_warning_says_so(
     assert f'rclpy {other or "of unknown version"} is not one' in warning
 
 
-def test_every_message_is_served_in_order_with_its_number_where_that_is_wanted(
-    loop: Loop,
-) -> None:
+def test_every_message_is_served_in_order_with_its_number_where_that_is_wanted(loop):
     plain: list[float] = []
     numbered: list[tuple[float, int]] = []
 

@@ -1,7 +1,5 @@
 """`simulate --cluster`: the same runs on a Dask cluster, whatever becomes of its workers."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Processes that do not end by themselves."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

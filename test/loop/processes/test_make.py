@@ -1,7 +1,5 @@
 """What make says where something is missing: one line that names it and its cure."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

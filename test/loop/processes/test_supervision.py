@@ -1,7 +1,5 @@
 """How bringup watches and ends processes, with small programs in the place of the nodes."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys
@@ -90,9 +88,7 @@ def test_a_process_that_is_never_ready_is_named_with_the_end_of_its_log(
     assert (tmp_path / 'logs' / 'slow.log').read_text().startswith('hello\n100\n')
 
 
-def test_what_ends_by_itself_ends_all_the_deaf_and_their_children_included(
-    watch: Callable[..., Watched], tmp_path: Path,
-) -> None:
+def test_what_ends_by_itself_ends_all_the_deaf_and_their_children_included(watch, tmp_path):
     file = tmp_path / 'begun'
     mortal = (
         'import os, sys, time\n'
@@ -105,9 +101,7 @@ def test_what_ends_by_itself_ends_all_the_deaf_and_their_children_included(
     wait_until(lambda: not marked_processes(run.mark), 'all have gone')
 
 
-def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(tmp_path, monkeypatch):
     monkeypatch.setattr(supervising, 'ESCALATION', (
         (signal.SIGINT, 0.2), (signal.SIGTERM, 0.2), (signal.SIGKILL, DEADLINE_S),
     ))

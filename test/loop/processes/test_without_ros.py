@@ -1,7 +1,5 @@
 """Without ROS 2: what works with the declared requirements alone, and what says why it does not."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -66,9 +64,7 @@ def called(libraries: Path, folder: Path, *arguments: str) -> subprocess.Complet
     )
 
 
-def test_what_needs_no_ros_works_and_the_rest_says_so_in_one_line(
-    libraries: Path, tmp_path: Path,
-) -> None:
+def test_what_needs_no_ros_works_and_the_rest_says_so_in_one_line(libraries, tmp_path):
     for module in (
         'nodes.controller', 'nodes.plant', 'nodes.reference', 'nodes.recorder',
         'nodes.check_driver', 'nodes.monitor.command', 'nodes.live.command', 'tools.bringup',

@@ -1,7 +1,5 @@
 """A worker process: what it computes, what its death costs, and that it outlives nobody."""
 
-from __future__ import annotations
-
 import math
 import operator
 import os
@@ -92,9 +90,7 @@ def test_results_are_those_of_a_computation_in_place(executor: WorkerExecutor) -
         assert result_of(channels[0]) == result_of(channels[1])
 
 
-def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(
-    executor: WorkerExecutor,
-) -> None:
+def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(executor):
     channel = executor.open()
     for job, argument, kind in (
         (math.sqrt, -1.0, 'ValueError'), (open, '/nowhere', 'FileNotFoundError'),
@@ -108,9 +104,7 @@ def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(
     assert result_of(channel) == -4
 
 
-def test_a_worker_imports_neither_ros_nor_the_program_that_started_it(
-    executor: WorkerExecutor,
-) -> None:
+def test_a_worker_imports_neither_ros_nor_the_program_that_started_it(executor):
     channel = executor.open()
     channel.submit(foreign_modules)
     found = result_of(channel)
@@ -145,9 +139,7 @@ def test_a_worker_that_stands_still_holds_up_nobody(executor: WorkerExecutor) ->
     assert result_of(other) == b'x' * 1_000_000 + b'y'
 
 
-def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(
-    executor: WorkerExecutor, tmp_path: Path,
-) -> None:
+def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(executor, tmp_path):
     begun = tmp_path / 'begun'
     sleeper, channel, third = executor.open(), executor.open(1, 3000), executor.open()
     rng = np.random.default_rng(2)

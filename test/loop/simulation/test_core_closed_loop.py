@@ -1,7 +1,5 @@
 """The whole loop in one process: what the project promises."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -108,9 +106,7 @@ def test_one_seed_gives_one_run_to_the_last_bit() -> None:
     ('printed', 'proportional'), ('fixed', 'tracking'), ('gradient', 'pole_placement'),
 ])
 @pytest.mark.parametrize('size', [5e-324, 1e-155, 1e-130])
-def test_commands_whose_square_is_hardly_a_number_are_harmless(
-    law: str, structure: str, size: float,
-) -> None:
+def test_commands_whose_square_is_hardly_a_number_are_harmless(law, structure, size):
     parameters = Parameters({'estimator.law': law, 'structure': structure})
     loop = build_closed_loop(parameters).controller
     for k in range(200):

@@ -1,8 +1,5 @@
 """`compare`: one command runs every loop and writes the figure and the document."""
 
-from __future__ import annotations
-
-from pathlib import Path
 
 import pytest
 
@@ -10,9 +7,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.compare import COMPARISON_HEADER, compare, contenders, main
 
 
-def test_document_and_figure_come_from_one_command(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_document_and_figure_come_from_one_command(tmp_path, capsys):
     assert main(['--out', str(tmp_path), '--duration', '2.5']) == 0
     page = (tmp_path / 'comparison.md').read_text()
     assert (tmp_path / 'images' / 'comparison.png').read_bytes().startswith(b'\x89PNG')

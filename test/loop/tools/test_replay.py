@@ -1,7 +1,5 @@
 """The command replay: the run's own estimates to the last bit, or where it parts from them."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path
@@ -71,9 +69,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_the_command_says_that_nothing_parts(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_says_that_nothing_parts(recorded, tmp_path, capsys):
     assert main([str(recorded), '--out', str(tmp_path)]) == 0
     assert 'to the last bit' in capsys.readouterr().out
     names = {path.name for path in tmp_path.iterdir()}
@@ -85,9 +81,7 @@ def test_the_command_says_that_nothing_parts(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_the_command_says_where_it_parts(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_command_says_where_it_parts(recorded, tmp_path, capsys):
     assert main([str(recorded), '--set', 'plant.uncertainty=0.1', '--out', str(tmp_path)]) == 0
     assert 'part from those of the run at t = 0.' in capsys.readouterr().out
 
@@ -109,9 +103,7 @@ def test_several_runs_and_values_give_a_table(recorded: Path, tmp_path: Path) ->
     ['RUN', '--sweep', 'amplitude'], ['RUN', '--from', '2', '--to', '1'],
     ['RUN', '--set', 'estimator.bounds.m=[2.0, 3.0]'],
 ])
-def test_bad_input_is_told_in_one_line(
-    recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str],
-) -> None:
+def test_bad_input_is_told_in_one_line(recorded, tmp_path, capsys, arguments):
     given = [str(recorded) if word == 'RUN' else word for word in arguments]
     assert main([*given, '--out', str(tmp_path)]) == 2
     assert capsys.readouterr().err.count('\n') == 1
@@ -119,9 +111,7 @@ def test_bad_input_is_told_in_one_line(
 
 @pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('repeated', [1, 3])
-def test_a_log_tells_what_the_controller_would_have_learned_from_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], repeated: int,
-) -> None:
+def test_a_log_tells_what_the_controller_would_have_learned_from_it(tmp_path, capsys, repeated):
     run = build_closed_loop(Parameters({'plant.uncertainty': 0.0, **NOISY})).run(300)
     log, config = tmp_path / 'log.csv', tmp_path / 'a.yaml'
     y = run.column('y')[repeated * (np.arange(300) // repeated)]

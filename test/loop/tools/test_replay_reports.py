@@ -1,7 +1,5 @@
 """replay from a bag whose driver says which v it applied: the estimates of the run once more."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -102,9 +100,7 @@ def float_message(value: float) -> bytes:
 
 @pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize(('use', 'reach'), [('true', LIMIT), ('auto', LIMIT), ('auto', np.inf)])
-def test_the_estimates_of_the_run_come_out_to_the_last_bit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], use: str, reach: float,
-) -> None:
+def test_the_estimates_of_the_run_come_out_to_the_last_bit(tmp_path, capsys, use, reach):
     driver = LimitingDriver(Parameters({**GIVEN, 'estimator.use_applied_control': use}), reach)
     run = driver.run()
     folder = driver.write(tmp_path, run)
@@ -118,9 +114,7 @@ def test_the_estimates_of_the_run_come_out_to_the_last_bit(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_without_its_reports_a_limiting_driver_is_learned_wrongly(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_without_its_reports_a_limiting_driver_is_learned_wrongly(tmp_path, capsys):
     driver = LimitingDriver(Parameters({**GIVEN, 'estimator.use_applied_control': True}), LIMIT)
     run = driver.run()
     assert run.column('c_r')[-1] == pytest.approx(3.0, rel=0.01)

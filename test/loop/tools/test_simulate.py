@@ -1,7 +1,5 @@
 """`simulate`: one run, many seeds, sweeps; deterministic whatever the number of processes."""
 
-from __future__ import annotations
-
 import csv
 import json
 import os
@@ -40,9 +38,7 @@ def one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0}, raising=False)
 
 
-def test_run_writes_its_results_and_prints_a_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_run_writes_its_results_and_prints_a_table(tmp_path, capsys):
     assert main(['--duration', '0.5', '--out', str(tmp_path)]) == 0
     files = {path.name for path in tmp_path.iterdir()}
     assert files >= {'report.html', 'samples.csv', 'summary.json', 'parameters.yaml'}
@@ -60,9 +56,7 @@ def test_parallel_runs_equal_serial_ones() -> None:
 
 
 @pytest.mark.usefixtures('one_processor')
-def test_seeds_give_a_table_and_a_row_each(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_seeds_give_a_table_and_a_row_each(tmp_path, capsys):
     arguments = [*NOISY, '--seeds', '3', '--seed', '10', '--duration', '0.7']
     assert main([*arguments, '--out', str(tmp_path)]) == 0
     rows = rows_of(tmp_path / 'seeds.csv')

@@ -1,7 +1,5 @@
 """One step of the controller: who sees what, in which order, and within which limits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from math import inf, nan
 
@@ -90,9 +88,7 @@ def test_control_that_was_really_applied_replaces_the_own_command() -> None:
 
 @given(signal=signals(), low=st.floats(-20.0, -1.0), high=st.floats(1.0, 20.0),
        move=st.one_of(st.just(inf), st.floats(0.1, 10.0)))
-def test_limits_hold_and_the_estimator_is_told_the_limited_v(
-    signal: list[float], low: float, high: float, move: float,
-) -> None:
+def test_limits_hold_and_the_estimator_is_told_the_limited_v(signal, low, high, move):
     estimator = Notebook()
     c = controller(estimator, Limits(low, high, move))
     published = [0.0]
@@ -158,18 +154,14 @@ def test_negative_number_of_lost_samples_is_refused() -> None:
         (((0.5, 1.0), (0.0, 1.0), (-1.0, nan)), 'estimator.bounds.c_l'),
     ],
 )
-def test_invalid_bounds_are_refused_and_named(
-    intervals: tuple[tuple[float, float], ...], name: str,
-) -> None:
+def test_invalid_bounds_are_refused_and_named(intervals, name):
     with pytest.raises(ParameterError) as refusal:
         Bounds(*intervals)
     assert refusal.value.name == name
 
 
 @given(values=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
-def test_projection_is_the_nearest_point_within_the_bounds(
-    values: tuple[float, float, float],
-) -> None:
+def test_projection_is_the_nearest_point_within_the_bounds(values):
     bounds = Bounds((0.5, 2.0), (0.0, 4.0), (-4.0, -1.0))
     projected = bounds.project(*values)
     for value, result, (low, high) in zip(
@@ -181,9 +173,7 @@ def test_projection_is_the_nearest_point_within_the_bounds(
 
 
 @given(values=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
-def test_projected_crossings_are_in_order_on_whatever_side(
-    values: tuple[float, float, float],
-) -> None:
+def test_projected_crossings_are_in_order_on_whatever_side(values):
     bounds = Bounds((0.5, 2.0), (-3.0, 4.0), (-4.0, 2.0))
     m, c_r, c_l = projected = bounds.project(*values)
     assert c_l <= c_r

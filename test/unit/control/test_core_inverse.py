@@ -1,13 +1,11 @@
 """Backlash inverse, equations (2.2) and (2.3)."""
 
-from __future__ import annotations
-
 from math import ceil, nan
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import Play, plays, signals, usual_plays
+from strategies import plays, signals, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.parameters.errors import ParameterError
@@ -26,9 +24,7 @@ def as_printed(
 
 
 @given(play=plays(), u=st.floats(-100.0, 100.0), signal=signals())
-def test_exact_inverse_cancels_any_backlash_after_the_first_engagement(
-    play: Play, u: float, signal: list[float],
-) -> None:
+def test_exact_inverse_cancels_any_backlash_after_the_first_engagement(play, u, signal):
     backlash, inverse = Backlash(play.m, play.c_r, play.c_l, u), BacklashInverse()
     engaged = False
     for u_d in signal:
@@ -39,9 +35,7 @@ def test_exact_inverse_cancels_any_backlash_after_the_first_engagement(
 
 
 @given(samples=st.lists(st.tuples(plays(), st.floats(-100.0, 100.0)), min_size=1, max_size=40))
-def test_adaptive_inverse_equals_the_three_printed_cases(
-    samples: list[tuple[Play, float]],
-) -> None:
+def test_adaptive_inverse_equals_the_three_printed_cases(samples):
     inverse = BacklashInverse()
     u_d_before, v_before = 0.0, 0.0
     for play, u_d in samples:
@@ -54,9 +48,7 @@ def test_adaptive_inverse_equals_the_three_printed_cases(
     play=usual_plays(), band=st.floats(0.1, 10.0), sign=st.sampled_from([1.0, -1.0]),
     noise=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60), slope=st.floats(0.0, 1.0),
 )
-def test_noise_within_the_direction_band_never_turns_v(
-    play: Play, band: float, sign: float, noise: list[float], slope: float,
-) -> None:
+def test_noise_within_the_direction_band_never_turns_v(play, band, sign, noise, slope):
     inverse = BacklashInverse(direction_band=band)
     v_before = inverse.step(sign * 2.0 * band, play.m, play.c_r, play.c_l)
     for k, share in enumerate(noise):
@@ -69,9 +61,7 @@ def test_noise_within_the_direction_band_never_turns_v(
 
 @given(play=usual_plays(), take_up=st.floats(0.1, 10.0), u_d=st.floats(0.5, 50.0),
        signal=signals())
-def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(
-    play: Play, take_up: float, u_d: float, signal: list[float],
-) -> None:
+def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(play, take_up, u_d, signal):
     inverse = BacklashInverse(take_up=take_up)
     backlash = Backlash(play.m, play.c_r, play.c_l)
     for target in (u_d, -u_d, u_d, *signal):

@@ -1,7 +1,5 @@
 """The commands that end a loop: within the limits, and where they are meant to end."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from math import inf
 
@@ -19,9 +17,7 @@ values = st.floats(-1e3, 1e3)
 
 
 @given(values, st.floats(0.5, 1e3), st.floats(-1e3, 999.0), st.floats(1e-3, 2e3))
-def test_ramp_goes_to_the_v_nearest_to_zero_as_fast_as_the_limits_allow(
-    v: float, move: float, low: float, width: float,
-) -> None:
+def test_ramp_goes_to_the_v_nearest_to_zero_as_fast_as_the_limits_allow(v, move, low, width):
     limits = Limits(low, low + width, move)
     v = min(max(v, low), low + width)
     commands = [v, *last_commands('ramp', at_rest(v), lambda: limits)]

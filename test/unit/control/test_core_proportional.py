@@ -1,7 +1,5 @@
 """Structure (3.2) with its algebraic loop."""
 
-from __future__ import annotations
-
 from math import isfinite
 
 import pytest
@@ -36,9 +34,7 @@ def tolerance(play: Play, y_m: float, u_d: float) -> float:
         min_size=1, max_size=40,
     ),
 )
-def test_u_d_equals_y_m_plus_f_v_for_any_estimate_and_signal(
-    samples: list[tuple[Play, float, float]],
-) -> None:
+def test_u_d_equals_y_m_plus_f_v_for_any_estimate_and_signal(samples):
     inverse = BacklashInverse()
     for play, share, y_m in samples:
         command = control(y_m, estimate_of(play, share), inverse)
@@ -55,9 +51,7 @@ def test_u_d_equals_y_m_plus_f_v_for_any_estimate_and_signal(
         min_size=1, max_size=40,
     ),
 )
-def test_v_satisfies_the_printed_inverse_at_the_same_time(
-    samples: list[tuple[Play, float, float]],
-) -> None:
+def test_v_satisfies_the_printed_inverse_at_the_same_time(samples):
     inverse = BacklashInverse()
     u_d_before, v_before = 0.0, 0.0
     for play, share, y_m in samples:

@@ -1,7 +1,5 @@
 """The last gate: bounds, rate and acceleration of v."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from math import ceil, cos, inf
 
@@ -31,9 +29,7 @@ def test_whatever_is_asked_what_is_sent_is_a_number_that_keeps_the_limits(
     (4.0, None, 4.0), (9.0, None, 5.0), (-9.0, None, -5.0), (9.0, 3.0, 5.0),
     (9.0, 9.0, 9.0), (7.0, 9.0, 7.0), (20.0, 9.0, 9.0), (-9.0, 9.0, -5.0), (-9.0, -7.0, -7.0),
 ])
-def test_what_others_tell_of_v_leads_it_no_further_out(
-    told: float, known: float | None, begins: float,
-) -> None:
+def test_what_others_tell_of_v_leads_it_no_further_out(told, known, begins):
     assert Limits(-5.0, 5.0, 0.1).go_on_from(told, known) == begins
 
 

@@ -1,7 +1,5 @@
 """The four-block structure: gains from the Diophantine equation, and the loop they make."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings

@@ -1,7 +1,5 @@
 """y follows y_m from a motor encoder too: G begins behind the motor, and the command before it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

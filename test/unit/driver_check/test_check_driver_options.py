@@ -1,7 +1,5 @@
 """What check_driver refuses before it begins."""
 
-from __future__ import annotations
-
 import pytest
 
 from backlash_ros.nodes.check_driver import main
@@ -11,9 +9,7 @@ from backlash_ros.nodes.check_driver import main
     (['--amplitude', '3'], 'give --drive'),
     (['--duration', '-1'], 'must be finite and > 0'),
 ])
-def test_bad_options_are_one_line_and_code_2(
-    capsys: pytest.CaptureFixture[str], options: list[str], word: str
-) -> None:
+def test_bad_options_are_one_line_and_code_2(capsys, options, word):
     with pytest.raises(SystemExit) as left:
         main(options)
     told = capsys.readouterr().err

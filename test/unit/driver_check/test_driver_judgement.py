@@ -1,12 +1,9 @@
 """Each fault of a driver is found once, and with its cure; a good driver has none."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
 from math import nan
-from typing import Any
 
 import numpy as np
 import pytest
@@ -189,9 +186,7 @@ def test_a_fault_of_the_driver_is_the_only_one_told_with_its_figure_and_its_cure
     ({'report': True, 'limit': 3.5}, {'estimator__use_applied_control': 'true'}),
     ({'report': True, 'limit': 3.5}, {'estimator__use_applied_control': 'auto'}),
 ])
-def test_what_the_parameters_announce_is_no_fault(
-    heard: dict[str, Any], changes: dict[str, object],
-) -> None:
+def test_what_the_parameters_announce_is_no_fault(heard, changes):
     assert faults(heard_from_driver(**heard), **changes) == []
 
 

@@ -1,7 +1,5 @@
 """A whole record as one function: backlash, G, noise, delay and sign."""
 
-from __future__ import annotations
-
 from math import isnan, nan
 
 import numpy as np
@@ -54,9 +52,7 @@ def assert_is(fit: RecordFit, truth: Truth) -> None:
     share=st.floats(0.0, 1.0), seed=st.integers(0, 1000),
     uncertainty=st.sampled_from([0.0, 0.2]),
 )
-def test_backlash_and_noise_are_found(
-    m: float, c_r: float, c_l: float, share: float, seed: int, uncertainty: float,
-) -> None:
+def test_backlash_and_noise_are_found(m, c_r, c_l, share, seed, uncertainty):
     truth = Truth(m, c_r, c_l, share)
     fit = of(*record(500, truth, seed=seed), uncertainty)
     assert_is(fit, truth)
@@ -178,8 +174,6 @@ def test_bounds_limit_what_is_usable() -> None:
     (np.zeros(3), np.zeros(3), (), 'at least one'),
     (np.zeros(3), np.zeros(3), (-1,), 'negative'),
 ])
-def test_arrays_that_make_no_record_are_refused(
-    v: np.ndarray, y: np.ndarray, delays: tuple[int, ...], message: str,
-) -> None:
+def test_arrays_that_make_no_record_are_refused(v, y, delays, message):
     with pytest.raises(ValueError, match=message):
         of(v, y, delays=delays)

@@ -1,7 +1,5 @@
 """Records and jobs, computed at once."""
 
-from __future__ import annotations
-
 import operator
 
 import numpy as np
@@ -26,9 +24,7 @@ def everything(samples: Samples, *more: object) -> tuple[object, ...]:
     blocks=st.lists(st.integers(0, 700), max_size=12), capacity=st.integers(1, 1500),
     held_back=st.integers(0, 50),
 )
-def test_record_holds_the_newest_samples_with_their_numbers(
-    blocks: list[int], capacity: int, held_back: int,
-) -> None:
+def test_record_holds_the_newest_samples_with_their_numbers(blocks, capacity, held_back):
     record = Record(2, capacity)
     rows = np.arange(2.0 * sum(blocks)).reshape(-1, 2)
     for part in np.split(rows, np.cumsum(blocks)[:-1]) if blocks else []:

@@ -1,7 +1,5 @@
 """The observer between two solutions against the stationary Kalman filter."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from records import resonance

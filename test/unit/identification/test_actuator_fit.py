@@ -1,7 +1,5 @@
 """Command and motor encoder of one record tell the position loop between them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice

@@ -1,7 +1,5 @@
 """Identification from arrays: what is found, how surely, and what a record cannot tell."""
 
-from __future__ import annotations
-
 from itertools import islice
 
 import numpy as np
@@ -73,9 +71,7 @@ def test_random_actuators_are_found_to_within_their_deviations(seed: int) -> Non
 
 
 @pytest.mark.parametrize('seed', [1])
-def test_rounding_alone_is_no_reason_for_a_further_pole(
-    monkeypatch: pytest.MonkeyPatch, seed: int,
-) -> None:
+def test_rounding_alone_is_no_reason_for_a_further_pole(monkeypatch, seed):
     monkeypatch.setattr(identification_cases, 'NOISE', (1e-300, 1e-300))
     case = random_case(seed)
     found = identify(case.v, case.y, case.period)

@@ -1,7 +1,5 @@
 """The command identify: records of every kind, the files it writes, what it says and returns."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -109,9 +107,7 @@ def test_the_loop_with_the_file_follows(result: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(tmp_path, capsys):
     v = 0.1 * motion(1200)
     source = write_csv(tmp_path / 'a.csv', v, np.random.default_rng(1).standard_normal(1200))
     assert main([str(source), *QUICK, '--out', str(tmp_path / 'out')]) == 1
@@ -120,9 +116,7 @@ def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(
     assert json.loads((tmp_path / 'out' / 'identified.json').read_text())['usable'] is False
 
 
-def test_a_bad_file_is_told_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_bad_file_is_told_in_one_line(tmp_path, capsys):
     source = tmp_path / 'a.csv'
     source.write_text('t,v\n0,1\n1,2\n')
     assert main([str(source), '--out', str(tmp_path / 'out')]) == 2
@@ -139,10 +133,7 @@ def test_a_bad_file_is_told_in_one_line(
     ['a.csv', '--columns', 'x=1'], ['a.csv', '--columns', 't=w'], ['a.csv', '--period', '0'],
     ['a.csv', '--config', 'nowhere.yaml'], ['a.csv', '--ros-args', '-r', 'a:=b'],
 ])
-def test_bad_options_are_told_in_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-) -> None:
+def test_bad_options_are_told_in_one_line(tmp_path, monkeypatch, capsys, arguments):
     monkeypatch.chdir(tmp_path)
     write_csv(tmp_path / 'a.csv', *record(100))
     assert main(arguments) == 2
@@ -205,9 +196,7 @@ def test_a_span_is_cut_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_what_the_controller_refuses_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_the_controller_refuses_is_told(tmp_path, capsys):
     config = tmp_path / 'a.yaml'
     # The gradient law needs another structure.
     config.write_text('/**: {ros__parameters: {estimator: {law: gradient}, structure: tracking}}')
@@ -218,9 +207,7 @@ def test_what_the_controller_refuses_is_told(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_an_axis_gets_a_file_of_its_own(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_an_axis_gets_a_file_of_its_own(tmp_path, capsys):
     config = tmp_path / 'axes.yaml'
     config.write_text(
         "/bringup: {ros__parameters: {axes: ['x', 'z']}}\n"

@@ -1,7 +1,5 @@
 """What is not a play is named by what it is; a play, whatever G is behind it, is not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which structure is taken: a pole that a zero cancels is none."""
 
-from __future__ import annotations
-
 from itertools import islice
 
 import numpy as np
@@ -49,9 +47,7 @@ NEITHER = compared(fit_of(True, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0, 0.98
     (False, [0.5, 0.6 + 0.4j, 0.6 - 0.4j], [0.6 + 0.4j, 0.6 - 0.4j], [0.6 + 0.4j, 0.6 - 0.4j]),
     (True, [], [], []), (False, [0.9, 0.5], [], []),
 ])
-def test_a_pole_with_a_zero_on_it_is_cancelled(
-    integrator: bool, poles: list[complex], zeros: list[complex], cancelled: list[complex],
-) -> None:
+def test_a_pole_with_a_zero_on_it_is_cancelled(integrator, poles, zeros, cancelled):
     assert cancelled_poles(fit_of(integrator, poles, zeros)) == pytest.approx(cancelled)
 
 

@@ -1,7 +1,5 @@
 """A gear that MuJoCo integrates: its play is the one that was asked for, and it is cancelled."""
 
-from __future__ import annotations
-
 import pytest
 
 pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.txt)')
@@ -20,9 +18,7 @@ def identified() -> gear_runs.Identified:
     return gear_runs.identified(SERVO, encoder=False)
 
 
-def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(
-    identified: gear_runs.Identified,
-) -> None:
+def test_identified_from_limits_alone_the_loop_removes_what_backlash_does(identified):
     assert identified.said == 'of use'
     assert identified.parameters is not None
     lost = SERVO.lost_motion

@@ -1,7 +1,5 @@
 """The verdict: three answers, each with its reason and the cure, from numbers alone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How laws without deviations judge their estimates."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """u reconstructed from y alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -85,9 +83,7 @@ def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: fl
     ],
 )
 @pytest.mark.parametrize('noise_std', [0.0, 1e-4, 1e-2])
-def test_zero_at_one_is_refused(
-    numerator: list[float], denominator: list[float], noise_std: float,
-) -> None:
+def test_zero_at_one_is_refused(numerator, denominator, noise_std):
     """A constant u leaves no trace in y then."""
     with pytest.raises(ParameterError) as refusal:
         InputReconstruction(TransferFunction(numerator, denominator), noise_std, LAG)

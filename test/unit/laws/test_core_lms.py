@@ -1,7 +1,5 @@
 """Normalised LMS with projection on (m, m c_r, m c_l)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,9 +100,7 @@ def test_known_u_and_a_swing_beyond_the_gap_identify_all_three(play: Play, step:
     play=usual_plays(), signal=strokes(), step=st.floats(0.1, 1.9), step_f=st.floats(0.0, 1.9),
     u_d=st.floats(-100.0, 100.0),
 )
-def test_estimates_stay_within_bounds_that_the_truth_violates(
-    play: Play, signal: list[float], step: float, step_f: float, u_d: float,
-) -> None:
+def test_estimates_stay_within_bounds_that_the_truth_violates(play, signal, step, step_f, u_d):
     inside = Estimate(1.0, 1.0, -1.0, 0.22)
     bounds = Bounds((0.75, 1.25), (0.5, 1.5), (-1.5, -0.5))
     for lesson in lessons(lms(step, bounds, step_f, inside), play, signal, u_d):

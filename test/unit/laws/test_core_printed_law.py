@@ -1,7 +1,5 @@
 """The printed law (3.11) and what follows from it."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from math import isnan
 
@@ -42,26 +40,20 @@ def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:
 
 
 @given(u=SMALL, y_m=SMALL, m=eighths(1, 80), w=SMALL)
-def test_printed_f_reduces_to_the_solution_of_e_equal_0(
-    u: float, y_m: float, m: float, w: float,
-) -> None:
+def test_printed_f_reduces_to_the_solution_of_e_equal_0(u, y_m, m, w):
     assume(y_m + m * w != 0.0 and u + m * w != 0.0)
     reduced = Fraction(m) * (Fraction(u) - Fraction(y_m)) / (Fraction(u) + Fraction(m * w))
     assert printed_f(u, y_m, m, w) == float(reduced)
 
 
 @given(u=SMALL, y_m=SMALL, f=eighths(-80, 80), w=SMALL)
-def test_printed_m_reduces_to_the_solution_of_e_equal_0(
-    u: float, y_m: float, f: float, w: float,
-) -> None:
+def test_printed_m_reduces_to_the_solution_of_e_equal_0(u, y_m, f, w):
     assume(f != 0.0 and y_m + f * w != 0.0 and u - y_m - f * w != 0.0)
     assert printed_m(u, y_m, f, w) == float(Fraction(u) * Fraction(f) / Fraction(u - y_m - f * w))
 
 
 @given(u=SMALL, y_m=SMALL, f=eighths(-80, 80), m=eighths(1, 80))
-def test_printed_c_reduces_to_the_solution_of_e_equal_0(
-    u: float, y_m: float, f: float, m: float,
-) -> None:
+def test_printed_c_reduces_to_the_solution_of_e_equal_0(u, y_m, f, m):
     assume(f != 0.0)
     reduced = (Fraction(u) - Fraction(y_m)) / Fraction(f) - Fraction(u) / Fraction(m)
     assert printed_c(u, y_m, f, m) == float(reduced)

@@ -1,7 +1,5 @@
 """The gradient law of the four-block loop."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What all laws offer."""
 
-from __future__ import annotations
-
 import pytest
 
 from backlash_ros.core.assembly import ESTIMATORS, build_controller

@@ -1,7 +1,5 @@
 """Estimates in a file: what is saved comes back, what does not fit is refused with the reason."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from math import isnan, nan
@@ -33,10 +31,7 @@ def parameters(file: Path, **values: object) -> Parameters:
     st.floats(0.01, 100.0), st.floats(0.0, 100.0), st.floats(-100.0, 0.0), st.floats(-0.5, 0.5),
     st.one_of(st.just(nan), st.floats(0.0, 10.0, exclude_min=True)),
 )
-def test_saved_estimate_comes_back_to_the_last_bit(
-    tmp_path_factory: pytest.TempPathFactory, m: float, c_r: float, c_l: float, f: float,
-    std: float,
-) -> None:
+def test_saved_estimate_comes_back_to_the_last_bit(tmp_path_factory, m, c_r, c_l, f, std):
     p = parameters(tmp_path_factory.mktemp('saved') / 'estimates.json')
     estimate = Estimate(m, c_r, c_l, f, std, std, std)
     save_estimate(Path(p.estimates.file), estimate, p)
@@ -64,9 +59,7 @@ def test_nothing_is_loaded_unless_asked_or_before_it_was_saved(tmp_path: Path) -
         ('estimator.law', 'lms'),
     ],
 )
-def test_estimates_of_another_plant_or_law_are_refused(
-    tmp_path: Path, name: str, value: object,
-) -> None:
+def test_estimates_of_another_plant_or_law_are_refused(tmp_path, name, value):
     file = tmp_path / 'estimates.json'
     save_estimate(file, LEARNED, parameters(file))
     with pytest.raises(ParameterError, match=f'was learned with {name}='):
@@ -125,9 +118,7 @@ def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, content: str) 
     [('m', 1000.0, 'outside of estimator.bounds.m'), ('c_r', -1000.0, 'outside'),
      ('c_r', -4.0, 'c_l=-3.5 above c_r=-4.0'), ('c_l', None, 'no finite c_l')],
 )
-def test_values_that_cannot_be_are_refused(
-    tmp_path: Path, part: str, value: float | None, reason: str,
-) -> None:
+def test_values_that_cannot_be_are_refused(tmp_path, part, value, reason):
     file = tmp_path / 'estimates.json'
     save_estimate(file, LEARNED, parameters(file))
     content = json.loads(file.read_text())

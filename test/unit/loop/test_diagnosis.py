@@ -1,7 +1,5 @@
 """What the controller says is wrong with the loop, from figures alone."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 from math import inf, nan
@@ -117,9 +115,7 @@ def test_every_cause_of_the_table_is_tried_here() -> None:
 
 
 @pytest.mark.parametrize(('changes', 'level', 'text'), CASES, ids=IDS)
-def test_each_cause_is_named_with_its_figure_and_its_cure(
-    changes: dict[str, Any], level: Level, text: str,
-) -> None:
+def test_each_cause_is_named_with_its_figure_and_its_cure(changes, level, text):
     finding = first(replace(WELL, **changes))
     assert finding.text.startswith(text)
     assert finding.level == level
@@ -146,9 +142,7 @@ def test_estimates_of_before_that_hold_are_not_said_to_move() -> None:
     ({'law': LawReport(unexplained=0.01)}, BLAMED),
     ({'law': LawReport(unexplained=inf)}, BLAMED),
 ])
-def test_a_contradiction_is_named_by_what_the_fit_has_found(
-    changes: dict[str, Any], text: str,
-) -> None:
+def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
     found = first(replace(INCONSISTENT, **changes))
     assert found == Finding(Level.ERROR, 'model', text)
     assert len(text) <= LONGEST_TEXT
@@ -174,9 +168,7 @@ def test_a_rival_whose_name_is_not_known_yet_is_no_line_of_the_log_at_once() -> 
     {'still': 200, 'v_swing': 2.0, 'gap': 1.0}, {'limited': 400}, {'late': 3},
     {'output': output_from(DRIVER, OTHER)},
 ])
-def test_an_estimate_that_does_not_fit_stays_an_error_beside_other_causes(
-    changes: dict[str, Any],
-) -> None:
+def test_an_estimate_that_does_not_fit_stays_an_error_beside_other_causes(changes):
     assert worst_level(replace(INCONSISTENT, **changes)) == Level.ERROR
 
 
@@ -203,9 +195,7 @@ def test_a_driver_that_pauses_now_and_then_is_not_asked_for_another_rate() -> No
     (0.0001, 0.0025, 0.005),  # each is sent twice
     (0.0053, 0.0054, 0.0055), (nan, nan, nan),
 ])
-def test_losses_bursts_and_jitter_are_no_wrong_rate(
-    intervals_s: tuple[float, float, float],
-) -> None:
+def test_losses_bursts_and_jitter_are_no_wrong_rate(intervals_s):
     assert first(replace(WELL, intervals_s=intervals_s)) == LEARNED
 
 

@@ -1,7 +1,5 @@
 """The period of a driver, whatever is lost or comes twice."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from math import isnan
 

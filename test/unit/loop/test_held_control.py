@@ -1,7 +1,5 @@
 """Which v acts over intervals that are looked at later, as by a plant that was held up."""
 
-from __future__ import annotations
-
 from math import inf
 
 import pytest
@@ -14,9 +12,7 @@ PERIOD_NS = 10_000_000
 @pytest.mark.parametrize(('periods_ago', 'applied'), [
     (0.4, [1.0, 1.0, 2.0]), (1.0, [1.0, 2.0, 2.0]), (5.0, [2.0, 2.0, 2.0]),
 ])
-def test_control_acts_from_its_arrival_though_the_plant_was_held_up(
-    periods_ago: float, applied: list[float],
-) -> None:
+def test_control_acts_from_its_arrival_though_the_plant_was_held_up(periods_ago, applied):
     now_ns = 100 * PERIOD_NS
     held = HeldControl()
     for v, ago in ((1.0, 9.0), (2.0, periods_ago)):

@@ -1,7 +1,5 @@
 """Which v acted over each interval, from the stamps of commands and of reports."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from backlash_ros.core.loop.intervals import v_of_intervals

@@ -1,7 +1,5 @@
 """Parameters of several joints: shared ones, own ones, and joints without any."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import pytest

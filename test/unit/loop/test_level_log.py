@@ -1,7 +1,5 @@
 """Which diagnostics become a line of the log."""
 
-from __future__ import annotations
-
 from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.loop.level_log import AGAIN_S, LASTS_S, LevelLog
 

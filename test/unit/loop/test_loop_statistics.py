@@ -1,7 +1,5 @@
 """One definition of latency: what /diagnostics says is what a report says of the same samples."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics

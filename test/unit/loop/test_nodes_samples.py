@@ -1,7 +1,5 @@
 """Which sample a message holds, and which v the plant had: the bookkeeping of the controller."""
 
-from __future__ import annotations
-
 from math import isnan
 
 import numpy as np
@@ -41,9 +39,7 @@ def test_time_stamps_alone_tell_every_missing_sample(gaps: list[int], delays: li
 
 
 @given(gaps, delays)
-def test_outputs_never_published_show_in_time_though_the_numbers_have_no_gap(
-    gaps: list[int], delays: list[float],
-) -> None:
+def test_outputs_never_published_show_in_time_though_the_numbers_have_no_gap(gaps, delays):
     counter = SampleCounter(PERIOD_S)
     stamps = stamps_of(gaps, delays)
     arrivals = [counter.count(stamp, 1 + i) for i, stamp in enumerate(stamps)]
@@ -99,9 +95,7 @@ def test_a_command_that_came_while_the_driver_was_held_up_missed_its_sample() ->
 @pytest.mark.parametrize(('passed_ns', 'late'), [
     (0, False), (PERIOD_NS // 10, True), (-PERIOD_NS, False), (100 * PERIOD_NS, True),
 ])
-def test_command_that_was_under_way_when_its_interval_ended_came_too_late(
-    passed_ns: int, late: bool,
-) -> None:
+def test_command_that_was_under_way_when_its_interval_ended_came_too_late(passed_ns, late):
     commands = CommandHistory(PERIOD_S)
     for _ in range(1000):
         commands.note_transit(passed_ns)
@@ -294,9 +288,7 @@ def pausing() -> list[float]:
     *(slow(share) for share in (0.0, 0.005, 0.03, 0.056, 0.09)), slow(-0.05), drifting(), pausing(),
 ])
 @pytest.mark.parametrize('numbered', [True, False])
-def test_a_sender_that_is_slow_or_pauses_has_lost_nothing(
-    stamps: list[float], numbered: bool,
-) -> None:
+def test_a_sender_that_is_slow_or_pauses_has_lost_nothing(stamps, numbered):
     counter = SampleCounter(PERIOD_S)
     for k, stamp in enumerate(stamps):
         arrival = counter.count(
@@ -319,9 +311,7 @@ def test_what_a_slow_sender_really_has_lost_is_counted(share: float) -> None:
 @pytest.mark.parametrize(('first', 'second'), [(1, 1), (100, 1), (1, 100), (5, 6)])
 @pytest.mark.parametrize('offset', [0.0, 0.4])
 @pytest.mark.parametrize('numbered', [True, False])
-def test_of_two_senders_one_is_used_from_the_start(
-    first: int, second: int, offset: float, numbered: bool,
-) -> None:
+def test_of_two_senders_one_is_used_from_the_start(first, second, offset, numbered):
     counter, used = SampleCounter(PERIOD_S), []
     for k in range(200):
         for sender, number, late in ((0, first, 0.0), (1, second, offset)):

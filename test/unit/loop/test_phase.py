@@ -1,7 +1,5 @@
 """The phases of a loop: the table that is read is the one that runs."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import pytest
@@ -18,9 +16,7 @@ def test_documented_table_is_the_one_that_runs() -> None:
 
 
 @pytest.mark.parametrize(('phase', 'event'), product(Phase, Event))
-def test_a_loop_that_stands_down_is_woken_by_nothing_but_the_end_of_its_rival(
-    phase: Phase, event: Event,
-) -> None:
+def test_a_loop_that_stands_down_is_woken_by_nothing_but_the_end_of_its_rival(phase, event):
     following = after(phase, event)
     if phase is Phase.STANDS_DOWN:
         assert (following is phase) == (event is not Event.RIVAL_GONE)

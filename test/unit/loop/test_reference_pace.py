@@ -1,7 +1,5 @@
 """How often y_m leaves, and for which sample, whatever becomes of plant_output."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import pytest
@@ -64,9 +62,7 @@ def test_reference_of_the_next_sample_leaves_half_a_period_after_each_output() -
 
 
 @given(arrival_gaps, st.booleans())
-def test_there_is_never_more_than_a_message_per_period_nor_two_close_together(
-    gaps: list[float], sleeps: bool,
-) -> None:
+def test_there_is_never_more_than_a_message_per_period_nor_two_close_together(gaps, sleeps):
     arrivals, at = [], 0.0
     for gap in gaps:
         at += gap * PERIOD_S

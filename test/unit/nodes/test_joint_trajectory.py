@@ -1,7 +1,5 @@
 """The stand-in for ros2_control's topic hardware: when it commands, and what it takes in."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Which way messages go between nodes of one machine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

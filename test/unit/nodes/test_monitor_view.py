@@ -1,7 +1,5 @@
 """What `monitor` shows of a controller, without ROS and without a terminal."""
 
-from __future__ import annotations
-
 from io import StringIO
 from math import inf, nan
 
@@ -48,9 +46,7 @@ def test_a_bar_ends_at_the_value_and_shades_the_band() -> None:
 @pytest.mark.parametrize(('largest', 'end'), [
     (0.0, 0.0), (1.3, 2.0), (0.95, 2.0), (3.0, 5.0), (0.017, 0.02), (80.0, 100.0), (9.5, 20.0),
 ])
-def test_an_axis_ends_at_a_round_number_beyond_the_largest_value(
-    largest: float, end: float,
-) -> None:
+def test_an_axis_ends_at_a_round_number_beyond_the_largest_value(largest, end):
     assert axis_end(largest) == pytest.approx(end)
 
 

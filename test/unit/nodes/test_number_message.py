@@ -1,7 +1,5 @@
 """Numbers as bytes: the same that the middleware makes of a Float64."""
 
-from __future__ import annotations
-
 import struct
 from math import inf, isnan, nan
 

@@ -1,7 +1,5 @@
 """Who of several publishers of the command was first, and who is gone."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Publishers of a command on this machine, known without the middleware."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import closing
@@ -30,8 +28,6 @@ def test_a_publisher_of_the_same_topic_is_seen_until_it_lets_go(here: Presence) 
 
 
 @pytest.mark.parametrize(('offset', 'topic'), [(1, '/control'), (0, '/x/control')])
-def test_other_domains_and_topics_are_nobodys_business(
-    here: Presence, offset: int, topic: str,
-) -> None:
+def test_other_domains_and_topics_are_nobodys_business(here, offset, topic):
     with closing(Presence(DOMAIN + offset, topic, 'b')) as other:
         assert here.others() == other.others() == frozenset()

@@ -1,7 +1,5 @@
 """Sections of a parameter file that do not reach the node they are meant for."""
 
-from __future__ import annotations
-
 import pytest
 
 from backlash_ros.nodes.runtime.parameters import unused
@@ -13,9 +11,7 @@ from backlash_ros.nodes.runtime.parameters import unused
     (['/plant'], '/left_plant', '/**/left_plant'),
     (['/plnt'], '/plant', '/**/plant'),
 ])
-def test_section_that_does_not_reach_its_node_is_named(
-    sections: list[str], full_name: str, cure: str,
-) -> None:
+def test_section_that_does_not_reach_its_node_is_named(sections, full_name, cure):
     assert list(unused(sections, 'plant', full_name)) == [(sections[-1], cure)]
 
 

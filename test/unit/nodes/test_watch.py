@@ -1,7 +1,5 @@
 """Estimates and signals one by one, for plots: their pace, their cost, their content."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from math import nan
 from typing import Any, cast
@@ -75,9 +73,7 @@ def test_only_what_is_listened_to_is_published() -> None:
 
 
 @pytest.mark.parametrize('rate_hz', [10.0, 50.0, 60.0, 200.0, 1000.0, 5000.0])
-def test_every_topic_keeps_to_the_lesser_of_its_bound_and_the_sampling_rate(
-    rate_hz: float,
-) -> None:
+def test_every_topic_keeps_to_the_lesser_of_its_bound_and_the_sampling_rate(rate_hz):
     watch, publishers = watch_of()
     for publisher in publishers.values():
         publisher.listeners = 1

@@ -1,7 +1,5 @@
 """A position loop in front of the gap: what it makes of a command, and of crossings behind it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -70,8 +68,6 @@ def test_a_command_beyond_its_crossing_moves_y_and_within_does_not() -> None:
     ({'actuator.numerator': ()}, 'actuator.numerator.*at least one number'),
     ({'actuator.numerator': (1.0, 0.0, 0.0)}, 'actuator.numerator.*must be below the degree'),
 ])
-def test_an_actuator_that_is_none_is_refused_by_name(
-    changes: dict[str, object], text: str,
-) -> None:
+def test_an_actuator_that_is_none_is_refused_by_name(changes, text):
     with pytest.raises(ParameterError, match=text):
         build_controller(Parameters({**PARAMETERS, **changes}))

@@ -1,7 +1,5 @@
 """An arm that MuJoCo integrates: what each joint loses is its gap and its wind-up."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

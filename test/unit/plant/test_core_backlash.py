@@ -1,7 +1,5 @@
 """Backlash, equation (2.1)."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from math import inf, nan
 
@@ -30,9 +28,7 @@ def as_printed(u_before: Fraction, v: Fraction, m: Fraction, c_r: Fraction, c_l:
     m=eighths(1, 40), c_l=eighths(-80, 40), gap=eighths(1, 80), u=eighths(-400, 400),
     signal=st.lists(eighths(-160, 160), min_size=1, max_size=40),
 )
-def test_clamp_equals_the_three_printed_cases(
-    m: float, c_l: float, gap: float, u: float, signal: list[float],
-) -> None:
+def test_clamp_equals_the_three_printed_cases(m, c_l, gap, u, signal):
     backlash = Backlash(m, c_l + gap, c_l, u)
     expected = Fraction(u)
     for v in signal:
@@ -57,9 +53,7 @@ def test_clamp_equals_the_three_printed_cases(
         ((1.0, 3.0, -3.0, nan), 'backlash.initial_u'),
     ],
 )
-def test_invalid_backlash_is_refused_and_named(
-    values: tuple[float, float, float, float], name: str,
-) -> None:
+def test_invalid_backlash_is_refused_and_named(values, name):
     with pytest.raises(ParameterError) as refusal:
         Backlash(*values)
     assert refusal.value.name == name

@@ -1,7 +1,5 @@
 """Which G(z) is refused, and which one is warned of."""
 
-from __future__ import annotations
-
 import pytest
 
 from backlash_ros.core.assembly import build_controller, warnings_of
@@ -21,9 +19,7 @@ def plant(numerator: list[float], denominator: list[float], **more: object) -> P
         ([1.0, -1.0], [1.0, -1.5, 0.5], 'cancels the pole 1'),
     ],
 )
-def test_plant_through_which_nothing_can_be_learned_is_refused(
-    numerator: list[float], denominator: list[float], reason: str,
-) -> None:
+def test_plant_through_which_nothing_can_be_learned_is_refused(numerator, denominator, reason):
     with pytest.raises(ParameterError, match=reason):
         build_controller(plant(numerator, denominator))
 

@@ -1,7 +1,5 @@
 """The parameter table and the check of values against it."""
 
-from __future__ import annotations
-
 from math import inf, nan
 
 import pytest
@@ -77,9 +75,7 @@ def test_any_unknown_name_is_refused_with_a_valid_one(name: str) -> None:
 
 
 @named(NUMBERS + LISTS)
-def test_value_beyond_a_bound_is_refused_and_the_bound_itself_unless_excluded(
-    parameter: Parameter,
-) -> None:
+def test_value_beyond_a_bound_is_refused_and_the_bound_itself_unless_excluded(parameter):
     count = len(parameter.default) if isinstance(parameter.default, tuple) else 0
     rules = []
     if parameter.low > -inf:
@@ -96,9 +92,7 @@ def test_value_beyond_a_bound_is_refused_and_the_bound_itself_unless_excluded(
 
 
 @named(NUMBERS)
-def test_what_is_no_finite_number_is_refused_unless_infinity_means_no_limit(
-    parameter: Parameter,
-) -> None:
+def test_what_is_no_finite_number_is_refused_unless_infinity_means_no_limit(parameter):
     for value in (nan, 'nan'):
         assert 'must be finite' in refusal_of(parameter.name, value)
     if parameter.high == inf:
@@ -217,9 +211,7 @@ def test_message_names_parameter_value_rule_and_unit() -> None:
     ],
 )
 @pytest.mark.parametrize('law', ['lms', 'printed'])
-def test_values_that_contradict_each_other_are_refused_before_anything_runs(
-    changes: dict[str, object], name: str, law: str,
-) -> None:
+def test_values_that_contradict_each_other_are_refused_before_anything_runs(changes, name, law):
     with pytest.raises(ParameterError) as refusal:
         build_everything({'estimator.law': law, **changes})
     assert refusal.value.name == name

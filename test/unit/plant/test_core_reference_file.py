@@ -1,7 +1,5 @@
 """y_m from a CSV file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -22,9 +20,7 @@ from backlash_ros.core.reference.file import read_reference_file
         ('t,y_m\n', 'at least one sample'),
     ],
 )
-def test_a_reference_file_is_refused_with_its_line(
-    tmp_path: Path, text: str, complaint: str,
-) -> None:
+def test_a_reference_file_is_refused_with_its_line(tmp_path, text, complaint):
     file = tmp_path / 'reference.csv'
     file.write_text(text)
     parameters = Parameters({'waveform': 'file', 'file': str(file)})

@@ -1,7 +1,5 @@
 """Reference signals y_m(t)."""
 
-from __future__ import annotations
-
 from math import pi, sin
 
 import pytest
@@ -16,9 +14,7 @@ OMEGA = 2.0 * pi  # a period of one second
 
 @given(t=st.floats(0.0, 100.0), amplitude=st.floats(0.0, 10.0), bias=st.floats(-10.0, 10.0),
        waveform=st.sampled_from([w for w in SHAPES if w != 'file']))
-def test_every_waveform_stays_within_amplitude_around_bias(
-    t: float, amplitude: float, bias: float, waveform: str,
-) -> None:
+def test_every_waveform_stays_within_amplitude_around_bias(t, amplitude, bias, waveform):
     y_m = ReferenceSignal(waveform, amplitude, OMEGA, bias)(t)
     assert abs(y_m - bias) <= amplitude + 1e-9
 
@@ -65,9 +61,7 @@ def test_chirp_sweeps_its_frequency_and_starts_again() -> None:
 
 
 @given(k=st.integers(0, 20000), period=st.sampled_from([0.001, 0.01, 0.02, 0.1, 1.0 / 3.0]))
-def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(
-    k: int, period: float,
-) -> None:
+def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(k, period):
     reference = ReferenceSignal(
         'file', sample_period=period, samples=tuple(float(i) for i in range(20001))
     )

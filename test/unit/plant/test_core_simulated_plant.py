@@ -1,12 +1,10 @@
 """The simulated plant: backlash, G(z), sensor (3.1)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import Play, output_of, paper_example, plants, signals, usual_plays
+from strategies import output_of, paper_example, plants, signals, usual_plays
 
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameters.errors import ParameterError
@@ -35,9 +33,7 @@ def outputs(simulated: SimulatedPlant, control: list[float]) -> list[float]:
 
 
 @given(model=plants(), play=usual_plays(), control=signals(), disturbance=st.floats(-5.0, 5.0))
-def test_y_is_g_of_the_backlash_output_plus_the_disturbance(
-    model: TransferFunction, play: Play, control: list[float], disturbance: float,
-) -> None:
+def test_y_is_g_of_the_backlash_output_plus_the_disturbance(model, play, control, disturbance):
     simulated = SimulatedPlant(
         model, Backlash(play.m, play.c_r, play.c_l), 0.01, np.random.default_rng(0),
         Imperfections(input_disturbance=disturbance),

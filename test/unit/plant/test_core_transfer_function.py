@@ -1,7 +1,5 @@
 """G(z) and its state space, against scipy.signal."""
 
-from __future__ import annotations
-
 from math import inf, nan
 
 import numpy as np
@@ -59,9 +57,7 @@ def test_leading_zeros_of_the_numerator_are_delay(numerator: list[float], delay:
         ([1.0], [], 'plant.denominator'),
     ],
 )
-def test_invalid_polynomials_are_refused_and_named(
-    numerator: list[float], denominator: list[float], name: str,
-) -> None:
+def test_invalid_polynomials_are_refused_and_named(numerator, denominator, name):
     with pytest.raises(ParameterError) as refusal:
         TransferFunction(numerator, denominator)
     assert refusal.value.name == name

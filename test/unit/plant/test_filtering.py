@@ -1,7 +1,5 @@
 """The filter of this package against that of SciPy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter as scipy_lfilter

@@ -1,7 +1,5 @@
 """The emulated bus: byte for byte what the protocol's description prints, and what its SDK asks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -56,9 +54,7 @@ def bus(clock: Clock) -> EmulatedBus:
      'FF FF FD 00 01 08 00 55 00 A6 00 00 00 8C C0'
      'FF FF FD 00 02 08 00 55 00 1F 08 00 00 BA BE'),
 ])
-def test_the_printed_packets_are_answered_byte_for_byte(
-    bus: EmulatedBus, monkeypatch: pytest.MonkeyPatch, asked: str, answered: str,
-) -> None:
+def test_the_printed_packets_are_answered_byte_for_byte(bus, monkeypatch, asked, answered):
     monkeypatch.setattr('servo_bus.MODEL', 0x0406)
     monkeypatch.setattr('servo_bus.FIRMWARE', 0x26)
     monkeypatch.setattr(bus, '_measure', lambda: None)
@@ -91,9 +87,7 @@ def port(bus: EmulatedBus, tmp_path: Path) -> Iterator[PatientPort]:
     line.close()
 
 
-def test_the_sdk_moves_the_arm_through_the_terminal(
-    bus: EmulatedBus, clock: Clock, port: PatientPort,
-) -> None:
+def test_the_sdk_moves_the_arm_through_the_terminal(bus, clock, port):
     packets, ids = PacketHandler(2.0), list(bus.servos)
     assert packets.ping(port, 3)[:2] == (MODEL, COMM_SUCCESS)
     goals = [CENTRE + 20 * one for one in ids]

@@ -1,7 +1,5 @@
 """The G(z) of a simulated plant that differs from the known one."""
 
-from __future__ import annotations
-
 from math import pi
 
 import numpy as np
@@ -58,9 +56,7 @@ def test_scaled_damping_is_the_motor_with_that_damping(damping: float) -> None:
 
 
 @given(plants(), st.sampled_from([2, 3]))
-def test_plant_with_scaled_frequency_takes_the_same_way_faster(
-    model: TransferFunction, factor: int,
-) -> None:
+def test_plant_with_scaled_frequency_takes_the_same_way_faster(model, factor):
     assume(continuous(model))
     altered = altered_plant(model, Alteration(frequency=factor))
     way, faster = step_response(model, 60 * factor)[::factor], step_response(altered, 60)
@@ -71,9 +67,7 @@ def test_plant_with_scaled_frequency_takes_the_same_way_faster(
 
 
 @given(plants(), st.integers(0, 2), st.integers(1, 3))
-def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(
-    model: TransferFunction, whole: int, quarters: int,
-) -> None:
+def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(model, whole, quarters):
     assume(continuous(model))
     lagging = step_response(altered_plant(model, Alteration(lag=whole + 0.25 * quarters)), 60)
     # A quarter of the frequency shows the response between the samples as well.

@@ -1,7 +1,5 @@
 """What a script without ROS may import from the core."""
 
-from __future__ import annotations
-
 import inspect
 
 import pytest

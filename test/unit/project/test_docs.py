@@ -1,7 +1,5 @@
 """The documents: links lead somewhere, what they name exists, what is made is current."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

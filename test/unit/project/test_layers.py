@@ -1,7 +1,5 @@
 """Layers: core <- bags <- nodes, bags <- tools; ROS in nodes only; the rooms of the core."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The shipped layouts of PlotJuggler and Foxglove hang together."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest
@@ -32,9 +30,7 @@ def panels_in(tree: object) -> Iterator[str]:
     {parts(PLOTJUGGLER_PATH, path) for path in curves()},
     {parts(FOXGLOVE_PATH, path) for path in foxglove_paths()},
 ], ids=['plotjuggler', 'foxglove'])
-def test_a_layout_shows_estimates_with_bands_signals_loop_status_and_latency(
-    paths: set[tuple[str, str, int]],
-) -> None:
+def test_a_layout_shows_estimates_with_bands_signals_loop_status_and_latency(paths):
     labels = {'y_m', 'y', 'u_d', 'v', 'status', 'latency_s', 'innovation', 'gap'}
     labels |= {f'{name}{end}' for name in ('m', 'c_r', 'c_l') for end in ('', '_low', '_high')}
     of_the_loop = {topics.SIGNAL_LABELS.index('v'), topics.SIGNAL_LABELS.index('u_hat')}

@@ -1,7 +1,5 @@
 """package.xml, setup.py and the launch file name the same things as the code."""
 
-from __future__ import annotations
-
 import ast
 import re
 import xml.etree.ElementTree as ElementTree

@@ -1,7 +1,5 @@
 """Bags: topics of the package, joint states with commands to joints, stamps that are none."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

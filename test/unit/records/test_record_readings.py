@@ -1,7 +1,5 @@
 """Readings that are none: repeated ones, failed ones, angles that begin anew; and what looks so."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

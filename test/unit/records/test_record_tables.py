@@ -1,7 +1,5 @@
 """Tables as people have them: separators, heads, names of columns, dates, Parquet."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -94,15 +92,20 @@ def test_what_was_not_read_is_lost(tmp_path: Path, word: str) -> None:
     assert record.v[40] == V[39]
 
 
+def test_columns_without_names_go_by_their_number(tmp_path: Path) -> None:
+    path = written(tmp_path / 'a.csv', rows())
+    with pytest.raises(InputError, match='columns are 1, 2, 3; name them'):
+        read_record(path)
+    assert read_record(path, columns={'t': '1', 'v': '2', 'y': '3'}).y.tolist() == Y.tolist()
+
+
 @pytest.mark.parametrize(('names', 'said'), [
     (('time', 'target pos (5)', 'pos (5)', 'target pos (3)', 'pos (3)'), 'several columns may be'),
     (('t', 'voltage', 'y'), 'no column is v'), (('t', 'v', 'speed'), 'no column is y'),
     (('t', 'time', 'v', 'y'), ''), (('time', 'stamp', 'v', 'y'), 'several columns may be t'),
     (('t', 'command', 'cmd', 'y'), 'several columns may be v'),
 ])
-def test_names_that_may_mean_several_columns_are_asked_for(
-    names: tuple[str, ...], said: str,
-) -> None:
+def test_names_that_may_mean_several_columns_are_asked_for(names, said):
     if not said:
         assert choose_columns(names, {}, 'a')[:3] == ('t', 'v', 'y')
         return
@@ -166,9 +169,7 @@ def test_any_file_is_read_or_refused(tmp_path: Path, content: bytes | str) -> No
     assert record.v.shape == record.y.shape
 
 
-def test_parquet_is_read_where_pyarrow_is_installed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_parquet_is_read_where_pyarrow_is_installed(tmp_path, monkeypatch):
     pyarrow = pytest.importorskip('pyarrow')
     from pyarrow import parquet
     stamps = (1_700_000_000_000_000_000 + np.round(T * 1e9)).astype('datetime64[ns]')

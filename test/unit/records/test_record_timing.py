@@ -1,7 +1,5 @@
 """Rows with stamps of every kind: what comes out is v and y at the instants that were meant."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,15 +9,6 @@ from numpy.typing import NDArray
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import record_of
 from backlash_ros.core.records.timing import averaged
-
-
-def shuffled(t: Array) -> Array:
-    """A few neighbours swapped."""
-    order = np.arange(len(t))
-    for k in (100, 300, 500):
-        order[[k, k + 1]] = order[[k + 1, k]]
-    return order
-
 
 Array = NDArray[np.float64]
 PERIOD_S = 0.01
@@ -122,6 +111,14 @@ def test_without_a_time_rows_are_counted_with_the_period_alone(stamps: Array | N
     with pytest.raises(RecordError, match='give --period S'):
         record_of(stamps, v, y)
     assert record_of(stamps, v, y, PERIOD_S).v.tolist() == v.tolist()
+
+
+def shuffled(t: Array) -> Array:
+    """A few neighbours swapped."""
+    order = np.arange(len(t))
+    for k in (100, 300, 500):
+        order[[k, k + 1]] = order[[k + 1, k]]
+    return order
 
 
 def test_rows_in_any_order_are_sorted() -> None:

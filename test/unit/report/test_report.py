@@ -1,7 +1,5 @@
 """`report`: what a page holds, from simulations, bags and saved files."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -81,9 +79,7 @@ def test_summary_of_a_bag_tells_the_newest_model(run: RunRecord, tmp_path: Path)
 
 
 @pytest.mark.parametrize('models', [{}, {5: believed([1.0, -0.5], tail=1)}])
-def test_bag_without_a_whole_model_is_read_all_the_same(
-    run: RunRecord, tmp_path: Path, models: dict[int, bytes],
-) -> None:
+def test_bag_without_a_whole_model_is_read_all_the_same(run, tmp_path, models):
     found = read_bag(write_bag(tmp_path / 'bag', run, models=models), run.sample_period).record
     assert found.samples == run.samples
     assert found.learned is None
@@ -121,10 +117,7 @@ def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path)
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_report_without_truth_shows_estimates_and_innovation(
-    run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_report_without_truth_shows_estimates_and_innovation(run, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write_bag(tmp_path / 'bag', run, truth=False)
     assert report.main(['bag']) == 0

@@ -1,7 +1,5 @@
 """Figures of `report`: nothing covers anything else, and no curve hides another."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from math import nan

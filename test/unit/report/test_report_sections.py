@@ -1,7 +1,5 @@
 """`report` of bags with more than one run: restarts, several axes, two controllers, a span."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,9 +90,7 @@ def test_bag_of_a_restart_gives_a_report_of_what_came_last_and_says_so(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_from_and_to_choose_the_other_part(
-    tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_from_and_to_choose_the_other_part(tmp_path, first, second, capsys):
     bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=1.5, first=40))
     assert same(read_bag(bag, span=Span(to_s=1.5)).record, first)
     part = read_bag(bag, span=Span(0.2, 0.7)).record
@@ -115,9 +111,7 @@ def test_saved_results_are_cut_likewise(tmp_path: Path, first: RunRecord) -> Non
     assert part.column('t')[0] == 0.0
 
 
-def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(
-    tmp_path: Path, first: RunRecord,
-) -> None:
+def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(tmp_path, first):
     bag = write_pieces(
         tmp_path / 'bag', Piece(first, first=179_536_708_930, truth_first=17)
     )
@@ -126,9 +120,7 @@ def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_bag_of_two_axes_gives_a_report_of_either(
-    tmp_path: Path, first: RunRecord, second: RunRecord, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_bag_of_two_axes_gives_a_report_of_either(tmp_path, first, second, capsys):
     bag = write_pieces(
         tmp_path / 'bag', Piece(first, namespace='pan/'), Piece(second, namespace='tilt/')
     )
@@ -139,9 +131,7 @@ def test_bag_of_two_axes_gives_a_report_of_either(
     assert 'holds no controller/signals of axis roll' in capsys.readouterr().err
 
 
-def test_bag_of_two_controllers_at_once_gives_a_report(
-    tmp_path: Path, first: RunRecord, second: RunRecord,
-) -> None:
+def test_bag_of_two_controllers_at_once_gives_a_report(tmp_path, first, second):
     bag = write_pieces(tmp_path / 'bag', Piece(first), Piece(second, begin_s=0.002, first=3))
     found = read_bag(bag)
     assert 'two controllers published at once' in found.notes[-1]

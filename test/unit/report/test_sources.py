@@ -1,7 +1,5 @@
 """Whatever holds a run is read: bags of any storage and compression, lone files of them."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -24,9 +22,7 @@ def run() -> RunRecord:
 
 
 @pytest.mark.parametrize('storage', StoragePlugin)
-def test_a_lone_file_of_a_bag_is_a_bag(
-    tmp_path: Path, run: RunRecord, storage: StoragePlugin,
-) -> None:
+def test_a_lone_file_of_a_bag_is_a_bag(tmp_path, run, storage):
     bag = write_bag(tmp_path / 'bag', run, storage)
     (file,) = (file for file in bag.iterdir() if file.suffix in ('.mcap', '.db3'))
     lone = Path(shutil.copy(file, tmp_path / f'sent{file.suffix}'))

@@ -1,7 +1,5 @@
 """Figures of merit, on runs whose figures are known."""
 
-from __future__ import annotations
-
 from math import exp, nan
 
 import numpy as np

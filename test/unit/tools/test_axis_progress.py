@@ -1,7 +1,5 @@
 """How long bringup waits for the samples of an axis, and what it says of those that do not come."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 
@@ -31,9 +29,7 @@ def let_pass(axis: AxisProgress, seconds: float) -> None:
     axis.moved -= seconds
 
 
-def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(
-    tmp_path: Path,
-) -> None:
+def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(tmp_path):
     axis, _ = begun(tmp_path, 'some command')
     axis.take({'sample': 5000})
     assert not axis.complete
@@ -41,9 +37,7 @@ def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(
     assert axis.complete
 
 
-def test_a_plant_is_complete_once_it_says_so_and_what_is_unheard_is_counted(
-    tmp_path: Path,
-) -> None:
+def test_a_plant_is_complete_once_it_says_so_and_what_is_unheard_is_counted(tmp_path):
     axis, _ = begun(tmp_path)
     axis.take({'sample': 41, 'received': {'plant_output': 42}})
     assert not axis.complete
@@ -88,9 +82,7 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
         axis.check_pace()
 
 
-def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts_it(
-    tmp_path: Path,
-) -> None:
+def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts_it(tmp_path):
     for driver in ('some command', 'none'):
         axis, _ = begun(tmp_path, driver)
         let_pass(axis, FIRST_SAMPLE_DEADLINE_S - 1.0)

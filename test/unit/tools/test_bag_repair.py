@@ -1,7 +1,5 @@
 """Bags that lost their writer or their end: nothing that was flushed is lost by the repair."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import tempfile
@@ -127,9 +125,7 @@ def ends_of_records(data: bytes) -> list[int]:
     return [*ends, len(data)]
 
 
-def test_mcap_cut_at_any_record_keeps_every_block_before_it(
-    finished: dict[str, Finished],
-) -> None:
+def test_mcap_cut_at_any_record_keeps_every_block_before_it(finished):
     whole = finished['mcap']
     ends = ends_of_records(whole.data)
     assert len(ends) > 2 * len(whole.flushed)
@@ -145,9 +141,7 @@ def test_mcap_cut_at_any_record_keeps_every_block_before_it(
 
 @settings(max_examples=20)
 @given(st.data())
-def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_error(
-    finished: dict[str, Finished], data: st.DataObject,
-) -> None:
+def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_error(finished, data):
     whole = finished[data.draw(st.sampled_from(sorted(STORAGE)))]
     changed = bytearray(whole.data)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -159,17 +153,13 @@ def test_garbage_in_a_file_never_stops_the_repair_with_anything_but_its_own_erro
         assert (damage(bag) == '') == complete
 
 
-def test_sqlite_that_lost_its_end_gives_the_messages_before_it(
-    finished: dict[str, Finished],
-) -> None:
+def test_sqlite_that_lost_its_end_gives_the_messages_before_it(finished):
     whole = finished['sqlite3']
     with whole.with_file(whole.data[:-2 * PAGE], metadata=True) as bag:
         assert MESSAGES // 2 < len(repaired_numbers(bag)) < MESSAGES
 
 
-def test_files_of_a_split_bag_and_lone_files_are_read_in_their_order(
-    tmp_path: Path, finished: dict[str, Finished],
-) -> None:
+def test_files_of_a_split_bag_and_lone_files_are_read_in_their_order(tmp_path, finished):
     whole = finished['mcap']
     for number in (10, 9):
         shutil.copy(message_file(whole.bag), tmp_path / f'bag_{number}.mcap')
@@ -204,9 +194,7 @@ class OtherStorage:
 
 
 @pytest.mark.parametrize('storage', STORAGE)
-def test_rosbags_made_otherwise_still_records(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, storage: str,
-) -> None:
+def test_rosbags_made_otherwise_still_records(tmp_path, monkeypatch, storage):
     monkeypatch.setattr(Writer, 'STORAGE_PLUGINS', {STORAGE[storage]: OtherStorage})
     bag = Bag(str(tmp_path / 'bag'), storage)
     assert not bag.survives_a_crash
@@ -253,9 +241,7 @@ def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
     assert contents(tmp_path) == before
 
 
-def test_second_repair_keeps_both_originals(
-    tmp_path: Path, finished: dict[str, Finished],
-) -> None:
+def test_second_repair_keeps_both_originals(tmp_path, finished):
     bag = tmp_path / finished['mcap'].bag.name
     shutil.copytree(finished['mcap'].bag, bag)
     originals = []

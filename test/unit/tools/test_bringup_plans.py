@@ -1,7 +1,5 @@
 """What bringup makes of its arguments: plans, environments, lines of progress, or one complaint."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import socket
@@ -77,9 +75,7 @@ def test_bad_input_is_refused_in_one_line_before_anything_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_folder_that_holds_a_bag_is_not_written_over(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_folder_that_holds_a_bag_is_not_written_over(tmp_path, capsys):
     (tmp_path / 'bag').mkdir()
     assert bringup.main(['--out', str(tmp_path)]) == 2
     assert 'holds a bag already' in capsys.readouterr().err
@@ -97,9 +93,7 @@ def test_two_runs_get_two_domains_and_none_that_somebody_uses() -> None:
                 assert third not in (first, second)
 
 
-def test_what_the_user_has_set_reaches_the_nodes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'SUBNET')
     monkeypatch.setenv('ROS_DOMAIN_ID', '7')
     environment = child_environment(tmp_path, None)

@@ -1,7 +1,5 @@
 """`simulate --cluster` without what it needs: one line that names the cure."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest
@@ -16,9 +14,7 @@ RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
 @pytest.mark.parametrize(('address', 'cure'), [
     (f'tcp://{HERE}:1', 'dask scheduler'), ('nonsense://x', 'dask scheduler'),
 ])
-def test_missing_scheduler_is_told_in_one_line(
-    address: str, cure: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_missing_scheduler_is_told_in_one_line(address, cure, monkeypatch, capsys):
     pytest.importorskip('distributed')
     monkeypatch.setattr(tools_cluster, 'CLUSTER_ANSWER_S', 0.3)
     assert main([*RUNS, '--cluster', address]) == 2
@@ -28,9 +24,7 @@ def test_missing_scheduler_is_told_in_one_line(
     assert cure in said
 
 
-def test_missing_dask_is_told_with_the_cure(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_missing_dask_is_told_with_the_cure(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'distributed', None)
     assert main([*RUNS, '--cluster', 'tcp://x:1']) == 2
     said = capsys.readouterr().err

@@ -1,7 +1,5 @@
 """Parameter files and settings: what is accepted, how mistakes are answered."""
 
-from __future__ import annotations
-
 from math import inf
 from pathlib import Path
 
@@ -65,9 +63,7 @@ def test_of_an_arm_one_joint_is_chosen(config: Path) -> None:
         effective_parameters(config, axis='waist')
 
 
-def test_values_of_joints_are_written_back_and_may_stand_apart_from_their_list(
-    config: Path, tmp_path: Path,
-) -> None:
+def test_values_of_joints_are_written_back_and_may_stand_apart_from_their_list(config, tmp_path):
     written(config, """/**: {ros__parameters: {joints: [waist, wrist], sample_period: 0.02}}
 /controller: {ros__parameters: {waist: {plant: {denominator: [1, -0.5], numerator: [0.5]}}}}""")
     configuration = read_configuration(config, ['waist/control.max=3'])
@@ -153,9 +149,7 @@ def test_section_of_a_node_is_accepted(config: Path, section: str) -> None:
         ('/plant: {ros__parameters: {driver: none}}', 'put it under /** or /bringup'),
     ],
 )
-def test_mistake_in_a_file_is_one_line_that_names_the_file(
-    config: Path, text: str, message: str,
-) -> None:
+def test_mistake_in_a_file_is_one_line_that_names_the_file(config, text, message):
     written(config, text)
     with pytest.raises((InputError, ParameterError)) as caught:
         load_config(config)
@@ -229,9 +223,7 @@ AXES = '/bringup: {ros__parameters: {axes: [x, y]}}\n'
     ['/x/plant', '/**/plant', '/x/**', '/**'],
     ['/**', '/x/**', '/**/plant', '/x/plant'],
 ])
-def test_named_node_goes_before_named_axis_and_that_before_all(
-    config: Path, sections: list[str],
-) -> None:
+def test_named_node_goes_before_named_axis_and_that_before_all(config, sections):
     values = {'/x/plant': 4, '/**/plant': 3, '/x/**': 2, '/**': 1}
     text = AXES
     left = list(sections)
@@ -259,9 +251,7 @@ def test_setting_of_an_axis_goes_before_one_for_all_in_any_order(config: Path) -
         ('/xx/**', "there is no axis 'xx' among x, y: did you mean x?"),
     ],
 )
-def test_section_that_no_axis_would_read_is_refused(
-    config: Path, section: str, message: str,
-) -> None:
+def test_section_that_no_axis_would_read_is_refused(config, section, message):
     written(config, AXES + f'{section}: {{ros__parameters: {{seed: 1}}}}')
     with pytest.raises(InputError) as caught:
         read_configuration(config)

@@ -1,7 +1,5 @@
 """Files that version 0.2.0 has written: half a second of the paper's example, in lockstep."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

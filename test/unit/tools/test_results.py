@@ -1,7 +1,5 @@
 """Files of a run: complete, exact, and strict JSON."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace
@@ -140,9 +138,7 @@ def test_run_without_samples_is_refused() -> None:
         summarise(RunRecord(np.empty((0, len(COLUMNS))), 0.01), None)
 
 
-def test_latest_points_at_the_newest_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folders = [results.result_directory(None) for _ in range(3)]
     assert len(set(folders)) == 3

@@ -1,7 +1,5 @@
 """What the ideal trajectory of the tracking structure promises of y, without any backlash."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -44,9 +42,7 @@ def gain_at_rest(model: StateModel, gains: PreviewGains) -> float:
     model=plants(), weight=st.floats(1e-4, 100.0), window=st.integers(0, 80),
     integral_weight=st.sampled_from([0.0, 1e-4, 1e-2]),
 )
-def test_the_trajectory_comes_to_rest_at_the_reference(
-    model: TransferFunction, weight: float, window: int, integral_weight: float,
-) -> None:
+def test_the_trajectory_comes_to_rest_at_the_reference(model, weight, window, integral_weight):
     state = StateModel(model)
     gains = gains_of(state, weight, integral_weight, window)
     assert gain_at_rest(state, gains) == pytest.approx(1.0, abs=1e-6)
@@ -54,9 +50,7 @@ def test_the_trajectory_comes_to_rest_at_the_reference(
 
 @pytest.mark.parametrize('weight', [1e-2, 1e2])
 @pytest.mark.parametrize('model', [STATIC, LAGGING, DELAYED], ids=['static', 'lagging', 'delayed'])
-def test_slow_motion_is_followed_without_lag_or_loss_whatever_u_weighs(
-    model: TransferFunction, weight: float,
-) -> None:
+def test_slow_motion_is_followed_without_lag_or_loss_whatever_u_weighs(model, weight):
     state, samples, slow = StateModel(model), 3000, 2.0 * np.pi / 400.0
     gains = gains_of(state, weight)
     r = np.sin(slow * np.arange(samples + len(gains.preview)))

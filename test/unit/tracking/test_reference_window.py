@@ -1,7 +1,5 @@
 """The references that the tracking structure looks at, and what is kept of the past."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np
@@ -16,9 +14,7 @@ from backlash_ros.core.control.tracking.reference_window import ReferenceWindow,
     preview=st.integers(0, 5), history=st.integers(0, 7),
     values=st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=80),
 )
-def test_window_and_past_are_the_last_values_in_order(
-    preview: int, history: int, values: list[float],
-) -> None:
+def test_window_and_past_are_the_last_values_in_order(preview, history, values):
     window = ReferenceWindow(preview, history, np.ones(len(averages(preview))))
     assert window.empty
     window.fill(7.0)
