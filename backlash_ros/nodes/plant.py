@@ -28,6 +28,7 @@ from backlash_ros.nodes.runtime.messages import (
     LabelledArrayPublisher,
     arrival_ns,
     clock_message,
+    message_with,
 )
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run, spin_paced
@@ -36,6 +37,48 @@ from backlash_ros.nodes.runtime.process import ProcessNode, emit, run, spin_pace
 LATEST_SHARE = 0.75
 LATE_CONTROLS, MISSED_OUTPUTS = 'late controls', 'missed outputs'
 BAD_CONTROLS = 'non-finite controls dropped'
+
+
+class PlantTopics:
+    """What the plant publishes. truth_rows: those that wait until y has left.
+
+    outputs: how many have left. newest: sample of the newest of these.
+    """
+
+    def __init__(self, node: ProcessNode) -> None:
+        self.applied = node.create_publisher(Float64, topics.APPLIED_CONTROL, DEPTH)
+        self._output = node.create_publisher(Float64, topics.PLANT_OUTPUT, DEPTH)
+        self._truth = LabelledArrayPublisher(
+            node, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
+        )
+        self._time = (
+            node.create_publisher(Clock, topics.CLOCK, KEPT_QOS) if node.settings.lockstep else None
+        )
+        self.truth_rows: list[tuple[float, ...]] = []
+        self.outputs, self.newest = 0, -1
+
+    def has_listeners(self, wanted: int) -> bool:
+        """Whether so many listen to y; one of several is a recorder, which wants everything."""
+        recorders = int(wanted > 1)
+        return self._truth.listeners >= recorders \
+            and self.applied.get_subscription_count() >= recorders \
+            and self._output.get_subscription_count() >= wanted
+
+    def tick(self, now_ns: int) -> None:
+        """Tell the simulated time, in lockstep."""
+        assert self._time is not None
+        self._time.publish(clock_message(now_ns))
+
+    def publish_output(self, y: float, sample: int) -> None:
+        """Publish y of a sample."""
+        self._output.publish(message_with(y))
+        self.outputs, self.newest = self.outputs + 1, sample
+
+    def publish_truth(self) -> None:
+        """Publish the rows that wait."""
+        for row in self.truth_rows:
+            self._truth.publish(row)
+        self.truth_rows.clear()
 
 
 class PlantNode(ProcessNode):
@@ -54,9 +97,6 @@ class PlantNode(ProcessNode):
         super().__init__(PLANT)
         p = self.settings
         self._plant = build_plant(p)
-        self._sample_period = p.sample_period
-        self._lockstep = p.lockstep
-        self._samples = p.samples
         # The same draws as in a simulation in one process, so that runs agree to the last bit.
         self._loss_rng = np.random.default_rng([p.seed, 1])
         self._started = False
@@ -65,40 +105,32 @@ class PlantNode(ProcessNode):
         self._expecting = False  # no v has come since the newest output
         self._tick = 0
         self._latest_ns = 0
-        self._outputs = 0  # published
-        self._newest = 0  # samples up to the newest of these outputs
         self._counts = {LATE_CONTROLS: 0, MISSED_OUTPUTS: 0, BAD_CONTROLS: 0}
         self._lately = Lately()
-        self._truth_rows: list[tuple[float, ...]] = []
-        self._output_message, self._applied_message = Float64(), Float64()
-        self._applied = self.create_publisher(Float64, topics.APPLIED_CONTROL, DEPTH)
-        self._output = self.create_publisher(Float64, topics.PLANT_OUTPUT, DEPTH)
-        self._truth = LabelledArrayPublisher(
-            self, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
-        )
+        self._published = PlantTopics(self)
         self._diagnostics = DiagnosticsPublisher(self, 'simulated plant')
-        if self._lockstep:
-            self._time = self.create_publisher(Clock, topics.CLOCK, KEPT_QOS)
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
         let_parameters_change(self, build_plant, self._take_up)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         name, outputs = self.resolve_topic_name, topics.PLANT_OUTPUT
+        wanted = p.wait_for_subscribers
         self.log.info(
             f'started: {name(topics.CONTROL)} in, {name(outputs)} out, '
-            f'sample_period {self._sample_period:g} s ({1.0 / self._sample_period:.4g} Hz)'
-            + (f'; waits for {wanted} subscribers of {outputs}' if (
-                wanted := p.wait_for_subscribers) else '')
+            f'sample_period {p.sample_period:g} s ({1.0 / p.sample_period:.4g} Hz)'
+            + (f'; waits for {wanted} subscribers of {outputs}' if wanted else '')
         )
         self.call_when(
-            self._has_listeners, self._start, f'subscribers of {topics.PLANT_OUTPUT}'
+            lambda: self._published.has_listeners(max(wanted, int(p.lockstep))), self._start,
+            f'subscribers of {outputs}',
         )
 
     def work(self, executor: NodeExecutor) -> None:
         while not (self._started or self.stopping):
             executor.spin_once()
-        if not self._lockstep:
+        if not self.settings.lockstep:
             spin_paced(
-                self, executor, self._sample_period, self._on_tick, lambda: not self._expecting
+                self, executor, self.settings.sample_period, self._on_tick,
+                lambda: not self._expecting,
             )
         super().work(executor)
 
@@ -113,18 +145,10 @@ class PlantNode(ProcessNode):
         plant.go_on_from(self._plant)
         self._plant = plant
 
-    def _has_listeners(self) -> bool:
-        wanted = self.settings.wait_for_subscribers
-        # One of several is a recorder, which wants to hear everything.
-        recorders = int(wanted > 1)
-        if self._truth.listeners < recorders or self._applied.get_subscription_count() < recorders:
-            return False
-        return self._output.get_subscription_count() >= max(wanted, int(self._lockstep))
-
     def _start(self) -> None:
         self._started = True
         emit('ready')
-        if self._lockstep:
+        if self.settings.lockstep:
             self._offer()
 
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
@@ -136,7 +160,7 @@ class PlantNode(ProcessNode):
         self._heard = True
         if self._expecting:
             self._expecting = False
-            if self._lockstep:
+            if self.settings.lockstep:
                 self._advance(v)
                 self._offer()
 
@@ -144,7 +168,7 @@ class PlantNode(ProcessNode):
         """Lockstep: go on to the next output that is not lost on purpose."""
         while not self._complete and not self._publish_output():
             self._advance(self._held.newest)
-        self._publish_truth()
+        self._published.publish_truth()
         self._report_completion()
 
     def _on_tick(self, tick: int, due_ns: int) -> bool:
@@ -154,15 +178,16 @@ class PlantNode(ProcessNode):
             self._counts[LATE_CONTROLS] += 1
         self._counts[MISSED_OUTPUTS] += max(passed - 1, 0)
         self._tick = tick
-        self._latest_ns = due_ns + int(LATEST_SHARE * self._sample_period * 1e9)
+        period_ns = self.settings.sample_period * 1e9
+        self._latest_ns = due_ns + int(LATEST_SHARE * period_ns)
         # Of the intervals that ended while the process was held up, some were over before v came.
         for missed in reversed(range(passed)):
             # All that has come so far came within the newest interval.
-            over_ns = due_ns - missed * self._sample_period * 1e9 if missed else inf
+            over_ns = due_ns - missed * period_ns if missed else inf
             self._advance(self._held.over(over_ns))
         if not self._complete:
             self._publish_output()
-        self._publish_truth()
+        self._published.publish_truth()
         self._report_completion()
         return not self._complete
 
@@ -173,41 +198,34 @@ class PlantNode(ProcessNode):
         sample = self._plant.sample
         u = self._plant.step(v)
         truth = self._plant.backlash
-        self._truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        self._applied_message.data = self._plant.applied
-        self._applied.publish(self._applied_message)
+        self._published.truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
+        self._published.applied.publish(message_with(self._plant.applied))
 
     def _publish_output(self) -> bool:
         """Measure y and publish it unless it is lost on purpose."""
         sample = self._plant.sample
-        self._output_message.data = self._plant.measure()
+        y = self._plant.measure()
         loss = self.settings.output_loss
         if sample > 0 and loss > 0.0 and float(self._loss_rng.random()) < loss:
             return False
-        if self._lockstep:
-            self._time.publish(clock_message(round(sample * self._sample_period * 1e9)))
+        if self.settings.lockstep:
+            self._published.tick(round(sample * self.settings.sample_period * 1e9))
         elif time.monotonic_ns() > self._latest_ns:
             self._counts[MISSED_OUTPUTS] += 1
             return False
         self._expecting = True
-        self._output.publish(self._output_message)
-        self._outputs, self._newest = self._outputs + 1, sample + 1
+        self._published.publish_output(y, sample)
         return True
-
-    def _publish_truth(self) -> None:
-        for row in self._truth_rows:
-            self._truth.publish(row)
-        self._truth_rows.clear()
 
     @property
     def _complete(self) -> bool:
-        return 0 < self._samples <= self._plant.sample
+        return 0 < self.settings.samples <= self._plant.sample
 
     def _report_completion(self) -> None:
         if self._complete:
             # What a recorder can have heard.
             emit('done', published={
-                'samples': self._newest, topics.PLANT_OUTPUT: self._outputs,
+                'samples': self._published.newest + 1, topics.PLANT_OUTPUT: self._published.outputs,
                 topics.APPLIED_CONTROL: self._plant.sample, topics.TRUTH: self._plant.sample,
             })
 

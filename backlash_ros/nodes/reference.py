@@ -18,7 +18,13 @@ from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.runtime.driver_io import DriverIo
 from backlash_ros.nodes.runtime.executor import Inbox, NodeExecutor
-from backlash_ros.nodes.runtime.messages import DEPTH, KEPT_QOS, arrival_ns, stamp_ns_of
+from backlash_ros.nodes.runtime.messages import (
+    DEPTH,
+    KEPT_QOS,
+    arrival_ns,
+    message_with,
+    stamp_ns_of,
+)
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
@@ -42,15 +48,13 @@ class ReferenceNode(ProcessNode):
         self._offset_s = 0.0  # keeps the phase where the frequency changes
         self._newest = 0  # sample that was published last
         self._sample_period = p.sample_period
-        self._lockstep = p.lockstep
         self._started = False
         self._io = DriverIo(self, p)
         self._counter = SampleCounter(self._sample_period)
         self._diagnostics: Inbox | None = None  # while no output was heard
         self._loop_runs_at: float | None = None  # when that was seen [s]
-        self._message = Float64()
         self._output = self.create_publisher(
-            Float64, topics.REFERENCE, KEPT_QOS if self._lockstep else DEPTH
+            Float64, topics.REFERENCE, KEPT_QOS if self.settings.lockstep else DEPTH
         )
         listeners = p.wait_for_subscribers
         self._pace = ReferencePace(
@@ -72,7 +76,7 @@ class ReferenceNode(ProcessNode):
     def work(self, executor: NodeExecutor) -> None:
         while not (self._started or self.stopping):
             executor.spin_once()
-        if self._lockstep:
+        if self.settings.lockstep:
             super().work(executor)
         else:
             self._follow(executor)
@@ -142,7 +146,7 @@ class ReferenceNode(ProcessNode):
 
     def _start(self) -> None:
         self._started = True
-        if self._lockstep:
+        if self.settings.lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         else:
             self._io.listen(self._on_output, depth=1)
@@ -162,8 +166,8 @@ class ReferenceNode(ProcessNode):
     def _publish(self, sample: int) -> None:
         # The same product as in a simulation in one process, so that runs agree to the last bit.
         self._newest = sample
-        self._message.data = self._signal(sample * self._sample_period + self._offset_s)
-        self._output.publish(self._message)
+        y_m = self._signal(sample * self._sample_period + self._offset_s)
+        self._output.publish(message_with(y_m))
 
 
 def main(args: list[str] | None = None) -> int:

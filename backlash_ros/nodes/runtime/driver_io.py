@@ -88,7 +88,6 @@ class DriverIo:
         self.stamps = HeaderStamps()
         self._node, self._p = node, p
         self.topics = driver_topics(p)
-        self.joint_names = p.joint_names
         self._joint_of = {joint or p.io.joint: joint for joint in p.joint_names}
         # On simulated time the stamps of the middleware, which are real time, say nothing.
         self.simulated_time = bool(node.get_parameter('use_sim_time').value)
@@ -96,6 +95,11 @@ class DriverIo:
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointState()  # the newest message of references
         self._reports: Reports | None = None
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints of the node, in the order of their commands in an array."""
+        return self._p.joint_names
 
     @property
     def publisher(self) -> Publisher:

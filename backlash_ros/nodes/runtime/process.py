@@ -136,6 +136,7 @@ class ProcessNode(ParameterNode):
         reconfigurable: whether parameters may change while the node is unconfigured.
         """
         super().__init__(executable)
+        self.begun_at = time.monotonic()  # from here on the node finds others and is found
         self.log = Node.get_logger(self)
         self.settings = declare_parameters(
             self, parameters_of or executable, reconfigurable
