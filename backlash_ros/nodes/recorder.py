@@ -65,7 +65,7 @@ class Channel:
 
 
 class Progress:
-    """The newest rows, still serialised, and what they say about the run."""
+    """The newest rows, still serialised, and what they say of the run (of its first joint)."""
 
     def __init__(self) -> None:
         self._estimates = b''

@@ -31,6 +31,13 @@ LISTED = Path('/proc/net/unix')
 class Presence:
     """Makes a publisher of a topic known to all of this machine until it is closed.
 
+    Discovery takes as long as it takes: a tenth of a second, or several where a message of it is
+    lost or a processor is busy. Every controller therefore holds a Unix socket in the abstract
+    namespace of Linux, whose name tells the domain, the topic and the identity of its publisher.
+    The kernel lists these names, and takes a name back with its process, however that ends.
+    Processes in containers see each other if they share the network; other systems than Linux list
+    nobody.
+
     domain: ROS_DOMAIN_ID. topic: its full name. identity: of the publisher, in letters and digits.
     """
 

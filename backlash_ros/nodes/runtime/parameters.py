@@ -187,6 +187,8 @@ PARAMS_FILE = '--params-file'
 def complaints(arguments: Sequence[str], executable: str, full_name: str) -> list[str]:
     """A sentence for each section of the given files that was probably meant for this node.
 
+    ROS 2 passes over a section whose name is not that of the node, without a word.
+
     arguments: of the command line. full_name: of the node, with its namespace.
     """
     files = [value for option, value in pairwise(arguments)

@@ -9,11 +9,11 @@ import gc
 import json
 import os
 import signal
+import struct
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
 from math import isfinite
 from typing import Any, cast
 
@@ -44,6 +44,28 @@ from backlash_ros.nodes.runtime.parameters import (
 )
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 
+ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
+START_LOOK_S = 0.01  # between two looks at a condition of start-up
+STOP_RETRY_S = 0.1  # between two requests to stop, until the node has heard one
+GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node in a second
+START_REMIND_S = 5.0  # between two lines that say what start-up waits for
+# A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
+NAP_NS = 3_000_000
+SIGEV_THREAD = 2  # <signal.h>: the timer calls a function, in a thread of its own
+
+
+def emit(event: str, **content: object) -> None:
+    """Tell the program that started the node of an event: a JSON object in a line of stdout.
+
+    Nothing unless BACKLASH_ROS_EVENTS=1. JSON has no nan: null.
+    """
+    if ENABLED:
+        checked = {
+            name: None if isinstance(value, float) and not isfinite(value) else value
+            for name, value in content.items()
+        }
+        print(json.dumps({'event': event, **checked}), flush=True)
+
 
 def ros_arguments(arguments: Sequence[str]) -> list[str]:
     """The part between --ros-args and --, all of them."""
@@ -53,76 +75,6 @@ def ros_arguments(arguments: Sequence[str]) -> list[str]:
         if inside:
             found.append(argument)
     return found
-
-
-ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
-
-
-def emit(event: str, **content: object) -> None:
-    """Print an event, flushed; nothing unless BACKLASH_ROS_EVENTS=1. JSON has no nan: null."""
-    if ENABLED:
-        checked = {name: _without_nan(value) for name, value in content.items()}
-        print(json.dumps({'event': event, **checked}), flush=True)
-
-
-def _without_nan(value: object) -> object:
-    return None if isinstance(value, float) and not isfinite(value) else value
-
-
-SIGEV_THREAD = 2  # <signal.h>: the timer calls a function, in a thread of its own
-
-
-class _SignalEvent(ctypes.Structure):
-    """struct sigevent of Linux; value is handed to function."""
-
-    _fields_ = (
-        ('value', ctypes.c_void_p), ('signal', ctypes.c_int), ('notify', ctypes.c_int),
-        ('function', ctypes.c_void_p), ('attributes', ctypes.c_void_p),
-        ('reserved', ctypes.c_char * 32),
-    )
-
-
-class _TimerSpec(ctypes.Structure):
-    """struct itimerspec: period and delay as seconds and nanoseconds."""
-
-    _fields_ = tuple(
-        (name, ctypes.c_long) for name in ('period_s', 'period_ns', 'delay_s', 'delay_ns')
-    )
-
-
-@contextmanager
-def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
-    """End the process with this exit code where the block takes longer than within_s [s]."""
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError):  # nobody may be reading any more
-            stream.flush()
-    if sys.platform != 'linux':
-        yield
-        return
-    c = ctypes.CDLL(None)
-    event = _SignalEvent(
-        value=code, notify=SIGEV_THREAD, function=ctypes.cast(c._exit, ctypes.c_void_p).value
-    )
-    timer = ctypes.c_void_p()
-    if c.timer_create(time.CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) != 0:
-        yield  # out of timers: without a last resort, as on any other system
-        return
-    seconds, fraction = divmod(within_s, 1.0)
-    c.timer_settime(
-        timer, 0, ctypes.byref(_TimerSpec(0, 0, int(seconds), int(fraction * 1e9))), None
-    )
-    try:
-        yield
-    finally:
-        c.timer_delete(timer)
-
-
-START_LOOK_S = 0.01  # between two looks at a condition of start-up
-STOP_RETRY_S = 0.1  # between two requests to stop, until the node has heard one
-GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node in a second
-START_REMIND_S = 5.0  # between two lines that say what start-up waits for
-# A wait of the executor costs more than this leaves; sleeping until the tick is more punctual.
-NAP_NS = 3_000_000
 
 
 class ProcessNode(ParameterNode):
@@ -227,6 +179,38 @@ def spin_paced(
             time.sleep(remaining * 1e-9)
         else:
             executor.serve_urgent(int(remaining))
+
+
+@contextlib.contextmanager
+def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
+    """End the process with this exit code where the block takes longer than within_s [s].
+
+    Fast DDS may hang for good while it takes a participant down, if others leave at the same time
+    (DomainParticipant::set_listener spins, seen with 2.14.5: of five participants that leave
+    together in one of some 600 exits, with the profile for loopback in one of some 2,800). It does
+    so with the interpreter locked: no thread of Python and no handler of a signal would ever run.
+    All work is done by then, so a timer of the C library ends the process instead.
+    faulthandler.dump_traceback_later would end it too, but with the exit code of a failure.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # nobody may be reading any more
+            stream.flush()
+    c, timer = ctypes.CDLL(None), ctypes.c_void_p()
+    exit_now = ctypes.cast(c._exit, ctypes.c_void_p).value
+    # struct sigevent: the argument of the function, signal, kind, function, attributes.
+    event = struct.pack('@PiiPP32x', code, 0, SIGEV_THREAD, exit_now, 0)
+    # Out of timers, or on another system than Linux: without a last resort.
+    armed = sys.platform == 'linux' \
+        and c.timer_create(time.CLOCK_MONOTONIC, event, ctypes.byref(timer)) == 0
+    if armed:
+        # struct itimerspec: period and delay as seconds and nanoseconds.
+        delay = struct.pack('@4l', 0, 0, int(within_s), int(within_s % 1.0 * 1e9))
+        c.timer_settime(timer, 0, delay, None)
+    try:
+        yield
+    finally:
+        if armed:
+            c.timer_delete(timer)
 
 
 def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
