@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.plant.noise_level import NoiseLevel
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -25,8 +26,9 @@ STATE_SCALE = 1e3  # prior of x in units of the first output and of the noise
 class FixedBacklash(Law):
     """The estimates stay what they are given as; only the state of G is estimated.
 
-    noise_std: of y. doubt: how much d may move per sample, as a share of the motion of u that
-    the constants predict; 0 trusts them fully.
+    noise_std: of y; where the innovations show more white noise, that counts. doubt: how much d
+    may move per sample, as a share of the motion of u that the constants predict; 0 trusts them
+    fully.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class FixedBacklash(Law):
         self._input = np.append(model.b, 0.0)
         self._noise_var = max(noise_std, 1e-12) ** 2
         self._doubt = doubt
+        self._least_noise, self._noise = self._noise_var**0.5, NoiseLevel()
         self._x: Array = np.zeros(n + 1)
         self._p: Array = np.zeros((n + 1, n + 1))
         self._u = 0.0
@@ -95,6 +98,8 @@ class FixedBacklash(Law):
             cross = self._c * p[:, 0]
             variance = self._c * cross[0] + self._noise_var
             self._innovation = y - self._c * float(x[0])
+            self._noise.take(self._innovation)
+            self._noise_var = max(self._noise.std, self._least_noise) ** 2
             gain = cross / variance
             x = x + gain * self._innovation
             p -= np.outer(gain, cross)

@@ -51,6 +51,17 @@ def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band
     assert error < 0.5 * noise + 1e-6
 
 
+@pytest.mark.parametrize('noise', [1.1e-3, 0.1 * GAP * KNOWN['m']])
+@pytest.mark.parametrize('rests_from', [12.0, 9.0])
+def test_noise_of_y_larger_than_configured_does_not_make_v_cross_the_gap(
+    noise: float, rests_from: float,
+) -> None:
+    asked = 0.5 * np.sin(1.5 * np.minimum(np.arange(0.0, 12.0, PERIOD), rests_from))
+    v, error = moved(asked, output_noise_std=noise, fixed__doubt=0.1)
+    assert turns(v, 0.5 * GAP) <= turns(asked, 0.1) + 3
+    assert error < 0.25 * noise
+
+
 def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
     rng = np.random.default_rng(3)
     asked = [np.zeros(200)]

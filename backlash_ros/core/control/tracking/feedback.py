@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, dot
 from backlash_ros.core.control.tracking.design import TrackingDesign
-from backlash_ros.core.control.tracking.noise_level import NoiseLevel
 from backlash_ros.core.control.tracking.rest import TOLERANCE
 from backlash_ros.core.control.tracking.trust import Trust
 from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.plant.noise_level import NoiseLevel
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.tracking.noise_level import NoiseLevel
+from backlash_ros.core.plant.noise_level import NoiseLevel
 
 Array = NDArray[np.float64]
 

@@ -34,7 +34,7 @@ TOLERANCE = 21.0
 # The same for the first samples of a rest, in which y is brought as close as the noise allows.
 # Later only a drift is worth a step.
 CLOSE, SETTLING = 7.0, 200
-UNCERTAIN = 2.0  # the same in standard deviations of x, where that is more
+UNCERTAIN = 5.0  # the same in standard deviations of x, where that is more
 SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
 ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
 TURNS = 2  # while the trajectory rests, after which feedback goes on in single steps

@@ -24,6 +24,7 @@ from backlash_ros.core.control.tracking.trust import Trust, shrunk_crossings
 from backlash_ros.core.control.tracking.turning import NOISE_BAND, side_for
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.noise_level import NoiseLevel
 from backlash_ros.core.plant.state_model import StateModel
 
 # A better design takes over when v does not move much: samples after the first estimate, by then v
@@ -57,6 +58,7 @@ class Tracking:
         self.feedback = StateFeedback(beginning, self.trust, noise_std)
         self.rest = Rest(beginning, noise_std)
         self.hand_over = HandOver()
+        self._y_noise = NoiseLevel()
         self._moves = deque([0.0], maxlen=NO_CROSSING)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
 
@@ -121,6 +123,8 @@ class Tracking:
         estimate, trust, trajectory = inputs.estimate, self.trust, self.trajectory
         feedback, x_cov = self.feedback, inputs.x_cov
         first = trajectory.references.empty
+        self._y_noise.take(inputs.y)
+        trajectory.noise_std = max(self._noise_std, self._y_noise.std)
         follows = self.rest.state.mode is Mode.FOLLOW and not inverse.taking_up
         if trust.take(estimate) and follows and not first:
             self.hand_over.to_estimate(inverse, trust.state)

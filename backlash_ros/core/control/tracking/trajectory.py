@@ -51,7 +51,7 @@ class IdealTrajectory:
     """
 
     def __init__(self, design: TrackingDesign, noise_std: float) -> None:
-        self._noise_std = noise_std
+        self.noise_std = noise_std
         self.use(design)
         self.state = TrajectoryState([0.0] * design.model.order)
         self.references = ReferenceWindow(
@@ -64,7 +64,7 @@ class IdealTrajectory:
     def use(self, design: TrackingDesign) -> None:
         """Be a trajectory of this design from the next sample on; see `replay`."""
         self._design = design
-        self._least = SMALLEST_IN_Y * self._noise_std / design.push_ahead
+        self._least_per_noise = SMALLEST_IN_Y / design.push_ahead
         self._transition: list[tuple[list[float], float]] = list(
             zip(design.model.a.tolist(), design.model.b.tolist(), strict=True)
         )
@@ -120,12 +120,13 @@ class IdealTrajectory:
             state.extreme = ahead[0]
         taken = ceil(crossing)
         arrival = max(taken - 1, 0)
-        noise = self.noise = max(self._least, self.noise_band,
+        least = self._least_per_noise * self.noise_std
+        noise = self.noise = max(least, self.noise_band,
                                  SMALLEST_TURN * (max(ahead) - min(ahead)))
         if state.decided > 0:
             state.decided -= 1
         elif state.side is Region.GAP:
-            if any(abs(u - state.extreme) > self._least for u in ahead[:arrival + 1]):
+            if any(abs(u - state.extreme) > least for u in ahead[:arrival + 1]):
                 state.side = _first_move(ahead, state.extreme, noise)
         else:
             peak = _turn(ahead, state.extreme, state.side, noise, band, taken)

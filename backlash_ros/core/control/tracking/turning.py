@@ -10,7 +10,7 @@ from __future__ import annotations
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.plant.backlash import Region
 
-NOISE_BAND = 3.0  # standard deviations of what feedback makes of noise
+NOISE_BAND = 5.0  # standard deviations of what feedback makes of noise
 
 
 def side_for(
@@ -19,7 +19,7 @@ def side_for(
     """Return the side for u_d.
 
     asked: by the trajectory. turned: whether it asks so since this sample. noise: what of u_d
-    may be noise.
+    may be noise, whichever way it points.
     """
     side = inverse.side
     if asked is Region.GAP or side is Region.GAP:
@@ -28,5 +28,5 @@ def side_for(
     if turned:
         # Limits may have kept v so far behind that u still has to go on.
         return asked if side is asked or back > -noise else side
-    turns = back > max(noise if side is asked else 0.0, inverse.direction_band)
+    turns = back > max(noise, inverse.direction_band)
     return Region(-side) if turns else side
