@@ -47,7 +47,14 @@ from backlash_ros.core.identification.output_error import (
     triangle,
 )
 from backlash_ros.core.identification.uncertainty import Covariance
-from backlash_ros.core.identification.verdict import APART, Findings, Verdict, judge
+from backlash_ros.core.identification.verdict import (
+    APART,
+    SURE,
+    Findings,
+    Verdict,
+    is_no_play,
+    judge,
+)
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.roughness import noise_of
@@ -61,9 +68,7 @@ FEWEST = 8  # samples per unknown below which nothing is fitted
 EARLY, LATEST = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 WINDOW = 4  # delays from one look at later ones to the next
 SHORTEST = 20  # samples of a record for each of the delay, at least
-# A later delay: log-likelihood by which it must fit better; share of the residual of the earlier
-# ones that it leaves at most, or times the noise of y.
-LIKELIER, LATER, NOISY = 5.0, 0.8, 1.5
+LATER = 5.0  # log-likelihood by which a later delay must fit better
 ALIKE = 1.3  # ratio of the squares left over of delays that may be the right one
 ROWS = 1200  # in which gaps are compared: of more samples, neighbours are averaged
 SAME = 0.005  # relative distance of two gaps that are one
@@ -195,7 +200,9 @@ def identifying(
         return nothing
     part = busiest(v, y)
     s = yield from _searched(v[part], y[part], options, options.delays or EARLY)
-    if not options.delays and s.chosen.structure.delay == EARLY[-1]:
+    late = not options.delays and s.chosen.structure.delay == EARLY[-1]
+    # What no G with a backlash explains, any delay explains a little better.
+    if late and not is_no_play(_observed(s.samples, s.best, quantum(s.samples.y))):
         s = yield from _later(s, options)
     rows = effective_rows(s.samples, s.best)
     # With as many poles, some of them may fit worse.
@@ -216,10 +223,35 @@ def identifying(
         samples = samples.without(wild) if wild.any() else samples
     best = fit(samples, best.structure, best.point, penalty=penalty)
     yield 'judging'
-    return _described(
-        samples, s, best, int((np.isfinite(y) & np.isnan(samples.whole_y)).sum()),
-        Identification(sample_period, v, y), options, part.start,
-    )
+    left_out = int((np.isfinite(y) & np.isnan(samples.whole_y)).sum())
+    given = replace(Identification(sample_period, v, y), outliers=left_out)
+    found = _described(samples, s, best, given, options, part.start)
+    return _as_a_gain(found, samples, s, given, options, part.start)
+
+
+def _as_a_gain(
+    found: Identification, samples: Samples, s: _Search, given: Identification, options: Options,
+    searched_from: int,
+) -> Identification:
+    """With a G that is a gain and a delay, where a better one is not known but the gap is.
+
+    A slow log of a position servo tells no more; what moves y otherwise counts as an error of G.
+    """
+    gains = [one for one in s.compared if one.structure.order == 0]
+    assert found.verdict is not None
+    if not gains or not found.verdict.backlash.known or found.verdict.model.known:
+        return found
+    chosen = min(gains, key=lambda one: one.fit.squares)
+    best = fit(samples, chosen.structure, chosen.trained.point)
+    apart = 0.5 * abs(best.point.gap - found.gap)  # what depends on the model
+    gain = _described(
+        samples, s._replace(chosen=chosen), best, given, options, searched_from, apart)
+    assert gain.verdict is not None
+    if not (gain.verdict.backlash.known and gain.verdict.model.known
+            and apart < SURE * found.std['gap']):
+        return found
+    moved = float(np.sqrt(best.squares / np.nanvar(samples.y) / len(samples.known)))
+    return replace(gain, uncertainty=max(gain.uncertainty, _as_parameter(moved)))
 
 
 def _searched(
@@ -270,10 +302,8 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
     window = range(delay - 1, min(delay + WINDOW + 2, latest) + 1)
     late = yield from _searched(v, y, options, window)
     better = effective_rows(late.samples, late.best) * np.log(early.best.rms / late.best.rms)
-    # What no G with a backlash explains, any delay explains a little better.
-    explains = late.best.rms < max(LATER * early.best.rms, NOISY * _noise(late.samples))
     inner = late.best.structure.delay < max(window)
-    return late if inner and explains and better > LIKELIER else early
+    return late if inner and better > LATER else early
 
 
 def _general(first: int, last: int) -> Structure:
@@ -377,14 +407,15 @@ def _with_delays(samples: Samples, best: Fit, delays: Sequence[int]) -> list[Fit
 
 
 def _described(
-    samples: Samples, s: _Search, best: Fit, left_out: int, given: Identification,
-    options: Options, searched_from: int,
+    samples: Samples, s: _Search, best: Fit, given: Identification, options: Options,
+    searched_from: int, apart: float = 0.0,
 ) -> Identification:
-    """Everything there is to say of the best fit."""
+    """Everything there is to say of the best fit. apart: deviation of the gap beside the fit's."""
     covariance = uncertainty.covariance_of(samples, best)
     crossings = uncertainty.crossings_covariance(best, covariance)
     gap_var, c_r_var = float(crossings[0, 0]), float(crossings[1, 1])
     c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
+    gap_var += apart**2
     band = frequencies_of(best.simulated)
     low = max(band[0], np.pi / samples.count)
     frequencies = np.geomspace(low, max(band[1], 1.01 * low), 60, dtype=np.float64)
@@ -393,7 +424,8 @@ def _described(
     residual = samples.y - best.simulated
     rows = effective_rows(samples, best)
     still = _still(samples, best)
-    correlation = max(lag_one(samples, best) - 3.0 / np.sqrt(len(samples.known)), 0.0)
+    correlation = max(
+        lag_one(residual[samples.known]) - 3.0 / np.sqrt(len(samples.known)), 0.0)
     held_out = _held_out(s.samples, s.chosen, options.held_out)
     numerator = best.numerator / options.slope
     step = quantum(samples.y)
@@ -426,7 +458,7 @@ def _described(
         integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
         quantum=step, correlation=correlation,
         ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
-        uncertainty=_as_parameter(float(spread.max())), outliers=left_out,
+        uncertainty=_as_parameter(float(spread.max())),
         reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
         details=Details(
             samples, s.samples, searched_from, best, covariance, tuple(s.compared), s.chosen,

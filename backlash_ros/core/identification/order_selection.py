@@ -3,7 +3,8 @@
 A pole that a zero cancels is none: such a structure gives way to the same one without that pole. It
 would predict a little better, but only what no G makes: the state and the offset that fit the
 samples held out would have a drift more to fit them with. Structures whose held-out error is
-within a few percent of the least of the others are equally good predictors. Among them the least
+within a few percent of the least, or within its own deviation, are equally good predictors. Among
+them the least
 
     N' log(squares) + unknowns log(N)
 
@@ -16,7 +17,7 @@ the structure. Of the structures that explain y to within their own rounding, th
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from math import inf
 from typing import NamedTuple
 
@@ -55,8 +56,9 @@ class Compared(NamedTuple):
     """One structure.
 
     trained: fitted to the first part, with which held_out, the rms of the error on the last part,
-    is made. fit: to all samples. criterion: as above, the smaller the better. exact: whether the
-    residual is no more than the rounding of the simulation.
+    is made; scatter: relative deviation of that. fit: to all samples. criterion: as above, the
+    smaller the better, inf where it was not fitted to the end. exact: whether the residual is no
+    more than the rounding of the simulation.
     """
 
     structure: Structure
@@ -65,6 +67,7 @@ class Compared(NamedTuple):
     fit: Fit
     criterion: float
     exact: bool
+    scatter: float = 0.0
 
 
 def compare(
@@ -89,6 +92,7 @@ def compare(
         found = fit(coarse, structure, begin, iterations=FEW_STEPS)
         first[structure] = _compared(found, found, coarse, later)
         yield
+    first = _with_criteria(first, coarse)
     done: dict[Structure, Compared] = {}
     for structure in _finalists(first):
         begins = [first[structure].trained.point]
@@ -100,22 +104,31 @@ def compare(
         found = fit(train, structure, min(some, key=lambda one: one.squares).point)
         done[structure] = _compared(found, fit(samples, structure, found.point), samples, later)
         yield
-    # What was not fitted to the end is shown alone.
+    done = _with_criteria(done, samples)
     return [done.get(structure, first[structure]._replace(criterion=inf, exact=False))
             for structure in structures]
 
 
 def _compared(trained: Fit, whole: Fit, samples: Samples, later: Samples) -> Compared:
-    rows = effective_rows(samples, whole)
+    error = (later.y - predicted(trained, later))[later.known]
     return Compared(
-        whole.structure, held_out_rms(trained, later), trained, whole,
-        rows * float(np.log(max(whole.squares, TINY)))
-        + whole.structure.unknowns * float(np.log(len(samples.target))),
-        whole.rms <= rounding(samples, whole),
+        whole.structure, _rms(error), trained, whole, inf, whole.rms <= rounding(samples, whole),
+        1.0 / float(np.sqrt(2.0 * _effective(error))),
     )
 
 
-def _finalists(first: dict[Structure, Compared]) -> list[Structure]:
+def _with_criteria(
+    compared: Mapping[Structure, Compared], samples: Samples,
+) -> dict[Structure, Compared]:
+    best = min((one.fit for one in compared.values()), key=lambda whole: whole.squares)
+    rows = effective_rows(samples, best)
+    return {structure: one._replace(
+        criterion=rows * float(np.log(max(one.fit.squares, TINY)))
+        + structure.unknowns * float(np.log(len(samples.target))),
+    ) for structure, one in compared.items()}
+
+
+def _finalists(first: Mapping[Structure, Compared]) -> list[Structure]:
     """Structures that may be the best by either measure, with those that they may give way to."""
     by_criterion = sorted(first, key=lambda s: first[s].criterion)
     by_prediction = sorted(first, key=lambda s: first[s].held_out)
@@ -136,8 +149,9 @@ def selected(compared: Sequence[Compared]) -> Compared:
     ])]
     if exact:
         return min(exact, key=lambda one: (one.structure.unknowns, one.fit.squares))
-    least = min(one.held_out for one in needed)
-    good = [one for one in needed if one.held_out <= WITHIN * least]
+    least = min(needed, key=lambda one: one.held_out)
+    within = least.held_out * max(WITHIN, 1.0 + least.scatter)
+    good = [one for one in needed if one.held_out <= within]
     return min(good, key=lambda one: one.criterion)
 
 
@@ -213,8 +227,11 @@ def _with_a_pole(point: Point) -> list[Point]:
 
 def held_out_rms(found: Fit, later: Samples) -> float:
     """Error of what the fit predicts for later samples."""
-    residual = (later.y - predicted(found, later))[later.known]
-    rms = float(np.sqrt(np.mean(residual**2)))
+    return _rms((later.y - predicted(found, later))[later.known])
+
+
+def _rms(error: Array) -> float:
+    rms = float(np.sqrt(np.mean(error**2)))
     return rms if np.isfinite(rms) else inf
 
 
@@ -238,14 +255,17 @@ def predicted(found: Fit, later: Samples) -> Array:
 
 def effective_rows(samples: Samples, found: Fit) -> float:
     """N' of the formula above."""
-    r = lag_one(samples, found)
-    return len(samples.target) * (1.0 - r) / (1.0 + r)
+    return _effective(samples.target - samples.reduced(found.simulated - samples.middle))
 
 
-def lag_one(samples: Samples, found: Fit) -> float:
-    """Correlation of the residuals of successive rows, lost ones left out, at least 0."""
-    residual = samples.target - samples.reduced(found.simulated - samples.middle)
+def _effective(residual: Array) -> float:
+    r = lag_one(residual)
+    return len(residual) * (1.0 - r) / (1.0 + r)
+
+
+def lag_one(residual: Array) -> float:
+    """Correlation of the residuals (R,) of successive rows, at least 0."""
     energy = float(np.mean(residual**2))
-    if energy == 0.0 or len(residual) < 2:
+    if energy == 0.0 or not np.isfinite(energy) or len(residual) < 2:
         return 0.0
     return min(max(float(np.mean(residual[1:] * residual[:-1])) / energy, 0.0), 0.99)

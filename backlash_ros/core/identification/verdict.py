@@ -339,6 +339,11 @@ def _one_speed(v: Array) -> bool:
     return bool(len(speeds) and np.std(speeds) < ONE_SPEED * np.mean(speeds))
 
 
+def is_no_play(o: Observed) -> bool:
+    """Whether it is something else than a play."""
+    return any(not _parted(text).known for text in what_it_is(o))
+
+
 def _parted(text: str) -> Answer:
     """A sentence like `reason; cure` about what is no play; a load that coasts leaves one."""
     reason, _, cure = text.partition('; ')
