@@ -1,17 +1,14 @@
 """A controller with several joints, through the messages of topic-based hardware."""
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from math import nan, sin
 from pathlib import Path
 
-import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from ros_processes import DEADLINE_S, NodeProcess, RosWorld, ros_world
+from ros_processes import NodeProcess, RosWorld, ros_world
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header
 
@@ -20,9 +17,6 @@ from backlash_ros.core.assembly import first_guess
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.cli import InputError
-from backlash_ros.tools.records.messages import read_bag_record
-from backlash_ros.tools.runs.bag import read_bag
 
 JOINTS = ['waist', 'elbow', 'gripper']
 PERIOD = 0.02
@@ -160,41 +154,6 @@ def test_every_joint_is_answered_by_its_own_loop_in_one_message(tmp_path: Path) 
         assert list(it.answer({'gripper': 0.0, 'elbow': 0.0, 'waist': 0.0}).name) == JOINTS
         for joint in JOINTS:
             it.probe.wait_until(it.says(joint, ''), f'diagnostics of {joint}')
-
-
-def test_joints_are_watched_and_recorded_each_by_its_name(tmp_path: Path) -> None:
-    bag = tmp_path / 'bag'
-    with arm(tmp_path) as it:
-        recorder = it.world.start('recorder', {
-            'bag': str(bag), 'io.style': 'joint_state_topic', 'wait_for_publishers': True,
-        })
-        recorder.wait_for('ready')
-        monitor = subprocess.Popen(
-            [sys.executable, '-m', 'backlash_ros.nodes.monitor.command'], stdin=subprocess.DEVNULL,
-            stdout=(tmp_path / 'monitor').open('wb'), env=it.world.environment,
-        )
-        try:
-            for k in range(40):
-                it.refer(reference(k))
-                it.answer(output(k))
-            it.probe.wait_until(lambda: all(
-                f'/controller: {joint}: ' in (tmp_path / 'monitor').read_text() for joint in JOINTS
-            ), 'the joints in the monitor')
-        finally:
-            monitor.terminate()
-            assert monitor.wait(DEADLINE_S) == 0
-        assert recorder.stop() == 0
-    first, elbow = read_bag(bag), read_bag(bag, axis='elbow')
-    assert any('this is joint waist; --axis chooses one of elbow, gripper' in note
-               for note in first.notes)
-    y = [output(k)['elbow'] for k in range(40)]
-    assert np.array_equal(elbow.record.column('y'), y)
-    assert elbow.record.column('c_r')[-1] == 0.05
-    with pytest.raises(InputError, match='of axis shoulder'):
-        read_bag(bag, axis='shoulder')
-    columns = {'v': 'joint_commands/elbow', 'y': 'robot_joint_states/elbow'}
-    record = read_bag_record(bag, None, '', columns)
-    assert np.array_equal(record.y[~np.isnan(record.y)], y)
 
 
 def test_an_array_has_the_commands_of_all_joints_in_their_order(tmp_path: Path) -> None:

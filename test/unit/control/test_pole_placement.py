@@ -40,18 +40,6 @@ def test_gains_solve_the_diophantine_equation(model: TransferFunction) -> None:
     np.testing.assert_allclose(left, right, atol=1e-6 * np.abs(right).max())
 
 
-@settings(max_examples=40, deadline=None)
-@given(plants())
-def test_reference_has_unit_gain_at_rest_and_cancels_no_zero(model: TransferFunction) -> None:
-    assume(well_separated(model))
-    closed = np.real(np.poly(np.full(model.order, 0.5)))
-    blocks = place_poles(model, closed, 0.3)
-    assert blocks.reference.response(np.array([1.0 + 0j]))[0] == pytest.approx(1.0)
-    np.testing.assert_allclose(
-        blocks.reference.numerator, blocks.theta_3 * model.numerator, atol=1e-12
-    )
-
-
 @pytest.mark.parametrize('filter_pole', [0.0, 0.6, 0.9])
 def test_loop_without_backlash_answers_as_the_reference_model_says(filter_pole: float) -> None:
     p = Parameters({

@@ -67,18 +67,6 @@ def follow(observer: Observer, disturbance: float, samples: int, seed: int = 0) 
     return np.array(errors)
 
 
-@pytest.mark.parametrize('level', [1, 3, 5, 7])
-def test_gain_settles_where_innovations_are_as_large_as_they_are(level: int) -> None:
-    model = MODELS['resonance']
-    observer = Observer(model, NOISE)
-    disturbance = RATIOS[level] * NOISE
-    errors = follow(observer, disturbance, 3000)
-    best = gain_of(model, RATIOS[level])
-    assert best is not None
-    # Within a third of the filter that was told the disturbance.
-    assert np.std(errors[1500:]) <= 1.35 * best.innovation * NOISE
-
-
 def followed_by_another_model(disturbance: float) -> float:
     """Size of the state's covariance in that of an observer which knows nothing before."""
     before, model = Observer(MODELS['resonance'], NOISE), MODELS['delayed']

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 from test_identification import PERIOD_S, motion, record
 
 from backlash_ros import topics
@@ -27,7 +25,6 @@ FILES = {
     'held_out.png', 'residual.png', 'gap.png', 'orders.png', 'poles_zeros.png', 'bode.png',
     'loop.png',
 }
-TYPES = get_typestore(Stores.ROS2_JAZZY)
 
 
 def write_csv(path: Path, v: np.ndarray, y: np.ndarray) -> Path:
@@ -116,15 +113,6 @@ def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(tmp_path, capsy
     assert json.loads((tmp_path / 'out' / 'identified.json').read_text())['usable'] is False
 
 
-def test_a_bad_file_is_told_in_one_line(tmp_path, capsys):
-    source = tmp_path / 'a.csv'
-    source.write_text('t,v\n0,1\n1,2\n')
-    assert main([str(source), '--out', str(tmp_path / 'out')]) == 2
-    error = capsys.readouterr().err
-    assert 'no column is y' in error
-    assert error.count('\n') == 1
-
-
 @pytest.mark.parametrize('arguments', [
     [], ['nowhere.csv'], ['--drive', 'a.csv'], ['a.csv', '--order', '7'],
     ['a.csv', '--order', '4-2'], ['a.csv', '--delay', 'x'], ['a.csv', '--slope', '0'],
@@ -138,41 +126,6 @@ def test_bad_options_are_told_in_one_line(tmp_path, monkeypatch, capsys, argumen
     write_csv(tmp_path / 'a.csv', *record(100))
     assert main(arguments) == 2
     assert capsys.readouterr().err.count('\n') == 1
-
-
-def write_bag(path: Path, v: np.ndarray, y: np.ndarray, report: bool, skipped: int = -1) -> None:
-    """What a driver and whoever moves it say: y(k), then v(k), and its report before y(k+1)."""
-    kind = 'std_msgs/msg/Float64'
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        names = [topics.PLANT_OUTPUT, topics.CONTROL] + [topics.APPLIED_CONTROL] * report
-        connections = {
-            name: writer.add_connection(f'/{name}', kind, typestore=TYPES) for name in names
-        }
-
-        def put(name: str, share: float, value: float) -> None:
-            message = TYPES.types[kind](data=float(value))
-            stamp = 10**18 + round((share + 1.0) * PERIOD_S * 1e9)
-            writer.write(connections[name], stamp, bytes(TYPES.serialize_cdr(message, kind)))
-
-        for k in range(len(v)):
-            if k != skipped:
-                put(topics.PLANT_OUTPUT, k, y[k])
-            # With reports, the command itself is another one.
-            put(topics.CONTROL, k + 0.1, 0.0 if report else v[k])
-            if report:
-                put(topics.APPLIED_CONTROL, k + 0.98, v[k])
-
-
-@pytest.mark.parametrize('report', [False, True])
-def test_a_bag_holds_v_and_y(tmp_path: Path, report: bool) -> None:
-    v, y = record(300)
-    write_bag(tmp_path / 'bag', v, y, report, skipped=120)
-    found = read_record(tmp_path / 'bag')
-    assert found.sample_period == pytest.approx(PERIOD_S)
-    assert found.v.tolist() == v.tolist()
-    assert found.lost == 1
-    assert np.isnan(found.y[120])
-    assert np.delete(found.y, 120).tolist() == np.delete(y, 120).tolist()
 
 
 def test_delays_of_single_samples_do_not_add_up_to_a_lost_one() -> None:

@@ -4,7 +4,6 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.play import play
@@ -17,8 +16,6 @@ from backlash_ros.core.identification.order_selection import (
     selected,
 )
 from backlash_ros.core.identification.output_error import Fit, Point, Structure
-
-Array = NDArray[np.float64]
 
 
 def fit_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Fit:
@@ -66,19 +63,6 @@ def test_it_gives_way_to_nothing_else_than_the_structure_without_it() -> None:
     assert selected([PLAIN, NEITHER]) is NEITHER
     later = PLAIN._replace(structure=PLAIN.structure._replace(delay=1))
     assert not gives_way(NO_INTEGRATOR.fit, [later, NO_INTEGRATOR])
-
-
-def test_a_slow_motion_of_a_motor_shows_no_integrator() -> None:
-    """The rounding of a slow y drifts, which an integrator without effect would follow."""
-    period, step = 0.005, 2.0 * np.pi / 2**14
-    v: Array = np.array(list(islice(strokes(-9.0, 11.0, 200.0, period, 60.0, 0.0), 2700)))
-    u = 0.098 * (play(v, 0.9, 0.55) - 0.55)
-    y = lfilter([0.0, 0.1568, 0.1269], [1.0, -1.2498, 0.5335], u)
-    found = identify(v, step * np.round(y / step), period, Options((2, 3, 4), (0,)))
-    assert found.reasons == ()
-    assert not found.integrator
-    assert found.denominator == pytest.approx([1.0, -1.2498, 0.5335], abs=1e-3)
-    assert found.gap == pytest.approx(0.9, abs=1e-3)
 
 
 def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:

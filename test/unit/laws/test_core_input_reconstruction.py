@@ -99,15 +99,6 @@ def test_lag_shorter_than_the_delay_of_the_plant_is_refused() -> None:
     InputReconstruction(model, 0.0, 5)
 
 
-def test_it_is_ready_only_after_its_start_is_forgotten() -> None:
-    reconstruction = InputReconstruction(PAPER, 0.0, 5)
-    ready = []
-    for _ in range(12):
-        reconstruction.update(0.0)
-        ready.append(reconstruction.ready)
-    assert ready == [False] * 10 + [True] * 2
-
-
 def test_noise_that_leaves_nothing_of_u_is_refused() -> None:
     with pytest.raises(ParameterError, match='so large that y says nothing of u'):
         InputReconstruction(PAPER, 1e200, LAG)

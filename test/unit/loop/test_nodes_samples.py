@@ -75,15 +75,6 @@ def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
     assert commands.late == 1
 
 
-def test_older_intervals_ended_in_time_though_the_newest_output_came_late() -> None:
-    commands = CommandHistory(PERIOD_S)
-    commands.publish(1.0, START_NS + 1)
-    commands.publish(2.0, START_NS + int(1.1 * PERIOD_NS))
-    # y(1) was missed, y(2) is taken late: 2.0 came after the end of the first interval.
-    assert over(commands, 2, end=2.3, due=2.0) == [1.0, 2.0]
-    assert over(commands, 2, end=2.3, due=2.3) == [2.0, 2.0]
-
-
 def test_a_command_that_came_while_the_driver_was_held_up_missed_its_sample() -> None:
     commands = CommandHistory(PERIOD_S)
     commands.publish(1.0, START_NS + 1)

@@ -1,6 +1,6 @@
 """Reference signals y_m(t)."""
 
-from math import pi, sin
+from math import pi
 
 import pytest
 from hypothesis import given
@@ -31,19 +31,6 @@ def test_every_waveform_stays_within_amplitude_around_bias(t, amplitude, bias, w
 )
 def test_shape_of(waveform: str, t: float, value: float) -> None:
     assert ReferenceSignal(waveform, 2.0, OMEGA, 1.0)(t) == pytest.approx(value)
-
-
-def test_multisine_excites_several_harmonics_at_a_low_crest() -> None:
-    values = [ReferenceSignal('multisine', 1.0, OMEGA)(k / 1000.0) for k in range(1000)]
-    rms = (sum(v * v for v in values) / 1000.0) ** 0.5
-    assert max(map(abs, values)) / rms < 2.5
-    for harmonic in (1, 2, 3, 5):
-        amount = sum(
-            v * complex(sin(OMEGA * harmonic * k / 1000.0), sin(OMEGA * harmonic * k / 1000.0
-                                                                + pi / 2))
-            for k, v in enumerate(values)
-        )
-        assert abs(amount) / 500.0 == pytest.approx(0.25, rel=1e-6)
 
 
 def test_chirp_sweeps_its_frequency_and_starts_again() -> None:

@@ -82,13 +82,3 @@ def test_wear_never_ends_in_an_invalid_backlash(changes: dict[str, list[float]])
     with pytest.raises(ParameterError) as refusal:
         outputs(build_plant(paper_example(**changes)), [0.0] * 400)
     assert refusal.value.name.startswith('backlash.')
-
-
-def test_parameters_reach_the_plant() -> None:
-    simulated = build_plant(paper_example(
-        backlash__m=2.0, backlash__c_r=1.0, backlash__c_l=-0.5, backlash__initial_u=0.25,
-        input_disturbance=3.0, plant__numerator=[0.5], plant__denominator=[1.0, -0.5],
-    ))
-    assert simulated.step(0.5) == 0.25
-    assert simulated.measure() == pytest.approx(0.5 * 3.25)
-    assert simulated.step(2.0) == pytest.approx(2.0)

@@ -34,16 +34,6 @@ def test_frequency_response_agrees_with_scipy(model: TransferFunction) -> None:
 
 
 @pytest.mark.parametrize(
-    ('numerator', 'delay'), [([1.0, 0.5], 1), ([0.0, 0.0, 3.0, 1.0], 1), ([0.0, 2.0], 2)],
-)
-def test_leading_zeros_of_the_numerator_are_delay(numerator: list[float], delay: int) -> None:
-    model = TransferFunction(numerator, [1.0, -0.5, 0.1])
-    assert model.delay == delay
-    impulse = output_of(model, np.eye(1, 10)[0])
-    assert np.flatnonzero(impulse)[0] == delay
-
-
-@pytest.mark.parametrize(
     ('numerator', 'denominator', 'name'),
     [
         ([1.0, 0.0], [1.0, 0.5], 'plant.numerator'),

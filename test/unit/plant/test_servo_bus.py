@@ -1,7 +1,5 @@
 """The emulated bus: byte for byte what the protocol's description prints, and what its SDK asks."""
 
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -9,20 +7,12 @@ pytest.importorskip('mujoco', reason='the physics need mujoco (requirements/dev.
 pytest.importorskip('dynamixel_sdk', reason='the bus needs dynamixel-sdk (requirements/dev.txt)')
 
 from arm_physics import ArmPhysics
-from dynamixel_bus import PatientPort
-from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PacketHandler
 from servo_bus import (
-    CENTRE,
     GOAL,
-    MODEL,
     POSITION,
-    RESOLUTION,
-    TORQUE_ENABLE,
     EmulatedBus,
-    Port,
     packet,
 )
-from waiting import DEADLINE_S
 
 
 class Clock:
@@ -76,33 +66,3 @@ def test_a_header_within_a_packet_is_stuffed_and_a_wrong_byte_noticed(bus: Emula
     assert b'\xff\xff\xfd\xfd' in asked
     assert bus.answer(asked) == packet(1, 0x55, b'\x04')  # out of range, thus understood
     assert bus.answer(asked[:-1] + bytes((asked[-1] ^ 1,))) == packet(1, 0x55, b'\x03')
-
-
-@pytest.fixture
-def port(bus: EmulatedBus, tmp_path: Path) -> Iterator[PatientPort]:
-    line = Port(bus, tmp_path / 'bus')
-    handler = PatientPort(str(tmp_path / 'bus'), 1_000_000, patience_s=DEADLINE_S)
-    yield handler
-    handler.closePort()
-    line.close()
-
-
-def test_the_sdk_moves_the_arm_through_the_terminal(bus, clock, port):
-    packets, ids = PacketHandler(2.0), list(bus.servos)
-    assert packets.ping(port, 3)[:2] == (MODEL, COMM_SUCCESS)
-    goals = [CENTRE + 20 * one for one in ids]
-    writer = GroupSyncWrite(port, packets, GOAL, 4)
-    reader = GroupSyncRead(port, packets, POSITION, 4)
-    for one, goal in zip(ids, goals, strict=True):
-        assert packets.write1ByteTxRx(port, one, TORQUE_ENABLE, 1) == (COMM_SUCCESS, 0)
-        assert writer.addParam(one, goal.to_bytes(4, 'little'))
-        assert reader.addParam(one)
-    assert writer.txPacket() == COMM_SUCCESS
-    for _ in range(8):
-        assert reader.txRxPacket() == COMM_SUCCESS
-        clock.now += 0.25
-    assert reader.txRxPacket() == COMM_SUCCESS
-    reached = [reader.getData(one, POSITION, 4) for one in ids]
-    lost = [bus.arm.lost_motion(joint) / RESOLUTION for joint in bus.arm.joints]
-    assert reached == pytest.approx(goals, abs=max(lost))
-    assert reached != [CENTRE] * len(ids)

@@ -14,7 +14,7 @@ from backlash_ros.core.assembly import build_model, build_plant, build_true_mode
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.plant.true_plant import Alteration, altered_plant, delayed
+from backlash_ros.core.plant.true_plant import Alteration, altered_plant
 
 PERIOD = 0.005
 
@@ -76,11 +76,6 @@ def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(model, whole
         slow = slow * 0.25
     expected = np.append(np.zeros(whole + 1), slow[4 - quarters::4])[:60]
     np.testing.assert_allclose(lagging, expected, rtol=0.0, atol=1e-7 * np.abs(slow).max())
-
-
-def test_delay_stays_a_delay_whatever_the_frequency() -> None:
-    altered = altered_plant(delayed(motor(), 3), Alteration(frequency=1.2))
-    assert_equal(altered, delayed(motor(24.0), 3), 1e-12)
 
 
 def test_plant_that_no_continuous_one_has_is_refused_with_its_pole() -> None:

@@ -104,14 +104,6 @@ def test_page_of_parameters_is_current() -> None:
     assert (DOCS / 'reference' / 'parameters.md').read_text() == parameters_page(), 'call make docs'
 
 
-def test_python_files_that_pages_name_exist() -> None:
-    named = {code for _, code in of_every_page(CODE) if re.fullmatch(r'\w+\.py', code)}
-    folders = ('backlash_ros', 'docs', 'benchmarks', 'examples', 'test', 'scripts')
-    present = {path.name for folder in folders for path in (ROOT / folder).rglob('*.py')}
-    assert named
-    assert named <= present
-
-
 def test_parameters_that_pages_name_exist() -> None:
     named = {
         code for _, code in of_every_page(CODE)

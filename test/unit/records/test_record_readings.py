@@ -28,14 +28,6 @@ def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
     assert found.period == pytest.approx(times * 0.005)
 
 
-def test_at_rest_one_reading_a_period_is_taken() -> None:
-    y = repeated(5)
-    y[1000:2000] = y[1000]
-    found = held(T, y)
-    assert found is not None
-    assert np.count_nonzero(found.own[1000:2000]) == pytest.approx(200, abs=2)
-
-
 @pytest.mark.parametrize('y', [
     MOTION + NOISE, np.round(20.0 * MOTION), SQUARE, STEPPED, np.zeros(len(T)), MOTION[:20],
     np.where(np.arange(len(T)) % 2 == 0, MOTION, np.nan),

@@ -100,15 +100,6 @@ def test_bag_gives_back_the_run(tmp_path: Path, storage: StoragePlugin) -> None:
     np.testing.assert_array_equal(found.latency_s, LATENCY_S)
 
 
-def test_sample_missing_in_the_bag_is_lost(run: RunRecord, tmp_path: Path) -> None:
-    bag = write_bag(tmp_path / 'bag', run, lost=frozenset({30, 31, 70}))
-    found = read_bag(bag, run.sample_period).record
-    assert found.lost_samples == 3
-    kept = np.delete(run.rows, [30, 31, 70], axis=0)
-    np.testing.assert_array_equal(found.column('t'), kept[:, 0])
-    np.testing.assert_array_equal(found.column('u')[:-1], kept[:-1, COLUMNS.index('u')])
-
-
 def test_sample_without_its_estimates_is_counted(run: RunRecord, tmp_path: Path) -> None:
     bag = write_bag(tmp_path / 'bag', run, unpaired=frozenset({50, 119}))
     found = read_bag(bag, run.sample_period)

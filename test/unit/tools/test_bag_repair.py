@@ -20,6 +20,19 @@ from backlash_ros.bags.reading import BagError, BagReader
 from backlash_ros.bags.repair import damage, repair, repair_command
 from backlash_ros.bags.writer import STORAGE, Bag
 
+
+class OtherStorage:
+    """Has all that rosbags promises of a storage, and nothing of what it is made of today."""
+
+    def __init__(self, path: Path, compression: Any) -> None:
+        self._hidden = Sqlite3Writer(path, compression)
+        self.path = self._hidden.path
+        self.add_msgtype = self._hidden.add_msgtype
+        self.add_connection = self._hidden.add_connection
+        self.write, self.close = self._hidden.write, self._hidden.close
+        self.abort = self._hidden.abort
+
+
 FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
 CDR = b'\x00\x01\x00\x00'
 MESSAGES, PER_FLUSH = 300, 60
@@ -179,18 +192,6 @@ def test_flush_reaches_into_the_installed_rosbags(tmp_path: Path, storage: str) 
     assert [message.data for message in BagReader(bag.path).messages()] == [number_message(7)]
     bag.close()
     assert damage(bag.path) == ''
-
-
-class OtherStorage:
-    """Has all that rosbags promises of a storage, and nothing of what it is made of today."""
-
-    def __init__(self, path: Path, compression: Any) -> None:
-        self._hidden = Sqlite3Writer(path, compression)
-        self.path = self._hidden.path
-        self.add_msgtype = self._hidden.add_msgtype
-        self.add_connection = self._hidden.add_connection
-        self.write, self.close = self._hidden.write, self._hidden.close
-        self.abort = self._hidden.abort
 
 
 @pytest.mark.parametrize('storage', STORAGE)

@@ -78,13 +78,6 @@ def test_values_of_joints_are_written_back_and_may_stand_apart_from_their_list(c
         read_configuration(config, ['wist/control.max=3'])
 
 
-def test_shipped_file_is_found_by_its_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert find_config(Path('geared_motor.yaml')).is_file()
-    here = written(tmp_path / 'geared_motor.yaml', 'a file of that name here goes first')
-    assert find_config(Path('geared_motor.yaml')).resolve() == here
-
-
 def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
     parameters = Parameters({
         'driver': "ros2 run 'it'", 'axes': ['x', 'y'], 'plant.numerator': [1 / 3, 1e-300],
@@ -111,20 +104,6 @@ def test_bad_value_is_answered_with_rule_and_file(config: Path) -> None:
     written(config, '/**: {ros__parameters: {sample_period: -1}}')
     with pytest.raises(ParameterError, match=r'my\.yaml: sample_period=-1\.0 must be > 0 \[s\]'):
         load_config(config)
-
-
-def test_whole_number_and_bare_exponent_are_floats(config: Path) -> None:
-    # YAML 1.1 reads 1e-5 as a text.
-    written(config, '/**: {ros__parameters: {amplitude: 3, plant.numerator: [1e-5, 4]}}')
-    values = load_config(config)
-    assert values == {'amplitude': 3.0, 'plant.numerator': (1e-5, 4.0)}
-    assert isinstance(values['amplitude'], float)
-
-
-@pytest.mark.parametrize('section', ['/**', '/controller', 'controller', '/**/controller'])
-def test_section_of_a_node_is_accepted(config: Path, section: str) -> None:
-    written(config, f'{section}: {{ros__parameters: {{estimator: {{law: lms}}}}}}')
-    assert load_config(config) == {'estimator.law': 'lms'}
 
 
 @pytest.mark.parametrize(
@@ -234,13 +213,6 @@ def test_named_node_goes_before_named_axis_and_that_before_all(config, sections)
         written(config, text)
         assert effective_parameters(config, axis='x')['seed'] == values[specific]
         left.remove(specific)
-
-
-def test_setting_of_an_axis_goes_before_one_for_all_in_any_order(config: Path) -> None:
-    written(config, AXES)
-    for settings in (['x/seed=5', 'seed=4'], ['seed=4', 'x/seed=5']):
-        assert effective_parameters(config, settings, axis='x')['seed'] == 5
-        assert effective_parameters(config, settings, axis='y')['seed'] == 4
 
 
 @pytest.mark.parametrize(

@@ -27,11 +27,6 @@ def without_truth(run: RunRecord) -> RunRecord:
 
 
 OLD_HEADER = 't,y_m,y,u_d,v,u,m,c_r,c_l,f'  # of samples.csv before version 0.3
-FIELDS = [
-    'estimator', 'structure', 'samples', 'sample_period', 'lost_samples', 'began_with', 'final',
-    'final_std', 'truth', 'settling_time_s', 'control_error_rms', 'tracking_error_rms',
-    'loop_latency_ms', 'final_status', 'status_share', 'model', 'noise_ratio', 'unexplained',
-]
 LEARNED = LearnedModel((0.1, 0.05), (1.0, -0.9), 1, (0.1, 0.2, 0.3, 0.4, nan), 1.1, 0.02)
 
 
@@ -64,17 +59,6 @@ def test_u_is_left_empty_where_it_is_unknown(run: RunRecord, tmp_path: Path) -> 
     with (tmp_path / 'samples.csv').open(newline='') as file:
         assert {row['u'] for row in csv.DictReader(file)} == {''}
     assert np.isnan(results.read_samples(tmp_path / 'samples.csv').column('u')).all()
-
-
-def test_summary_has_the_agreed_fields(run: RunRecord) -> None:
-    summary = summarise(run, Parameters({'estimator.law': 'lms'}))
-    assert list(summary) == FIELDS
-    assert list(summary['final']) == ['m', 'c_r', 'c_l', 'f']
-    for name in ('final_std', 'truth', 'settling_time_s'):
-        assert list(summary[name]) == ['m', 'c_r', 'c_l']
-    assert summary['estimator'] == 'lms'
-    assert summary['samples'] + summary['lost_samples'] == 150
-    assert summary['loop_latency_ms'] is None
 
 
 def test_what_is_not_finite_becomes_null(run: RunRecord, tmp_path: Path) -> None:
