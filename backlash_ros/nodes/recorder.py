@@ -40,6 +40,19 @@ from backlash_ros.nodes.runtime.messages import (
 from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, run
 from backlash_ros.options import BAD_INPUT, FAILED
 
+RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
+FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that a flush takes
+# Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
+DRAIN_S = 0.3
+IDLE_SPINS = 5  # without a message, timers being served in between
+# All but those that io.style names; y comes last of all: it starts the loop.
+OF_THE_LOOP: dict[str, type[Any]] = {
+    topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
+    topics.MODEL: Float64MultiArray, topics.TRUTH: Float64MultiArray,
+    topics.DIAGNOSTICS: DiagnosticArray,
+}
+NEEDED_PUBLISHERS = (topics.ESTIMATES, topics.SIGNALS)
+
 
 @dataclass
 class Channel:
@@ -109,21 +122,6 @@ class Progress:
 
 def _row(message: bytes, labels: tuple[str, ...]) -> dict[str, float]:
     return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=False))
-
-
-RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
-FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that a flush takes
-# Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
-DRAIN_S = 0.3
-IDLE_SPINS = 5  # without a message, timers being served in between
-
-# All but those that io.style names; y comes last of all: it starts the loop.
-OF_THE_LOOP: dict[str, type[Any]] = {
-    topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
-    topics.MODEL: Float64MultiArray, topics.TRUTH: Float64MultiArray,
-    topics.DIAGNOSTICS: DiagnosticArray,
-}
-NEEDED_PUBLISHERS = (topics.ESTIMATES, topics.SIGNALS)
 
 
 class RecorderNode(ProcessNode):

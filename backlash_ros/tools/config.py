@@ -18,8 +18,8 @@ from backlash_ros import shipped
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.joints import entry_of, split
 from backlash_ros.core.parameters.parameter import Parameter, Value
+from backlash_ros.core.parameters.parameter_set import entry_of, split
 from backlash_ros.core.parameters.table import (
     BRINGUP,
     BY_NAME,

@@ -32,6 +32,8 @@ from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
 from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
 from backlash_ros.nodes.runtime.process import ProcessNode
 
+ABSENT = 5  # messages in a row without a joint that is not there
+
 
 def publishers_of(
     node: Node, topic: str, message_type: type[Any], qos: QoSProfile,
@@ -81,9 +83,6 @@ def _unfit(
     unreliable = offered.reliability == ReliabilityPolicy.BEST_EFFORT \
         and wanted.reliability == ReliabilityPolicy.RELIABLE
     return 'reliability' if unreliable else 'qos'
-
-
-ABSENT = 5  # messages in a row without a joint that is not there
 
 
 class Diagnosis:

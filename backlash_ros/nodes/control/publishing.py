@@ -25,6 +25,12 @@ WATCH_LOOK_S = 0.5  # between two looks at who listens
 WATCH_DEPTH = 10  # messages that may wait for a subscriber
 U_INDEX = topics.SIGNAL_LABELS.index('u_hat')
 BAND = 2.0  # half width of the band around an estimate, in standard deviations
+Row = tuple[float, ...]
+# Who comes late gets the newest ones: G may never change again. More than one, so that a subscriber
+# that is held up misses none, and one of each joint.
+NEWEST = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# Deviations and noise change with every few samples, and are of use at the pace of a reader.
+MODEL_PERIOD_S = 1.0
 
 
 class WatchPublisher:
@@ -98,9 +104,6 @@ def watched_values(signals: Sequence[float], estimates: Sequence[float]) -> dict
     return values | {name: value for name, value in signal.items() if name != 'sample'}
 
 
-Row = tuple[float, ...]
-
-
 class StepPublisher:
     """The topics ~/signals, ~/estimates and those below ~/watch.
 
@@ -150,13 +153,6 @@ def _rows(loop: ControlLoop, step: ControlStep | None) -> tuple[Row, Row]:
 
 def _joined(rows: Iterator[Row]) -> Row:
     return sum(rows, ())
-
-
-# Who comes late gets the newest ones: G may never change again. More than one, so that a subscriber
-# that is held up misses none, and one of each joint.
-NEWEST = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Deviations and noise change with every few samples, and are of use at the pace of a reader.
-MODEL_PERIOD_S = 1.0
 
 
 class ModelPublisher:

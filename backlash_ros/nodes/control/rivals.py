@@ -26,6 +26,14 @@ from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 LISTED = Path('/proc/net/unix')
+# What discovery mostly takes, and where all are on this machine: a publisher that is found so soon
+# after the start of a node was there before it. Controllers of this machine are waited for however
+# long it takes.
+DISCOVERY_S, DISCOVERY_HERE_S = 0.7, 0.4
+HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
+OWN_ENDPOINT_S = 10.0  # longest wait for the graph to show a publisher of this very process
+# Keys in /diagnostics by which controllers know each other.
+ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
 
 
 class Presence:
@@ -67,16 +75,6 @@ class Presence:
         """Let go of the name."""
         if self._socket is not None:
             self._socket.close()
-
-
-# What discovery mostly takes, and where all are on this machine: a publisher that is found so soon
-# after the start of a node was there before it. Controllers of this machine are waited for however
-# long it takes.
-DISCOVERY_S, DISCOVERY_HERE_S = 0.7, 0.4
-HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
-OWN_ENDPOINT_S = 10.0  # longest wait for the graph to show a publisher of this very process
-# Keys in /diagnostics by which controllers know each other.
-ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
 
 
 class Rival(NamedTuple):

@@ -17,6 +17,9 @@ V, U = 'v', 'u_hat'
 LOOP = 'loop'
 
 Curves = dict[str, list[float | None]]
+LIVE_PAGE = Path(__file__).with_name('page.html')
+HOST = '127.0.0.1'
+MOST_READERS = 16  # pages that are open at once
 
 
 def rounded(value: float) -> float | None:
@@ -77,11 +80,6 @@ class History:
         """What is kept of the portions from this number on."""
         missed = min(self.end - number, len(self._kept))
         return list(self._kept)[len(self._kept) - missed:]
-
-
-LIVE_PAGE = Path(__file__).with_name('page.html')
-HOST = '127.0.0.1'
-MOST_READERS = 16  # pages that are open at once
 
 
 def bound_socket(port: int) -> socket.socket:

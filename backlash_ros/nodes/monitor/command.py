@@ -39,6 +39,16 @@ from backlash_ros.topics import BACKLASH
 
 # Arrows and function keys come as sequences of which a part looks like other keys.
 KEY_SEQUENCE = re.compile(r'\x1b(\[|O)[0-9;]*.?')
+MONITOR = 'monitor'
+SCREEN_PERIOD_S = 0.2  # of the screen
+LINE_S = 1.0  # between two plain lines
+SERVICE_TIMEOUT_S = 5.0  # longest wait for a service
+NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
+# What a key calls, and the switch of the diagnostics that it turns over.
+ACTIONS = {
+    'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
+    'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
+}
 
 
 @contextmanager
@@ -63,13 +73,6 @@ def pressed_keys(stream: TextIO) -> Iterator[Callable[[], str]]:
         yield read
     finally:
         termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
-
-
-MONITOR = 'monitor'
-SCREEN_PERIOD_S = 0.2  # of the screen
-LINE_S = 1.0  # between two plain lines
-SERVICE_TIMEOUT_S = 5.0  # longest wait for a service
-NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
 
 
 @dataclass
@@ -225,13 +228,6 @@ class MonitorNode(ProcessNode):
 
     def _say(self, text: str) -> None:
         self._notice, self._notice_ends_s = text, time.monotonic() + NOTICE_S
-
-
-# What a key calls, and the switch of the diagnostics that it turns over.
-ACTIONS = {
-    'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
-    'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
-}
 
 
 def main(args: list[str] | None = None) -> int:

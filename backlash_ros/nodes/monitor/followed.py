@@ -21,6 +21,9 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.topics import BACKLASH
 
 DIGITS = re.compile(r'[\d.]+')  # a text in which a figure has changed tells nothing new
+VIEWER_NICENESS = 10  # of a process that only shows: the loop comes first
+# By which a controller is known, or a joint of it.
+WATCHED = re.compile(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}')
 
 
 @dataclass
@@ -96,11 +99,6 @@ class ControllerState:
             return f'silent for {silent_s:.0f} s'
         # An unconfigured or inactive controller has no state of the estimates to tell.
         return self.values.get('state') or self.message.partition(':')[0]
-
-
-VIEWER_NICENESS = 10  # of a process that only shows: the loop comes first
-# By which a controller is known, or a joint of it.
-WATCHED = re.compile(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}')
 
 
 def give_way() -> None:

@@ -21,6 +21,12 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
+KNOWN_RCLPY = ('7.1.',)  # begin of the versions: those of ROS 2 Jazzy
+# Services and events may wait so long.
+LOOK_NS = 100_000_000
+# What is due so soon after a message is done at once: later it might hold up the next message.
+AHEAD_NS = 5_000_000
+
 
 class Polled(MutuallyExclusiveCallbackGroup):
     """Of subscriptions that no executor serves."""
@@ -56,13 +62,6 @@ class Inbox:
     def close(self) -> None:
         """Take no more."""
         self._node.destroy_subscription(self._subscription)
-
-
-KNOWN_RCLPY = ('7.1.',)  # begin of the versions: those of ROS 2 Jazzy
-# Services and events may wait so long.
-LOOK_NS = 50_000_000
-# What is due so soon after a message is done at once: later it might hold up the next message.
-AHEAD_NS = 5_000_000
 
 
 class NodeExecutor(SingleThreadedExecutor):

@@ -21,12 +21,13 @@ from rclpy.parameter import Parameter as RosParameter
 
 from backlash_ros.core.parameters import Parameters, check_value
 from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
-from backlash_ros.core.parameters.joints import entry_of
 from backlash_ros.core.parameters.parameter import Parameter, Value
+from backlash_ros.core.parameters.parameter_set import entry_of
 from backlash_ros.core.parameters.table import CONTROLLER, NODES, PARAMETERS
 
 # Declared by rclpy itself in every node.
 ROS_OWN = {'use_sim_time', 'start_type_description_service'}
+PARAMS_FILE = '--params-file'
 
 
 class ParameterNode(Node):
@@ -179,9 +180,6 @@ def _ros_parameter(name: str, value: Value) -> RosParameter:
             name, kind.STRING_ARRAY if _entry(name).names else kind.DOUBLE_ARRAY, []
         )
     return RosParameter(name, value=_declarable(name, value))
-
-
-PARAMS_FILE = '--params-file'
 
 
 def complaints(arguments: Sequence[str], executable: str, full_name: str) -> list[str]:
