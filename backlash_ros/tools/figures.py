@@ -18,7 +18,7 @@ from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.runs.analysis import (
+from backlash_ros.tools.runs.figure_data import (
     ErrorCurves,
     FollowedReference,
     LawTrace,

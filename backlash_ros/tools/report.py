@@ -27,7 +27,7 @@ from backlash_ros.tools.cli import (
 )
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.page import Picture, facts, page, table
-from backlash_ros.tools.runs.analysis import (
+from backlash_ros.tools.runs.figure_data import (
     compare_laws,
     compared_samples,
     followed_reference,
@@ -41,7 +41,7 @@ from backlash_ros.tools.runs.files import (
     write_run,
     write_summary,
 )
-from backlash_ros.tools.runs.source import read_run
+from backlash_ros.tools.runs.reading import read_run
 from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
 from backlash_ros.topics import BACKLASH
 

@@ -17,10 +17,10 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import InputError, Span
 from backlash_ros.tools.config import write_config
-from backlash_ros.tools.runs import analysis
+from backlash_ros.tools.runs import figure_data
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import Run, write_run, write_summary
-from backlash_ros.tools.runs.source import read_run
+from backlash_ros.tools.runs.reading import read_run
 from backlash_ros.tools.runs.summary import summarise
 
 
@@ -198,11 +198,11 @@ def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
 def test_output_is_compared_with_the_reference_as_late_as_the_structure_makes_it() -> None:
     tracking = Parameters({'structure': 'tracking', 'amplitude': 0.2, 'tracking.preview': 60})
     run = build_closed_loop(tracking).run(300)
-    reference = analysis.followed_reference(run, tracking)
+    reference = figure_data.followed_reference(run, tracking)
     assert reference.delay == pytest.approx(0.6)
     np.testing.assert_array_equal(reference.values[60:], run.column('y_m')[:-60])
     assert reference.followed
-    assert not analysis.followed_reference(run, None).followed
+    assert not figure_data.followed_reference(run, None).followed
     late, prompt = (summarise(run, known)['tracking_error_rms'] for known in (tracking, None))
     assert late < 0.5 < prompt
 
@@ -211,4 +211,4 @@ def test_moving_rms_is_that_of_the_newest_samples() -> None:
     values = np.array([3.0, nan, 4.0, 1e-9, 0.0, 1e-9])
     small = 1e-9 / np.sqrt(2)
     expected = [3.0, 3.0, 4.0, np.sqrt(8.0), small, small]
-    np.testing.assert_allclose(analysis.moving_rms(values, 2), expected, rtol=1e-9)
+    np.testing.assert_allclose(figure_data.moving_rms(values, 2), expected, rtol=1e-9)

@@ -13,7 +13,7 @@ from matplotlib.transforms import Bbox
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import figures
-from backlash_ros.tools.runs import analysis
+from backlash_ros.tools.runs import figure_data
 
 
 @pytest.fixture(scope='module')
@@ -63,9 +63,9 @@ def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None
         for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):
             rows[:, COLUMNS.index(name)] = nan
     shown = replace(run, rows=rows)
-    parts = analysis.interesting_parts(shown, PARAMETERS)
+    parts = figure_data.interesting_parts(shown, PARAMETERS)
     late = shown.column('y_m')
-    references = [analysis.FollowedReference(late, 0.6, followed) for followed in (True, False)]
+    references = [figure_data.FollowedReference(late, 0.6, followed) for followed in (True, False)]
     settling = {'m': 0.5, 'c_r': None, 'c_l': 0.9}
     drawn = [
         figures.draw_estimates(shown), figures.draw_innovation(shown, parts),
@@ -73,7 +73,7 @@ def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None
         *(figures.draw_output(shown, parts[1], reference) for reference in references),
     ]
     if truth:
-        traces = analysis.compare_laws(shown, PARAMETERS)
+        traces = figure_data.compare_laws(shown, PARAMETERS)
         drawn += [
             figures.draw_parameter_errors(shown, parts[0], settling),
             figures.draw_control_error(shown, parts), figures.draw_laws(traces, parts[0]),
@@ -88,8 +88,9 @@ def test_no_text_covers_another_or_the_data(run: RunRecord, truth: bool) -> None
 
 def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
     other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
-    own, *others = analysis.compare_laws(run, other)
+    own, *others = figure_data.compare_laws(run, other)
     assert own.recorded
     assert len(own.t) == run.samples
     assert all('gone.csv' in trace.note for trace in others)
-    assert isinstance(figures.draw_laws([own, *others], analysis.Part('Begin', slice(10))), Figure)
+    part = figure_data.Part('Begin', slice(10))
+    assert isinstance(figures.draw_laws([own, *others], part), Figure)
