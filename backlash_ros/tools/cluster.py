@@ -32,7 +32,7 @@ def run_on_cluster(jobs: Sequence[Job], address: str, label: str = '') -> list[O
         raise InputError(
             "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
         ) from None
-    # What the user is to know is told in one line.
+    # The error below says in one line what the user needs to know.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False)

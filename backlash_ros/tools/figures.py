@@ -32,7 +32,7 @@ from backlash_ros.topics import BACKLASH
 Array = NDArray[np.float64]
 
 TIME_LABEL = 'time t [s]'  # label of an axis
-# Okabe-Ito and Tol: told apart with every kind of colour vision.
+# Okabe-Ito and Tol: distinct with every kind of colour vision.
 HUES = {
     'm': '#0072B2', 'c_r': '#D55E00', 'c_l': '#009E73',
     'u': '#000000', 'u_d': '#E69F00', 'v': '#CC79A7', 'y': '#332288', 'y_m': '#777777',
@@ -52,7 +52,7 @@ matplotlib.rcParams.update({
     'axes.formatter.limits': (-5, 6), 'figure.constrained_layout.use': True, 'figure.dpi': 130,
     'grid.color': '#dddddd', 'grid.linewidth': 0.6, 'legend.fontsize': 10,
     'legend.frameon': False, 'lines.linewidth': 1.3,
-    'agg.path.chunksize': 20_000,  # of a curve with more points than can be told apart
+    'agg.path.chunksize': 20_000,  # of a curve with more points than the eye resolves
 })
 
 
@@ -116,7 +116,7 @@ def zero_line(axes: Axes) -> None:
 
 def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str = '') -> None:
     """Fill between two signals over time, where both are known."""
-    step = slice(None, None, max(len(t) // 2000, 1))  # more points cannot be told apart
+    step = slice(None, None, max(len(t) // 2000, 1))  # the eye resolves no more points
     axes.fill_between(
         t[step], low[step], high[step], color=colour, alpha=0.18, linewidth=0, label=name or '_',
     )

@@ -222,7 +222,7 @@ class RunWatch:
                 )
 
     def _catch_up(self) -> None:
-        """Wait until the recorder has told of all that was published, and say what is missing."""
+        """Wait until the recorder has heard all that was published, and say what is missing."""
         # The middleware sends again what got lost on the way to a recorder that was held up, with
         # its own settings every 3 s.
         deadline = time.monotonic() + 10.0
@@ -273,7 +273,7 @@ class RunWatch:
             _complain_of_missing_output(event.content)
 
     def _judge_exits(self) -> None:
-        """Look at how the processes have ended that were told to."""
+        """Check the exit codes of the processes that were asked to end."""
         bad = []
         for child in self._supervisor.children:
             code = child.process.returncode
@@ -281,7 +281,7 @@ class RunWatch:
                 continue
             if not child.plan.foreign or code == -signal.SIGKILL:
                 bad.append(child.describe_end('did not stop cleanly'))
-            # A driver may end so that was told to by a signal; a shell adds 128 to its number.
+            # A driver may end so of the signal that stops it; a shell adds 128 to its number.
             elif code not in (-signal.SIGINT, -signal.SIGTERM,
                               128 + signal.SIGINT, 128 + signal.SIGTERM):
                 # How a program of the user says good-bye is its own affair.

@@ -372,10 +372,10 @@ def _unique(values: Array) -> tuple[Array, NDArray[np.intp]]:
 
 def _median_period(path: Path, count: Stamps, stamps: Stamps) -> float:
     if count.size < 2:
-        raise InputError(f'{path}: the sample period cannot be told from one sample: give --config')
+        raise InputError(f'{path}: one sample does not show the sample period: give --config')
     period = float(np.median(np.diff(stamps) / np.diff(count))) * 1e-9
     if not period > 0.0:
-        raise InputError(f'{path}: its stamps do not tell the sample period: give --config')
+        raise InputError(f'{path}: its stamps do not show the sample period: give --config')
     return period
 
 

@@ -62,7 +62,7 @@ def summarise(
 
 
 def _beginning(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
-    """The estimates of the first command, and where they are from; None where nobody knows."""
+    """The estimates of the first command, and where they are from; None where that is unknown."""
     first = {name: float(run.column(name)[0]) for name in (*BACKLASH, 'f')}
     if parameters is None:
         return {**first, 'from': None}
