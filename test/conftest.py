@@ -35,12 +35,10 @@ def pytest_configure() -> None:
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports without what takes most of their time, for tests of all else that they hold."""
     monkeypatch.setattr(FigureCanvasAgg, 'print_png', leave_out)
 
 
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Session]]:
-    """Start bringup with arguments; whatever is left of it at the end is killed."""
     with bringup_sessions(tmp_path) as start_session:
         yield start_session

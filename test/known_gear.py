@@ -20,16 +20,13 @@ KNOWN = Estimate(1.0, 0.5, -0.5, 0.0, 1e-3, 2e-3, 2e-3)
 
 
 def estimator_knowing(known: Estimate) -> Law:
-    """The default law, which begins with this estimate."""
     return build_controller(PARAMETERS, known).estimator
 
 
 def answers(u: list[float], late: int = 0) -> NDArray[np.float64]:
-    """y after each u (N,), without noise. late: samples of delay."""
     return np.asarray(lfilter([0.0] * late + list(NUMERATOR), DENOMINATOR, u))
 
 
 def learn(estimator: Law, v: float, y: float) -> None:
-    """Let it take in a sample, and all the time for its fit."""
     estimator.update(y, Interval(v, v, v, 0.0))
     estimator.refine()

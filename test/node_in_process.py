@@ -116,7 +116,6 @@ class Bench:
 
     @property
     def state(self) -> str:
-        """Of the life cycle."""
         return str(self.node._state_machine.current_state[1])
 
     def run(self, samples: int) -> None:
@@ -133,7 +132,6 @@ class Bench:
                 loop.core.refine()  # however long it takes
 
     def serve(self) -> None:
-        """Let the node do what it has to do besides."""
         self._executor.spin_once(timeout_sec=0.005)
         self.probe.spin(0.005)
 

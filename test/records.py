@@ -24,16 +24,13 @@ class Truth(NamedTuple):
 
     @property
     def gap(self) -> float:
-        """Width."""
         return self.c_r - self.c_l
 
     @property
     def theta(self) -> Array:
-        """(m, m c_r, m c_l)."""
         return self.m * np.array([1.0, self.c_r, self.c_l])
 
     def start(self, v: Array) -> float:
-        """Play output before v (N,)."""
         return float(v[0]) + self.share * self.gap
 
 

@@ -68,17 +68,14 @@ class ForkedNode:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
         assert self._process.pid is not None
         return self._process.pid
 
     @property
     def returncode(self) -> int | None:
-        """Its exit code, the negative number of the signal that killed it, or None."""
         return self._process.exitcode
 
     def poll(self) -> int | None:
-        """The same."""
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
@@ -89,12 +86,10 @@ class ForkedNode:
         return self.returncode
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Send a signal to it alone, if it is there."""
         if self.returncode is None:
             os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """Send SIGKILL."""
         self.send_signal(signal.SIGKILL)
 
 
@@ -137,12 +132,10 @@ class NodeProcess:
 
     @property
     def stderr(self) -> str:
-        """What the node has logged."""
         return self._stderr.read_text()
 
     @property
     def stdout(self) -> str:
-        """What the node has printed."""
         return self._stdout.read_text()
 
     def events(self, kind: str) -> list[dict[str, Any]]:
@@ -162,16 +155,13 @@ class NodeProcess:
         return events[0]
 
     def send(self, number: signal.Signals) -> None:
-        """Send a signal to this process alone."""
         self.process.send_signal(number)
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
-        """Signal it and return its exit code."""
         self.send(number)
         return self.wait()
 
     def wait(self) -> int:
-        """Exit code of a node that ends by itself."""
         return self.process.wait(DEADLINE_S)
 
     def kill(self) -> None:
@@ -199,11 +189,9 @@ class Probe:
         return heard
 
     def publisher(self, topic: str, message_type: type[Any]) -> Publisher:
-        """A publisher with deep history."""
         return self.node.create_publisher(message_type, topic, 1000)
 
     def wait_until(self, condition: Callable[[], object], what: str) -> None:
-        """Listen until condition holds."""
         wait_until(condition, what, lambda: self._executor.spin_once(timeout_sec=0.02))
 
     def ask(self, call: Callable[[], Future], what: str) -> Any:
@@ -224,7 +212,6 @@ class Probe:
         return next(future for future in asked if future.done()).result()
 
     def spin(self, seconds: float) -> None:
-        """Listen for a moment."""
         self._executor.spin_once(timeout_sec=seconds)
 
     def close(self) -> None:
@@ -271,6 +258,5 @@ class RosWorld:
 
 @contextmanager
 def ros_world(folder: Path) -> Iterator[RosWorld]:
-    """Nodes that nobody else hears; all are gone when the context is left."""
     with free_domain() as domain, ExitStack() as stack:
         yield RosWorld(folder, domain, stack)

@@ -69,12 +69,10 @@ class Registers:
         self.table[68] = 2
 
     def get(self, address: int) -> int:
-        """Value of a register."""
         size = 4 if address in (GOAL, SPEED, POSITION) else 1
         return int.from_bytes(self.table[address:address + size], 'little', signed=size == 4)
 
     def put(self, address: int, value: int) -> None:
-        """Set a register."""
         size = 4 if address in (GOAL, SPEED, POSITION) else 1
         self.table[address:address + size] = value.to_bytes(size, 'little', signed=size == 4)
 

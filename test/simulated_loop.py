@@ -24,7 +24,6 @@ Fault = Callable[[int, Output], list[Output]]
 
 
 def as_sent(k: int, output: Output) -> list[Output]:
-    """What a sound network makes of the output at tick k."""
     return [output]
 
 
@@ -82,7 +81,6 @@ class SimulatedLoop:
         assert self.error() < error
 
     def error(self) -> float:
-        """The largest relative error of m, c_r and c_l."""
         e = self.loop.estimate
         return float(np.abs(np.array([e.m, e.c_r, e.c_l]) / TRUTH - 1.0).max())
 

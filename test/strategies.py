@@ -26,11 +26,9 @@ class Play:
 
     @property
     def gap(self) -> float:
-        """Width of the gap in v."""
         return self.c_r - self.c_l
 
     def rounding(self, u: float) -> float:
-        """What rounding may change in u, which goes through u / m + c and back."""
         return 1e-12 * (1.0 + abs(u) + self.m * (abs(self.c_r) + abs(self.c_l)))
 
 
@@ -51,7 +49,6 @@ def usual_plays(draw: st.DrawFn) -> Play:
 
 
 def signals(size: float = 100.0, min_size: int = 1, max_size: int = 60) -> st.SearchStrategy:
-    """Any finite signal, with repeated values as well."""
     value = st.one_of(st.floats(-size, size), st.integers(-3, 3).map(float))
     return st.lists(value, min_size=min_size, max_size=max_size)
 
@@ -67,7 +64,6 @@ def strokes(draw: st.DrawFn, size: float = 60.0, most: int = 8) -> list[float]:
 
 
 def eighths(low: int, high: int) -> st.SearchStrategy:
-    """Multiples of 1/8: their products are exact in floating point."""
     return st.integers(low, high).map(lambda i: i / 8.0)
 
 
@@ -115,7 +111,6 @@ def paper_example(**changes: object) -> Parameters:
 
 
 def output_of(model: TransferFunction, u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """y(0..N-1) for u(0..N-1) from rest, by scipy."""
     return np.asarray(signal.lfilter(model.numerator, model.denominator, u))
 
 
@@ -142,16 +137,13 @@ class KnownInput:
 
     @property
     def u_hat(self) -> float:
-        """u(k - lag)."""
         return self._window[0]
 
     @property
     def ready(self) -> bool:
-        """Whether u(k - lag) lies after the start."""
         return self._samples >= self.lag
 
     def newer(self, samples: int) -> float:
-        """u(k - lag + samples), or the newest one."""
         return self._window[min(samples, self.lag - 1)]
 
     def update(self, y: float) -> float:

@@ -11,7 +11,6 @@ NO_PICTURE = b'\x89PNG'
 
 
 def leave_out(canvas: FigureCanvasAgg, file: IO[bytes], **_: object) -> None:
-    """In the place of FigureCanvasAgg.print_png."""
     file.write(NO_PICTURE)
 
 

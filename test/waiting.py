@@ -7,7 +7,6 @@ DEADLINE_S = 60.0  # for a machine under load; nothing here takes long
 
 
 def pause() -> None:
-    """Pass a moment."""
     time.sleep(0.02)
 
 

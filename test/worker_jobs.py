@@ -24,5 +24,4 @@ def last_for_ever(begun: Path) -> None:
 
 
 def foreign_modules() -> list[str]:
-    """What was imported besides the standard library."""
     return sorted({name.partition('.')[0] for name in sys.modules} - sys.stdlib_module_names)

@@ -82,11 +82,9 @@ def heard_from_driver(
 
 
 def faults(heard: Heard, graph: Graph = GOOD_GRAPH, **changes: object) -> list[Finding]:
-    """The findings that are wrong."""
     findings = judge(graph, heard, Parameters(parameters(**changes)))
     return [finding for finding in findings if finding.mark == WRONG]
 
 
 def subjects(findings: list[Finding]) -> list[str]:
-    """What the findings are about."""
     return [finding.subject for finding in findings]

@@ -28,7 +28,6 @@ Sent = Callable[[int, float], list[float]]
 
 
 def as_measured(k: int, y: float) -> list[float]:
-    """What a sound driver sends at sample k."""
     return [y]
 
 
@@ -80,12 +79,10 @@ class PacedDriver:
         self.rest()
 
     def run(self, samples: int) -> None:
-        """Let the plant go on for so many samples."""
         for _ in range(samples):
             self._tick()
 
     def run_until(self, condition: Callable[[], object], what: str) -> None:
-        """Let the plant go on until condition holds."""
         wait_until(condition, what, self._tick)
 
     def learn(self) -> None:
@@ -95,15 +92,12 @@ class PacedDriver:
         self.run_until_known(0.02)
 
     def run_until_known(self, error: float) -> None:
-        """Go on until no estimate is off by more than a share."""
         self.run_until(lambda: self.error() < error, f'estimates within {error:.0%}')
 
     def rest(self) -> None:
-        """Let the plant stand still while nobody is served."""
         self._start = time.monotonic() - self.k * PERIOD_S
 
     def status(self) -> DiagnosticStatus | None:
-        """The newest diagnostics of the controller."""
         statuses = [message.status[0] for message in self._diagnostics]
         return next((s for s in reversed(statuses) if s.name == 'controller'), None)
 
@@ -121,11 +115,9 @@ class PacedDriver:
         return str(values.get(key, ''))
 
     def value(self, key: str) -> float:
-        """The same as a number."""
         return float(self.text(key) or 0.0)
 
     def estimate(self) -> dict[str, float]:
-        """The newest m, c_r, c_l."""
         return dict(zip(('m', 'c_r', 'c_l'), self.estimates[-1].data, strict=False))
 
     def error(self) -> float:

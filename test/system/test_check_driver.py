@@ -36,11 +36,9 @@ class Check(ForkedNode):
 
     @property
     def stdout(self) -> str:
-        """What it has printed so far."""
         return self._files[0].read_text() if self._files[0].exists() else ''
 
     def communicate(self) -> tuple[str, str]:
-        """All that it has printed and complained of, once it has ended."""
         self.wait(DEADLINE_S)
         return self.stdout, self._files[1].read_text()
 

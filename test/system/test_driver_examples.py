@@ -23,7 +23,6 @@ DEADLINE_S = 240.0
 
 
 def commands_of_driver_page() -> list[list[str]]:
-    """The words of every command, in the order of the page."""
     lines = [line for block in BLOCKS for line in block.splitlines()]
     return [words for line in lines if (words := shlex.split(line)) and words[0] != 'export']
 

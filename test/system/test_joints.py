@@ -80,7 +80,6 @@ class Arm:
 
     @staticmethod
     def stamp_ns(k: int) -> int:
-        """Of sample k."""
         return round((1000.0 + k * PERIOD) * 1e9)
 
     def says(self, joint: str, words: str) -> Callable[[], bool]:

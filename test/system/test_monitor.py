@@ -56,7 +56,6 @@ class Screen:
         return ESCAPES.sub('', pictures[-2]) if len(pictures) > 2 else ''
 
     def press(self, keys: str) -> None:
-        """Press keys."""
         os.write(self._master, keys.encode())
 
     def wait(self) -> int:
@@ -67,7 +66,6 @@ class Screen:
 
     @property
     def restored(self) -> bool:
-        """Whether the terminal is as it was before."""
         return termios.tcgetattr(self._slave) == self._before and LEAVE_SCREEN in self.output
 
     def close(self) -> None:

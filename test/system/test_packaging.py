@@ -19,8 +19,6 @@ EXECUTABLES = {
     'controller', 'plant', 'reference', 'recorder', 'bringup', 'simulate', 'report', 'compare',
     'check_driver', 'identify', 'replay', 'monitor', 'live',
 }
-ROS_PREFIXES = ('rclpy', 'ament_')
-ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
 DEADLINE_S = 30.0
 COLCON = [
     sys.executable, '-c', 'import sys; from colcon_core.command import main; sys.exit(main())'
@@ -150,47 +148,3 @@ def test_colcon_installs_what_the_tools_look_for_and_it_runs(
         if controller.poll() is None:
             controller.kill()
         controller.wait()
-
-
-def test_launch_file_starts_a_loop_that_records_and_ends_on_sigint(
-    installation: Path, sourced: Mapping[str, str], driver_context: Context, tmp_path: Path
-) -> None:
-    pytest.importorskip('launch_ros', reason='launch and launch_ros come with ROS 2, not from PyPI')
-    code = (
-        'import sys\n'
-        'from launch import LaunchDescription, LaunchService\n'
-        'from launch.actions import IncludeLaunchDescription\n'
-        'file, *arguments = sys.argv[1:]\n'
-        'service = LaunchService()\n'
-        'service.include_launch_description(LaunchDescription([IncludeLaunchDescription(\n'
-        '    file, launch_arguments=[tuple(each.split(":=")) for each in arguments])]))\n'
-        'sys.exit(service.run())\n'
-    )
-    file = installation / 'share' / 'backlash_ros' / 'launch' / 'backlash.launch.py'
-    arguments = ['config:=geared_motor.yaml', 'namespace:=pan', f'record:={tmp_path / "bag"}']
-    log = tmp_path / 'launch.log'
-    with log.open('wb') as output:
-        launch = subprocess.Popen(
-            [sys.executable, '-c', code, str(file), *arguments], cwd=tmp_path,
-            env={**sourced, 'ROS_LOG_DIR': str(tmp_path / 'log')}, stdout=output, stderr=output,
-        )
-    node = rclpy.create_node('listener', context=driver_context)
-    executor = SingleThreadedExecutor(context=driver_context)
-    executor.add_node(node)
-    commands: list[Float64] = []
-    node.create_subscription(Float64, '/pan/control', commands.append, 10)
-    try:
-        deadline = time.monotonic() + DEADLINE_S
-        while len(commands) < 100 and launch.poll() is None and time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.1)
-        assert len(commands) >= 100, log.read_text()
-        launch.send_signal(signal.SIGINT)
-        launch.wait(DEADLINE_S)
-        assert (tmp_path / 'bag' / 'metadata.yaml').is_file(), log.read_text()
-        assert 'Traceback' not in log.read_text()
-    finally:
-        if launch.poll() is None:
-            launch.terminate()  # which stops what it has started
-            launch.wait()
-        executor.shutdown()
-        node.destroy_node()

@@ -50,12 +50,10 @@ class Listener:
         self.heard.append((time.monotonic(), int(message.data[SAMPLE])))
 
     def wait_for(self, further: int) -> None:
-        """Listen until so many samples more have come."""
         wanted = len(self.heard) + further
         self._probe.wait_until(lambda: len(self.heard) >= wanted, 'further samples')
 
     def before(self, moment: float) -> set[int]:
-        """Samples that came before a moment on the monotonic clock."""
         return {sample for at, sample in self.heard if at < moment}
 
 

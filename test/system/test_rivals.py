@@ -34,7 +34,6 @@ class Stage:
         return self.world.start('controller', values, '-r', f'__node:={name}', *same)
 
     def status(self, name: str) -> DiagnosticStatus | None:
-        """The newest that a controller has said."""
         found = [each for message in self._diagnostics for each in message.status]
         return next((each for each in reversed(found) if each.name == name), None)
 
@@ -47,7 +46,6 @@ class Stage:
         )
 
     def run_until(self, condition: Callable[[], object], what: str) -> None:
-        """Let the loop go on."""
         self.driver.run_until(condition, what)
 
     def samples(self, name: str) -> int:
@@ -57,7 +55,6 @@ class Stage:
         return int(values.get('samples', 0))
 
     def commands(self) -> list[float]:
-        """Every v, whoever sent it."""
         return [message.data for message in self.driver.controls]
 
 

@@ -154,7 +154,6 @@ def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> N
 
 
 def stepped(rest: Rest, inverse: BacklashInverse, estimate: Estimate) -> float:
-    """v after the step that rest asks for."""
     crossings = shrunk_crossings(estimate, rest.state.shrinkage, known=True)
     return inverse.proceed(1.0, *crossings)
 

@@ -59,12 +59,3 @@ def test_a_clock_that_is_set_is_an_interruption_or_taken_for_lost_outputs(
     world.run(100)
     assert world.statistics.interruptions == interruptions
     assert world.statistics.lost == lost
-
-
-def test_a_driver_that_is_restarted_is_an_interruption() -> None:
-    world = World()
-    world.run(100)
-    world.driver.down_until = 150
-    world.run(100)
-    assert world.statistics.interruptions == 1
-    assert world.statistics.lost == 0

@@ -51,39 +51,6 @@ def test_lost_outputs_leave_the_estimates_within_5_percent(share: float, publish
     world.check_sanity()
 
 
-def lost_in_bursts(k: int, output: Output) -> list[Output]:
-    return [] if k % 150 >= 100 else [output]
-
-
-def doubled(k: int, output: Output) -> list[Output]:
-    return [output, output]
-
-
-class Swapped:
-    """Every tenth output comes after the one that follows it."""
-
-    def __init__(self) -> None:
-        self._kept: list[Output] = []
-
-    def __call__(self, k: int, output: Output) -> list[Output]:
-        if k % 10 == 9:
-            self._kept = [output]
-            return []
-        kept, self._kept = self._kept, []
-        return [output, *kept]
-
-
-@pytest.mark.parametrize(('fault', 'extra'), [(lost_in_bursts, 0), (doubled, 400), (Swapped(), 40)])
-def test_bursts_repetitions_and_wrong_order_leave_the_estimates_within_5_percent(fault, extra):
-    world = SimulatedLoop()
-    world.learn()
-    world.fault = fault
-    world.run(400)
-    assert world.error() < 0.05
-    assert world.loop.statistics.extra == extra
-    world.check_sanity()
-
-
 @pytest.mark.parametrize(('share', 'use'), [
     (0.01, 'auto'), (0.1, 'true'), (0.3, 'auto'), (0.3, 'true'),
 ])

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from cases.geared_motor import motor, random_backlash
-from contract.learning_rows import Job, run_job
 from places import ROOT
 
 from backlash_ros.core.estimate import Status
@@ -51,11 +50,3 @@ def test_first_swap_waits_until_the_gap_was_crossed_with_the_first_estimate(seed
     assert swaps
     for k in swaps:
         assert moves[k:k + 5].max() <= moves[k - 200:k].max()
-
-
-@pytest.mark.parametrize('seed', [6, 7])
-def test_load_that_coasts_is_not_tracked_with_more_error_than_stated(seed: int) -> None:
-    gear = {**motor(), **random_backlash(seed), 'seed': seed}
-    found = run_job(Job('', gear, 10.0, {'damping': 0.5})).judged
-    assert found is not None
-    assert found.wrong <= 0.1

@@ -53,12 +53,10 @@ class Arm:
         return self.sent[-1]
 
     def change(self, name: str, value: float) -> str:
-        """Set a parameter; returns why it cannot be, empty where it can."""
         result = self.node.set_parameters_atomically([Parameter(name, value=value)])
         return '' if result.successful else str(result.reason)
 
     def lose(self, joint: str) -> None:
-        """Let one joint be silent for longer than any timeout."""
         self.node.loops.by_name[joint].heard_at = -1e9
         self.node._look_for_silence()
 

@@ -17,7 +17,6 @@ from std_srvs.srv import Trigger
 
 from backlash_ros.nodes.runtime import executor as prompt_executor
 from backlash_ros.nodes.runtime.executor import Inbox, NodeExecutor, PromptExecutor, make_executor
-from backlash_ros.nodes.runtime.process import spin_paced
 from backlash_ros.tools.bringup.environment import free_domain
 
 
@@ -32,7 +31,6 @@ class Loop:
         self.publisher = self.node.create_publisher(Float64, 'number', 10)
 
     def spin_until(self, condition: Callable[[], object], what: str) -> None:
-        """Serve until condition holds."""
         wait_until(condition, what, lambda: self.executor.spin_once(timeout_sec=0.02))
 
     def say(self, *values: float) -> None:
@@ -158,25 +156,3 @@ def test_a_guard_condition_of_another_thread_ends_a_long_wait(loop: Loop) -> Non
     threading.Thread(target=guard.trigger).start()
     loop.spin_until(lambda: called, 'the guard condition')
     assert called == [True]
-
-
-def test_what_may_wait_is_served_after_a_tick_and_not_before_one(fast_loop: Loop) -> None:
-    ticked, calls = False, []
-
-    def tick(number: int, due_ns: int) -> bool:
-        nonlocal ticked
-        ticked = True
-        return number < 100
-
-    def idle() -> bool:
-        nonlocal ticked
-        ticked = False
-        return True
-
-    steady = Clock(clock_type=ClockType.STEADY_TIME)
-    fast_loop.node.create_subscription(Float64, 'number', lambda message: None, 10)
-    fast_loop.node.create_timer(0.01, lambda: calls.append(ticked), clock=steady)
-    fast_loop.node.stopping = False
-    spin_paced(fast_loop.node, fast_loop.executor, 2e-3, tick, idle)
-    assert calls
-    assert all(calls)

@@ -32,7 +32,6 @@ DEAF = (
 
 
 def begun(file: Path) -> str:
-    """A statement that tells the test where a program has come to."""
     return f'open({str(file)!r}, "w").close();'
 
 

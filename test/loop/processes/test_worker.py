@@ -20,7 +20,6 @@ from backlash_ros.core.estimation.executor import (
     LOST,
     Channel,
     Failure,
-    InlineExecutor,
     Record,
     Samples,
 )
@@ -76,18 +75,6 @@ def begin(channel: Channel, begun: Path) -> None:
     begun.unlink(missing_ok=True)
     assert channel.submit(last_for_ever, begun)
     wait_until(lambda: channel.poll() is None and begun.exists(), 'the job is under way')
-
-
-def test_results_are_those_of_a_computation_in_place(executor: WorkerExecutor) -> None:
-    rng = np.random.default_rng(1)
-    channels = [place.open(3, 500) for place in (executor, InlineExecutor())]
-    for k in range(40):
-        for row in rng.standard_normal((rng.integers(0, 150), 3)).tolist():
-            for channel in channels:
-                channel.append(*row)
-        for channel in channels:
-            assert channel.submit(checksum, float(k))
-        assert result_of(channels[0]) == result_of(channels[1])
 
 
 def test_what_a_job_raises_or_cannot_return_comes_back_as_a_value(executor):

@@ -34,7 +34,6 @@ def noisy(changes: dict[str, object] | None = None) -> Parameters:
 
 @pytest.fixture
 def one_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No further processes, which take longer to start than these runs last."""
     monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0}, raising=False)
 
 
@@ -202,21 +201,6 @@ def test_interrupted_seeds_end_at_once_with_one_line(tmp_path: Path, number: int
         assert process.returncode == 1
         assert err == 'simulate: interrupted\n'
         wait_until(lambda: is_gone(process.pid), 'the end of every process')
-    finally:
-        if not is_gone(process.pid):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
-    command = [sys.executable, '-m', 'backlash_ros.tools.simulate', '--seeds', '4',
-               '--duration', '100000', '--out', str(tmp_path / 'out')]
-    process = subprocess.Popen(command, cwd=ROOT, start_new_session=True)
-    try:
-        wait_until(lambda: len(children(process.pid)) > 1, 'the start of a worker')
-        process.kill()
-        assert process.wait() == -signal.SIGKILL
-        wait_until(lambda: is_gone(process.pid), 'the end of every worker')
     finally:
         if not is_gone(process.pid):
             os.killpg(process.pid, signal.SIGKILL)

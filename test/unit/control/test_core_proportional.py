@@ -20,7 +20,6 @@ def estimate_of(play: Play, f_over_m: float) -> Estimate:
 
 
 def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
-    """The structure looks at the reference and the estimate alone."""
     return Proportional().control(ControlInput(y_m, 0.0, estimate, NO_STATE), inverse)
 
 
@@ -78,18 +77,6 @@ def test_f_near_or_beyond_m_is_limited(play: Play, y_m: float, share: float) -> 
         y_m + command.f * command.v, abs=tolerance(play, y_m, command.u_d)
     )
     assert LARGEST_F_OVER_M == LARGEST_SHARE
-
-
-@given(play=usual_plays(), share=st.floats(-0.8, -0.1), y_m=st.floats(1.0, 100.0))
-def test_v_is_held_where_no_branch_agrees(play: Play, share: float, y_m: float) -> None:
-    """With f < 0 the two solutions lie the other way round and leave a range between them."""
-    inverse, estimate = BacklashInverse(), estimate_of(play, share)
-    top = control(1000.0, estimate, inverse)
-    right_less_left = play.m * estimate.f * play.gap / (play.m - estimate.f)
-    little_less = 1000.0 + 0.5 * right_less_left * (play.m - estimate.f) / play.m
-    held = control(little_less, estimate, inverse)
-    assert held.v == top.v
-    assert held.u_d == pytest.approx(little_less + held.f * held.v)
 
 
 def test_v_does_not_stay_where_estimates_far_off_have_led_it() -> None:

@@ -43,7 +43,6 @@ def sent(limits: Limits, targets: list[float], v: float = 0.0) -> list[float]:
 
 
 def accelerations(v: list[float]) -> list[float]:
-    """Changes of the move, from rest."""
     return np.abs(np.diff(v, 2, prepend=[v[0]])).tolist()
 
 

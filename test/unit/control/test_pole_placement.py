@@ -56,7 +56,6 @@ def test_loop_without_backlash_answers_as_the_reference_model_says(filter_pole: 
 
 
 def closed_of(p: Parameters) -> np.ndarray:
-    """A_m that the parameters lead to, read off the loop's own reference model."""
     from backlash_ros.core.assembly import build_four_blocks
     return build_four_blocks(p).reference.denominator
 

@@ -29,7 +29,6 @@ def record(
 
 
 def of(v: np.ndarray, y: np.ndarray, uncertainty: float = 0.2, **options: object) -> RecordFit:
-    """The fit with the exact G, unless told otherwise."""
     known = {'model': MODEL, 'noise_std': NOISE, **options}
     return fit_record(v, y, uncertainty=uncertainty, **known)
 
@@ -62,17 +61,6 @@ def test_backlash_and_noise_are_found(m, c_r, c_l, share, seed, uncertainty):
     assert fit.correlation == 0.0
     assert fit.delay == 0
     assert fit.outliers == 0
-
-
-@pytest.mark.parametrize(('delay', 'm', 'gap'), [(0, 2.0, 0.5), (3, -0.1, 2.0)])
-def test_without_noise_the_fit_is_exact(delay: int, m: float, gap: float) -> None:
-    truth = Truth(abs(m), 0.4 * gap, -0.6 * gap)
-    v, y = record(400, truth, noise=0.0, delay=delay)
-    y = np.copysign(1.0, m) * y
-    y[::17] = nan
-    fit = of(v, y, 0.0, noise_std=1e-9, delays=range(6))
-    assert fit.delay == delay
-    assert (fit.m, fit.c_r, fit.c_l) == pytest.approx((m, 0.4 * gap, -0.6 * gap), rel=1e-4)
 
 
 @pytest.mark.parametrize('delay', [0, 2, 5])

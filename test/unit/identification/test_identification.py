@@ -43,7 +43,6 @@ def motion(count: int, reach: float = 3.0, rate: float = 40.0) -> Array:
 def record(
     count: int = 1600, gap: float = 0.9, c_r: float = 0.5, noise: float = 2e-3, seed: int = 1,
 ) -> tuple[Array, Array]:
-    """v and y of a load on a spring behind a gap, one sample of delay."""
     v = motion(count)
     return v, answer(v, gap, c_r, noise, seed)
 

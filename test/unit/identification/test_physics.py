@@ -14,7 +14,6 @@ SERVO = PRESETS['servo']
 
 @pytest.fixture(scope='module')
 def identified() -> gear_runs.Identified:
-    """The servo, identified from its limits alone."""
     return gear_runs.identified(SERVO, encoder=False)
 
 

@@ -16,7 +16,6 @@ PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
 
 
 def play_output(samples: int = 400) -> Array:
-    """A sine with the flat tops that a backlash leaves, amplitude 10."""
     return np.clip(14.0 * np.sin(0.126 * np.arange(samples)), -10.0, 10.0)
 
 

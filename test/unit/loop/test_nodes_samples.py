@@ -61,7 +61,6 @@ def test_a_gap_in_the_numbers_counts_though_messages_come_in_a_burst(gaps: list[
 def over(
     commands: CommandHistory, intervals: int, end: float, due: float | None = None,
 ) -> list[float]:
-    """v over intervals of which the last one ended at `end`, in time unless told [samples]."""
     end_ns, due_ns = (START_NS + int(t * PERIOD_NS) for t in (end, end if due is None else due))
     return commands.over(intervals, end_ns, due_ns)[0]
 
@@ -260,18 +259,15 @@ def test_clock_that_is_set_back_is_believed_after_some_samples(jump: int) -> Non
 
 
 def slow(share: float, jitter: float = 0.05) -> list[float]:
-    """Stamps [periods] of a sender that is slow by this share, with some jitter."""
     rng = np.random.default_rng(3)
     return [k * (1.0 + share) + jitter * float(rng.random()) for k in range(2000)]
 
 
 def drifting() -> list[float]:
-    """A period that grows by 10 % and shrinks again."""
     return np.cumsum(1.05 + 0.05 * np.sin(np.arange(2000) / 200.0)).tolist()
 
 
 def pausing() -> list[float]:
-    """Every 40th period is longer by half: a sender that sleeps for a period after its work."""
     return np.cumsum([1.5 if k % 40 == 39 else 1.0 for k in range(2000)]).tolist()
 
 

@@ -35,9 +35,3 @@ def test_all_joints_are_commanded_where_their_differences_add_up_to_more_than_th
     if published:
         assert list(message.position) == list(known.commands.values())
         assert known.write() is not None  # again, as long as the joints are elsewhere
-
-
-def test_states_are_taken_by_name_and_only_where_they_are_finite() -> None:
-    known = system(a=0.5, b=0.25)
-    known.read(JointState(name=['other', 'b', 'a'], position=[9.0, 0.75, math.nan]))
-    assert known.states == {'a': 0.5, 'b': 0.75}

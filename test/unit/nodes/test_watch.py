@@ -10,7 +10,6 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.nodes.control.publishing import (
-    WATCH_LOOK_S,
     WATCH_PERIOD_S,
     WatchPublisher,
     watched_values,
@@ -56,20 +55,6 @@ def watch_of() -> tuple[WatchPublisher, Mapping[str, FakePublisher]]:
 def run(watch: WatchPublisher, rate_hz: float, seconds: float) -> None:
     for k in range(round(rate_hz * seconds)):
         watch.follow(SIGNALS, ESTIMATES, k / rate_hz)
-
-
-def test_nothing_is_published_and_seldom_anything_asked_while_nobody_listens() -> None:
-    watch, publishers = watch_of()
-    run(watch, 1000.0, 10.0)
-    assert all(publisher.sent == [] for publisher in publishers.values())
-    assert all(publisher.looks <= 10.0 / WATCH_LOOK_S for publisher in publishers.values())
-
-
-def test_only_what_is_listened_to_is_published() -> None:
-    watch, publishers = watch_of()
-    publishers['~/watch/c_l'].listeners = 1
-    run(watch, 100.0, 1.0)
-    assert {topic for topic, each in publishers.items() if each.sent} == {'~/watch/c_l'}
 
 
 @pytest.mark.parametrize('rate_hz', [10.0, 50.0, 60.0, 200.0, 1000.0, 5000.0])

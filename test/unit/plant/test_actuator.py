@@ -6,7 +6,7 @@ import pytest
 from backlash_ros.core.assembly import build_controller, build_plant
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.plant.actuator import Actuator, Motor
+from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 LAG = TransferFunction((0.05, 0.05), (1.0, -1.6, 0.65), 'actuator')  # gain 2
@@ -29,19 +29,6 @@ def response_to(commands: list[float]) -> np.ndarray:
         y.append(plant.measure())
         plant.step(command)
     return np.array(y)
-
-
-def test_in_front_of_g_without_a_gap_is_what_both_do_one_after_the_other() -> None:
-    serial = ACTUATOR.in_front_of(MODEL)
-    a, b, _ = serial.state_space()
-    inner_a, inner_b, _ = MODEL.state_space()
-    x, inner = np.zeros(serial.order), np.zeros(MODEL.order)
-    motor = Motor(Actuator(LAG))
-    for k in range(60):
-        command = np.sin(0.2 * k)
-        x = a @ x + b * command
-        inner = inner_a @ inner + inner_b * motor.step(command, 0.0, 100.0, -100.0)
-        assert x[0] == pytest.approx(inner[0], abs=1e-12)
 
 
 def test_a_command_beyond_its_crossing_moves_y_and_within_does_not() -> None:

@@ -38,7 +38,6 @@ def test_chirp_sweeps_its_frequency_and_starts_again() -> None:
     step = 1e-4
 
     def frequency(t: float) -> float:
-        """From the phase: y_m^2 + (y_m'/omega)^2 = 1."""
         slope = (chirp(t + step) - chirp(t - step)) / (2.0 * step)
         return abs(slope) / (1.0 - chirp(t) ** 2) ** 0.5
 

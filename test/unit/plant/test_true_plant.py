@@ -38,7 +38,6 @@ def step_response(model: TransferFunction, samples: int) -> NDArray[np.float64]:
 
 
 def continuous(model: TransferFunction) -> bool:
-    """Whether a G(s) of the same order has this response."""
     poles = model.poles
     return not np.any((poles.real <= 0.0) & (np.abs(poles.imag) < 1e-3))
 
@@ -53,17 +52,6 @@ def test_scaled_damping_is_the_motor_with_that_damping(damping: float) -> None:
     altered = altered_plant(motor(), Alteration(damping=damping / 0.5))
     # Two poles that meet are known to the square root of the rounding error only.
     assert_equal(altered, motor(damping=damping), 1e-12)
-
-
-@given(plants(), st.sampled_from([2, 3]))
-def test_plant_with_scaled_frequency_takes_the_same_way_faster(model, factor):
-    assume(continuous(model))
-    altered = altered_plant(model, Alteration(frequency=factor))
-    way, faster = step_response(model, 60 * factor)[::factor], step_response(altered, 60)
-    # An integrator keeps its velocity gain: there is less time for as much speed.
-    integrates = np.any(np.abs(model.poles - 1.0) < 1e-6)
-    expected = way / factor if integrates else way
-    np.testing.assert_allclose(faster, expected, rtol=0.0, atol=1e-7 * np.abs(way).max())
 
 
 @given(plants(), st.integers(0, 2), st.integers(1, 3))

@@ -38,7 +38,6 @@ INSTALLED = re.compile(r'/lib/backlash_ros/(\w+)')
 LINK = re.compile(r'\]\(([^)\s]+)\)')
 CODE = re.compile(r'`([^`\n]+)`')
 DOTTED = re.compile(r'[a-z_]+(\.[a-z_0-9]+)+')
-SETTING = re.compile(r'^(?P<name>[a-z_.]+): (?P<value>\S.*)$')
 GROUPS = {name.split('.')[0] for name in BY_NAME if '.' in name}
 # Files of a result and topics share their first word with a group of parameters.
 FILE_ENDINGS = {'py', 'yaml', 'json', 'csv', 'md', 'html', 'txt'}
@@ -113,17 +112,6 @@ def test_parameters_that_pages_name_exist() -> None:
     groups = {name.rsplit('.', 1)[0] for name in BY_NAME if '.' in name}
     assert named & set(BY_NAME)
     assert named <= set(BY_NAME) | groups
-
-
-def test_settings_that_pages_name_are_accepted() -> None:
-    settings = [
-        (found['name'], found['value']) for _, code in of_every_page(CODE)
-        if (found := SETTING.match(code)) and found['name'] in BY_NAME
-        and found['value'] != 'n'
-    ]
-    assert settings
-    for name, value in settings:
-        effective_parameters(None, [f'{name}={value}'])
 
 
 @pytest.mark.parametrize('words', shell_commands(), ids=' '.join)

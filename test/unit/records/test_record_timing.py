@@ -16,7 +16,6 @@ COUNT = 1200
 
 
 def position(t: Array) -> Array:
-    """A motion that is known at any time."""
     return np.asarray(np.sin(5.0 * t) + 0.4 * np.sin(11.0 * t + 1.0))
 
 
@@ -34,7 +33,6 @@ def even(count: int = COUNT) -> Array:
 
 
 def off(record: Record, begin: float = 0.0) -> float:
-    """How far y is from the motion at the instants of the grid, root mean square."""
     t = begin + record.sample_period * np.arange(len(record.y))
     return float(np.sqrt(np.nanmean((record.y - position(t))**2)))
 

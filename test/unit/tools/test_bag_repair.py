@@ -91,7 +91,6 @@ class Finished:
         self.data = message_file(self.bag).read_bytes()
 
     def numbers_within(self, size: int) -> int:
-        """How many numbers had been flushed when the file was no larger than this."""
         return max(count for end, count in self.flushed if end <= size)
 
     @contextmanager
@@ -113,7 +112,6 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Finished]:
 
 
 def repaired_numbers(bag: Path) -> list[float]:
-    """What the repair leaves; nothing if it says that nothing can be saved."""
     return numbers_in(bag) if is_complete_after_repair(bag) else []
 
 
@@ -170,16 +168,6 @@ def test_sqlite_that_lost_its_end_gives_the_messages_before_it(finished):
     whole = finished['sqlite3']
     with whole.with_file(whole.data[:-2 * PAGE], metadata=True) as bag:
         assert MESSAGES // 2 < len(repaired_numbers(bag)) < MESSAGES
-
-
-def test_files_of_a_split_bag_and_lone_files_are_read_in_their_order(tmp_path, finished):
-    whole = finished['mcap']
-    for number in (10, 9):
-        shutil.copy(message_file(whole.bag), tmp_path / f'bag_{number}.mcap')
-    assert [file.name for file in BagReader(tmp_path).files] == ['bag_9.mcap', 'bag_10.mcap']
-    lone = BagReader(tmp_path / 'bag_9.mcap')
-    assert sum(topic.name == '/number' for topic, *_ in lone.messages()) == MESSAGES
-    assert lone.damage == ''
 
 
 @pytest.mark.parametrize('storage', STORAGE)
