@@ -11,7 +11,7 @@ milliseconds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
+from collections.abc import MutableMapping
 from pathlib import Path
 
 PROFILE = Path(__file__).with_suffix('.xml')
@@ -20,21 +20,12 @@ VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
 OF_THE_FOLDER = 'DEFAULT_FASTRTPS_PROFILES.xml'  # read by Fast DDS from the working directory
 
 
-def is_confined(environment: Mapping[str, str]) -> bool:
-    """Whether nobody of another machine is to be met, but for those that are named."""
-    return environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == 'LOCALHOST'
-
-
-def names_peers(environment: Mapping[str, str]) -> bool:
-    """Whether other machines are named."""
-    return bool(environment.get('ROS_STATIC_PEERS'))
-
-
 def prefer_loopback(environment: MutableMapping[str, str]) -> None:
     """Choose a profile, before rclpy.init, if nobody else or named machines alone are to be met.
 
     A profile of the user's own stays in force.
     """
-    if is_confined(environment) and not Path(OF_THE_FOLDER).exists():
-        profile = NETWORK_PROFILE if names_peers(environment) else PROFILE
-        environment.setdefault(VARIABLE, str(profile))
+    confined = environment.get('ROS_AUTOMATIC_DISCOVERY_RANGE') == 'LOCALHOST'
+    if confined and not Path(OF_THE_FOLDER).exists():
+        alone = not environment.get('ROS_STATIC_PEERS')
+        environment.setdefault(VARIABLE, str(PROFILE if alone else NETWORK_PROFILE))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import socket
 import sys
 import time
@@ -21,15 +20,13 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
 from backlash_ros.core.loop.diagnosis import UNNAMED
-from backlash_ros.middleware.loopback import is_confined, names_peers
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 LISTED = Path('/proc/net/unix')
-# What discovery mostly takes, and where all are on this machine: a publisher that is found so soon
-# after the start of a node was there before it. Controllers of this machine are waited for however
-# long it takes.
-DISCOVERY_S, DISCOVERY_HERE_S = 0.7, 0.4
+# What discovery mostly takes: a publisher that is found so soon after a node was made was there
+# before it. Controllers of this machine are waited for however long it takes.
+DISCOVERY_S = 0.7
 HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
 OWN_ENDPOINT_S = 10.0  # longest wait for the graph to show a publisher of this very process
 # Keys in /diagnostics by which controllers know each other.
@@ -161,9 +158,7 @@ class RivalWatch:
         self.found: tuple[Rival, ...] = ()
         self._node, self._changed = node, changed
         own = identity_made_by(node, self.topic, advertise)
-        here = is_confined(os.environ) and not names_peers(os.environ)
-        takes_s = DISCOVERY_HERE_S if here else DISCOVERY_S
-        self._rivals = Rivals(own, node.begun_at + takes_s)
+        self._rivals = Rivals(own, node.begun_at + DISCOVERY_S)
         self._presence = Presence(node.context.get_domain_id(), self.topic, own)
         self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
         self._others: frozenset[str] = frozenset()
