@@ -15,8 +15,7 @@ Made from [table.py](../../backlash_ros/core/parameters/table.py) by `make docs`
 The nodes, `bringup` and `simulate` all read one YAML file:
 [paper_example.yaml](../../config/paper_example.yaml) shows every group.
 `y`, `y_m`, `u` and `v` stand for the units of those signals. Parameters marked *live* may change in
-a running node; all others of `controller`, but for `io.*`, `lockstep`, `autostart`,
-`wait_for_subscribers` and `estimator.use_applied_control`, while it is unconfigured.
+a running node; all others of `controller`, but for those marked *fixed*, while it is unconfigured.
 
 | name | default | unit | allowed | meaning | used by |
 |---|---|---|---|---|---|
@@ -29,7 +28,7 @@ def parameters_page() -> str:
 
 
 def _row(p: Parameter) -> str:
-    users = ', '.join(p.used_by) + (', *live*' if p.live else '')
+    users = ', '.join([*p.used_by, *(['*live*'] * p.live), *(['*fixed*'] * p.fixed)])
     cells = (f'`{p.name}`', f'`{as_yaml(p.default)}`', p.unit, _allowed(p), p.description, users)
     return '| ' + ' | '.join(cell.replace('|', '\\|') for cell in cells) + ' |'
 
