@@ -131,7 +131,7 @@ def afresh(
         if m * sign > 0.0 and all(abs(gap - other) > APART * other for other in gaps):
             gaps.append(gap)
             theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], begin])
-            start = Fit(np.zeros(1), p0, theta, noise)
+            start = p.step(Fit(np.zeros(1), p0, theta, noise), 1.0, held=True)
             fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
     if also is not None and also.m > 0.0:
         begins = replace(also, step=0.0, noise_std=also.noise, x=np.zeros(1))
@@ -139,8 +139,10 @@ def afresh(
     fits = [f for f in fits if np.isfinite(f.evidence)]
     if not fits:
         return None
+    fits = p.comparable(fits)
     top = max(f.evidence for f in fits)
     fits = [p.finished(p.fitted(f)) if f.evidence > top - FAR_BEHIND else f for f in fits]
+    fits = p.comparable(fits)
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0:
         return best
@@ -164,7 +166,8 @@ def with_walk(p: Problem, f: Fit) -> Fit:
         walking = p.walking(share * f.m * f.gap / sqrt(len(p.v)))
         begin = replace(f, knots=np.zeros(0), step=0.0, noise_std=f.noise)
         g = walking.with_intervals(walking.fitted(begin, FIRST_STEPS))
-        if g.valid and g.evidence > best.evidence + (0.0 if best.walk_std else WALKING):
+        of_best, of_g = (each.evidence for each in walking.comparable([best, g]))
+        if g.valid and of_g > of_best + (0.0 if best.walk_std else WALKING):
             best = g
     return best
 

@@ -221,10 +221,11 @@ class Problem:
 
     # --- a Gauss-Newton step --------------------------------------------------------------------
 
-    def step(self, f: Fit, most_scale: float = np.inf) -> Fit:
+    def step(self, f: Fit, most_scale: float = np.inf, held: bool = False) -> Fit:
         """The values that the linearization around f makes likeliest, with their posterior.
 
-        Raises LinAlgError where the numbers get too large.
+        held: whether gap and beginning stay, so that all else fits them. Raises LinAlgError where
+        the numbers get too large.
         """
         x, y = self._around(f)
         weights = self.weights(y)
@@ -236,7 +237,7 @@ class Problem:
         rows = np.empty((len(self.v), len(beta) + 1), order='F')
         np.multiply(jacobian, root[:, None], out=rows[:, :-1])
         rows[:, -1] = target
-        stack = np.concatenate([rows, *self._beside(replace(f, x=x), len(beta))])
+        stack = np.concatenate([rows, *self._beside(replace(f, x=x), len(beta), held)])
         scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
         scale[-1] = 1.0
         r = lapack.dgeqrf(np.asfortranarray(stack / scale))[0][:len(beta) + 1]
@@ -281,8 +282,8 @@ class Problem:
             )
         return out
 
-    def _beside(self, f: Fit, size: int) -> list[Array]:
-        """Rows of what is known beside the samples."""
+    def _beside(self, f: Fit, size: int, held: bool) -> list[Array]:
+        """Rows of what is known beside the samples, or what gap and beginning are held at."""
         first = size - 3 - self.family.count  # place of m
         rows: list[Array] = []
         if self.older is not None:
@@ -293,7 +294,10 @@ class Problem:
         wide[0, first + 2] = 1.0 / max(float(np.ptp(self.v)), 1e-300)  # the gap is within the swing
         begin = np.zeros((1, size + 1))
         begin[0, first - 1] = 1.0
-        if self.start is None:  # anywhere within the gap of now
+        if held:
+            wide[0, first + 2], wide[0, -1] = TIGHT, TIGHT * f.gap
+            begin[0, first - 1], begin[0, -1] = TIGHT, TIGHT * f.p0
+        elif self.start is None:  # anywhere within the gap of now
             begin[0, -1] = self.v[0] + 0.5 * f.gap
             begin *= sqrt(12.0) / max(f.gap, 1e-9)
         else:
@@ -422,12 +426,21 @@ class Problem:
         free = max(float(w.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
         return sqrt((float((w * r) @ r) + self.nominal**2) / (free + 1.0))
 
-    def finished(self, f: Fit) -> Fit:
-        """The same with its evidence and the correlation of what is left."""
+    def comparable(self, fits: list[Fit]) -> list[Fit]:
+        """The same with evidence that counts each reading alike: as the closest fit has it."""
+        closest = min(fits, key=lambda f: f.rms)
+        w = self.weights(self.output(closest))
+        return [f if f is closest else self.finished(f, w) for f in fits]
+
+    def finished(self, f: Fit, w: Array | None = None) -> Fit:
+        """The same with its evidence and the correlation of what is left.
+
+        w: weights of the readings (N,), None: those of f.
+        """
         p, _ = self.input(f)
         y = self.output(f)
         r = np.where(self.known, self.y - y, 0.0)
-        w = self.weights(y)
+        w = self.weights(y) if w is None else w
         likelihood, score, information = told(r, f.noise_std, f.step)
         known = self.known
         count = float(w.sum())

@@ -249,7 +249,8 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
         known = before.published
         crosses = known is not None and np.ptp(record.v) > known[1] - known[2]
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
-    wrong = found.m < 0.0 or found.count * found.correlation > 1.0
+    systematic = found.count * found.correlation > 1.0
+    wrong = found.m < 0.0 or (systematic and found.noise > AS_GOOD * _noise(setup, found))
     contradicts = before.published is not None and is_known(setup, found, found.turns)
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
 
@@ -348,6 +349,7 @@ def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> 
     other = afresh(setup, record)
     if other is None or not is_known(setup, other, 9):
         return fit
+    fit, other = problem.comparable([fit, other])
     best = other if other.evidence > fit.evidence + 3.0 else fit
     return replace(best, spread=spread(best, [fit, other]))
 
