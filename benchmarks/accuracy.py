@@ -61,6 +61,9 @@ ROWS: dict[str, Measured] = {
     'simulate': Measured(
         timing_rows.simulate_jobs, timing_rows.run_simulate, timing_rows.times_figures,
         alone=True),
+    'identify': Measured(
+        timing_rows.identify_jobs, timing_rows.run_identify, timing_rows.times_figures,
+        alone=True),
     'bound': Measured(
         learning_rows.bound_jobs, learning_rows.run_job, learning_rows.bound_figures),
     'losses': Measured(

@@ -129,3 +129,26 @@ def _multisine(rng: np.random.Generator, reach: float, period: float, count: int
         )
     ], axis=0)
     return np.asarray(reach * v / np.abs(v).max())
+
+
+NO_PLAYS = ('no play', 'dead zone', 'saturation', 'many plays', 'pushed')
+
+
+def without_play(kind: str, seed: int) -> tuple[Array, Array, Array]:
+    """t, v, y (N,) of what looks like a play, and is none, or not that alone."""
+    rng = np.random.default_rng([seed, len(kind)])
+    period, count = 0.01, 2000
+    v = _multisine(rng, 1.0, period, count)
+    if kind == 'pushed':  # v in steps, with rests in which something else moves the load
+        v = np.repeat(np.round(v[::100], 1), 100)
+    size = float(rng.uniform(0.1, 0.3))
+    u = {
+        'dead zone': lambda: np.sign(v) * np.maximum(np.abs(v) - size, 0.0),
+        'saturation': lambda: np.clip(play(v, 0.3 * size, 0.0), -2.0 * size, 2.0 * size),
+        'many plays': lambda: np.mean([play(v, g, 0.0) for g in np.linspace(0, 3 * size, 12)], 0),
+    }.get(kind, lambda: v)()
+    a = float(rng.uniform(0.6, 0.9))
+    y = lfilter([0.0, 1.0 - a], [1.0, -a], u)
+    if kind == 'pushed':
+        y = y + 0.3 * size * np.sin(0.07 * np.arange(count)) * (np.arange(count) % 400 > 200)
+    return period * np.arange(count), v, y + 2e-3 * rng.standard_normal(count)

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from cases.geared_motor import flat, motor
 from cases.held_up import HeldUpProcesses
-from cases.identification_cases import random_case
+from cases.identification_cases import NO_PLAYS, random_case, without_play
 from faults import Result, play
 from gears.gear_runs import (
     PRESETS,
@@ -167,19 +167,24 @@ class Identified(NamedTuple):
     fitted: tuple[float, float] | None = None
 
 
-CLEAN, SPOILT = 'clean', 'as people record'
+CLEAN, SPOILT, NONE = 'clean', 'as people record', 'no play'
 JITTER, REPEATED, LONGEST_DELAY = 0.1, 0.05, 12  # of the period; share of y; samples
 
 
 def identification_jobs(scale: float) -> list[tuple[str, int]]:
     """Seeds of random actuators; as people record: with jitter, an offset, repeats and a delay."""
-    return [(group, seed) for group, count in ((CLEAN, 24), (SPOILT, 16))
+    return [(group, seed) for group, count in ((CLEAN, 24), (SPOILT, 16), (NONE, 20))
             for seed in range(round(count * scale))]
 
 
 def run_identification(job: tuple[str, int]) -> Identified:
     """Identify one actuator."""
     group, seed = job
+    if group == NONE:
+        found = identified(*without_play(NO_PLAYS[seed % len(NO_PLAYS)], seed)).json
+        known = (found.get('known') or {}).get('backlash', {}).get('known', False)
+        return Identified(group, bool(known and found['gap'] > 3.0 * found['std']['gap']), 0.0, 0.0,
+                          False)
     case = random_case(seed)
     t, v, y, delay = case.period * np.arange(len(case.v)), case.v, case.y.copy(), case.delay
     truth = {'gap': case.gap}
@@ -221,6 +226,9 @@ def identification_figures(runs: Sequence[Identified]) -> dict[str, Figure]:
     figures: dict[str, Figure] = {}
     for name in dict.fromkeys(run.group for run in runs):
         of = [run for run in runs if run.group == name]
+        if name == NONE:
+            figures[f'{name}: a gap is promised'] = share([run.usable for run in of])
+            continue
         good = [run for run in of if run.usable]
         figures |= {f'{name}: {what}': one for what, one in {
             'called of use': share([run.usable for run in of], 'more'),

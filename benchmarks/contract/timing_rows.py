@@ -6,17 +6,28 @@ the same loop, or of a bare echo node: so they carry over to other machines.
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from cases.geared_motor import motor
+from numpy.typing import NDArray
 from real_time.loop_latency import measure_latency
 from real_time.step_times import Sampled, filter_timer
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
 
 from backlash_ros.core import Parameters, build_closed_loop
+from backlash_ros.core.estimation.play import play
 from contract.figures import Figure, figure
+
+Array = NDArray[np.float64]
 
 LEAST_SCATTER = 0.05  # relative, of a time: what one run of a machine does not show
 QUANTILES = {'p50': 0.5, 'p99': 0.99}
@@ -116,3 +127,40 @@ def run_simulate(job: tuple[str, int]) -> Times:
                   (time.process_time() - begun) / SIMULATED / unit})
 
 
+IDENTIFIED = {'4,000 samples': (4000, 0.005), '60 s at 1 kHz': (60_000, 0.001),
+              'a week at one minute': (10_080, 60.0)}
+GAP, B, A = 0.3, [0.0, 0.05, 0.045], [1.0, -1.6, 0.695]
+
+
+def identify_jobs(scale: float) -> list[tuple[str, int]]:
+    """Records of the lengths that users have."""
+    return repeated(scale, tuple(IDENTIFIED), 2)
+
+
+def run_identify(job: tuple[str, int]) -> Times:
+    """`identify`, start and page included, beside a plain least squares given the true gap."""
+    name, seed = job
+    count, period = IDENTIFIED[name]
+    rng = np.random.default_rng(seed)
+    k = np.arange(count)
+    v = np.sin(0.011 * k) + 0.6 * np.sin(0.026 * k + 1.0) + 0.3 * np.sin(0.053 * k + 2.0)
+    p = play(v, GAP, float(v[0]))
+    y = lfilter(B, A, p - 0.5 * GAP) + 1e-3 * rng.standard_normal(count)
+
+    def left(x: Array) -> Array:
+        out = lfilter([0.0, *x[:2]], [1.0, *x[2:4]], p - x[4], zi=x[5:])[0]
+        return np.asarray(out - y)
+
+    begun = time.process_time()
+    least_squares(left, [0.1, 0.0, -1.5, 0.6, 0.0, 0.0, 0.0], x_scale='jac')
+    floor = time.process_time() - begun
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / 'record.csv'
+        np.savetxt(path, np.column_stack([period * k, v, y]), '%.9g', ',', header='t,v,y',
+                   comments='')
+        begun = sum(os.times()[2:4])
+        subprocess.run([sys.executable, '-m', 'backlash_ros.tools.identify', str(path), '--out',
+                        folder], check=True, capture_output=True)
+        spent = sum(os.times()[2:4]) - begun
+    return Times({f'identify, {name} [s]': spent, f'identify, {name} / given the gap':
+                  spent / floor})

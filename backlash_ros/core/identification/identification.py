@@ -178,7 +178,10 @@ def identify(v: Array, y: Array, sample_period: float, options: Options | None =
 
 
 class _Search(NamedTuple):
-    """The best of the structures that were compared. rivals: other minima (gap, how far behind)."""
+    """The best of the structures that were compared. rivals: other minima (gap, how far behind).
+
+    apart: deviation of the gap beside the fit's, by a later delay that fits alike.
+    """
 
     samples: Samples
     compared: list[Compared]
@@ -187,6 +190,7 @@ class _Search(NamedTuple):
     rivals: list[tuple[float, float]]
     curve: Profile
     delays: Sequence[int]
+    apart: float = 0.0
 
 
 def identifying(
@@ -225,7 +229,7 @@ def identifying(
     yield 'judging'
     left_out = int((np.isfinite(y) & np.isnan(samples.whole_y)).sum())
     given = replace(Identification(sample_period, v, y), outliers=left_out)
-    found = _described(samples, s, best, given, options, part.start)
+    found = _described(samples, s, best, given, options, part.start, s.apart)
     return _as_a_gain(found, samples, s, given, options, part.start)
 
 
@@ -243,7 +247,7 @@ def _as_a_gain(
         return found
     chosen = min(gains, key=lambda one: one.fit.squares)
     best = fit(samples, chosen.structure, chosen.trained.point)
-    apart = 0.5 * abs(best.point.gap - found.gap)  # what depends on the model
+    apart = s.apart + 0.5 * abs(best.point.gap - found.gap)  # what depends on the model
     gain = _described(
         samples, s._replace(chosen=chosen), best, given, options, searched_from, apart)
     assert gain.verdict is not None
@@ -303,7 +307,10 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
     late = yield from _searched(v, y, options, window)
     better = effective_rows(late.samples, late.best) * np.log(early.best.rms / late.best.rms)
     inner = late.best.structure.delay < max(window)
-    return late if inner and better > LATER else early
+    if inner and better > LATER:
+        return late
+    apart = 0.5 * abs(late.best.point.gap - early.best.point.gap)
+    return early._replace(apart=apart) if better > -LATER else early
 
 
 def _general(first: int, last: int) -> Structure:

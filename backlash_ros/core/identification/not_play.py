@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize, nnls
 
 from backlash_ros.core.estimation.play import LEFT, engaged, plays
 from backlash_ros.core.plant.filtering import lfilter
@@ -36,6 +35,7 @@ PLAYS, WIDEST = 12, 0.7  # in parallel, and the widest of them, in swings of v
 SEVERAL = 0.2  # of the largest weight: a play in parallel that counts
 LEAD = 0.002  # of the swing of v: a lead where v turns
 LEADS = 0.6  # share of what a play leaves, that a lead where v turns has to explain
+SMOOTH = 0.6  # share of what a play leaves, that several plays have to explain
 FEWEST = 20  # moves that are looked at
 MOVED = 8.0  # noises by which y should have moved, to see whether it stuck
 STUCK_SHARE, JUMPED = 0.35, 2.0  # of such moves; times what y should have moved
@@ -200,7 +200,7 @@ def other_nonlinearity(o: Observed) -> str:
     steps = swing * np.linspace(0.0, WIDEST, PLAYS)
     weights, several = fit.parallel([with_play(width) for width in steps])
     count = int(np.count_nonzero(weights > SEVERAL * weights.max()))
-    if count >= 3 and fit.beats(several, one, o.noise):
+    if count >= 3 and fit.beats(several, one, o.noise, SMOOTH):
         return (
             f'{count} plays in parallel explain it, up to {steps[weights > 0.0].max():.3g} wide: y '
             'turns smoothly, as with friction along the way or in a piezo; only a single backlash '
@@ -325,6 +325,7 @@ class _Family:
         self, operator: Callable[..., Array], starts: Sequence[tuple[float, ...]],
     ) -> _Best:
         """The best parameters of a nonlinearity, from the best two starts."""
+        from scipy.optimize import minimize  # a fifth of the time that a start takes
         scale = max(float(np.ptp(self.v)), 1e-300)
 
         def left(at: Sequence[float]) -> float:
@@ -344,6 +345,7 @@ class _Family:
 
     def parallel(self, plays: Sequence[Array]) -> tuple[Array, _Best]:
         """Weights, none of them negative, of several plays in parallel, and what is left over."""
+        from scipy.optimize import nnls
         columns = [self.columns(w) for w in plays]
         best, weights = _Best(np.inf, (), columns[0]), np.zeros(len(plays))
         # In turn: the weights for a linear system behind them, and that system for the weights.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -113,6 +114,9 @@ def _share(text: str) -> float:
 
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point of `identify`."""
+    # The matrices are small: more threads of BLAS would cost more than they bring.
+    os.environ.setdefault('OMP_NUM_THREADS', '1')
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
     outcome: list[bool] = []
     code = run_tool(EXECUTABLE, lambda: outcome.append(_identify(args)))
     return FAILED if outcome == [False] else code
