@@ -18,11 +18,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from math import isfinite, log, sqrt
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, play, reversals
@@ -240,7 +240,7 @@ class Problem:
         stack = np.concatenate([rows, *self._beside(replace(f, x=x), len(beta), held)])
         scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
         scale[-1] = 1.0
-        r = lapack.dgeqrf(np.asfortranarray(stack / scale))[0][:len(beta) + 1]
+        r = _lapack().dgeqrf(np.asfortranarray(stack / scale))[0][:len(beta) + 1]
         return self._solved(
             f, np.triu(r) * scale, len(x), float(weights.sum()),
             min(most_scale, self.most_scale)
@@ -323,7 +323,7 @@ class Problem:
         if not np.isfinite(r).all():
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
         regular = diagonal.min() > 0.0
-        inverse = lapack.dtrtri(r[:n, :n])[0] if regular else np.linalg.pinv(r[:n, :n])
+        inverse = _lapack().dtrtri(r[:n, :n])[0] if regular else np.linalg.pinv(r[:n, :n])
         by = inverse @ r[:n, n:]
         freedom = max(count - n, 0.0) + 1.0
         squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
@@ -536,3 +536,11 @@ def _towards(f: Fit, new: Fit, share: float = 1.0) -> Fit:
         new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
         p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta),
     )
+
+
+def _lapack() -> ModuleType:
+    """LAPACK, loaded where fits are made: it takes 31 MB, which a controller can do without."""
+    from scipy.linalg import lapack
+
+    module: ModuleType = lapack
+    return module

@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.explanations import Record
-from backlash_ros.core.estimation.fit import Fit, state_columns, walk
+from backlash_ros.core.estimation.fit import Fit, walk
 from backlash_ros.core.estimation.observer import Gains, Observer
 from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.settings import GATE, OUTLIERS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.filtering import lfilter
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.state_model import StateModel, powers
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -63,15 +62,13 @@ def place_of(fit: Fit, record: Record, model: TransferFunction, memory: int) -> 
 
 def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
     """The state of this G (observer form) that explains y (M,), nan where lost, after u (M,)."""
-    a = model.denominator.tolist()
-    b = np.append(model.numerator[1:], 0.0)
-    forced = lfilter(b, a, u)
+    a, b, c = model.state_space()
+    responses = powers(a, b, len(u))
+    forced = np.convolve(responses @ c, u)[:len(u)]
+    columns = powers(a.T, a.T @ c, len(u))  # of the state before them
     known = np.isfinite(y)
-    columns = state_columns(a, len(u))[known]
-    before = np.linalg.lstsq(columns, (y - forced)[known], rcond=1e-12)[0]
-    output, after = lfilter(b, a, u, zi=before)
-    # From the transposed direct form to the observer form, whose first state is y.
-    return np.append(output[-1], after[:-1] + model.denominator[1:-1] * output[-1])
+    before = np.linalg.lstsq(columns[known], (y - forced)[known], rcond=1e-12)[0]
+    return np.asarray(np.linalg.matrix_power(a, len(u)) @ before + u[::-1] @ responses)
 
 
 class Following:

@@ -24,7 +24,6 @@ from math import inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.coasting import coasting
@@ -359,6 +358,8 @@ def _contradicts(problem: Problem, fit: Fit, z: Array, new: int) -> bool:
 
     z: their residuals over the noise that was known before.
     """
+    from scipy.special import chdtri  # where fits are made: 31 MB
+
     weights = problem.weights(problem.output(fit))[new:]
     count = float(weights[np.isfinite(z)].sum())
     if not count:

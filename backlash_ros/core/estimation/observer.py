@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
+from backlash_ros.core.plant.riccati import lyapunov, riccati
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -54,15 +54,15 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
     noise = np.outer(model.b, model.b) * (ratio / power) ** 2
     noise += REGULAR * float(np.trace(noise)) * np.eye(n)
     try:
-        p = linalg.solve_discrete_are(model.a.T, c, noise, np.eye(1))
+        p = riccati(model.a.T, c[:, 0], noise)
         variance = float(model.c * p[0, 0] * model.c) + 1.0
         column = p[:, 0] * model.c / variance
         # Error of the prediction with this gain: P = (A - A k c) P (A - A k c)' + A k k' A' + Q.
         after = model.a @ column
-        quiet = linalg.solve_discrete_lyapunov(
+        quiet = lyapunov(
             model.a - np.outer(after, c), np.outer(after, after) + noise * RATIO_STEP**-2
         )
-    except (linalg.LinAlgError, ValueError):
+    except np.linalg.LinAlgError:
         return None
     return Gain(
         tuple((model.to_observer @ column).tolist()), sqrt(variance),

@@ -20,7 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -57,6 +56,8 @@ def told(r: Array, noise_std: float, step: float) -> Told:
             -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
             np.full(len(r), noise_std**-2),
         )
+    from scipy.special import log_ndtr  # where fits are made: 31 MB
+
     upper, lower = (r + 0.5 * step) / noise_std, (r - 0.5 * step) / noise_std
     # Of both tails the smaller one: the difference of two numbers near 1 would be rounding.
     mirrored = lower > 0.0
@@ -81,6 +82,8 @@ def mean_information(ratio: float) -> float:
 
     ratio: step over the deviation of the noise.
     """
+    from scipy.special import ndtr  # as above
+
     edges = np.arange(-REACH, REACH + 2) - 0.5
     arguments = (edges - ((np.arange(PLACES) + 0.5) / PLACES - 0.5)[:, None]) * ratio
     likelihood = np.diff(ndtr(arguments))

@@ -14,7 +14,6 @@ from math import inf, nan, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.model_check import check_model
@@ -64,7 +63,7 @@ class InputReconstruction:
         self._step[n + 1:, n:-1] = np.eye(lag)
         try:
             steady = self._stationary()
-        except (linalg.LinAlgError, ValueError):
+        except (np.linalg.LinAlgError, ValueError):
             variance = nan
         else:
             self._gain = self._gain_of(steady)
@@ -84,6 +83,8 @@ class InputReconstruction:
 
     def _stationary(self) -> Array:
         """Covariance of z before a measurement when no sample was ever lost."""
+        from scipy import linalg  # where it is needed: 31 MB
+
         size = self._n + 1
         output, process = np.zeros((size, 1)), np.zeros((size, size))
         output[0, 0], process[-1, -1] = self._c, 1.0

@@ -11,7 +11,6 @@ from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import lapack
 
 Array = NDArray[np.float64]
 Coefficients = Sequence[float] | Array
@@ -53,6 +52,8 @@ def lfilter(
         reached = min(order, count)
         y[..., :reached] += before[..., :reached]
     if len(poles) > 1 and count:
+        from scipy.linalg import lapack  # where it is needed: 31 MB
+
         # The lower band of a triangular matrix, a column per sample.
         band = np.repeat(np.array(poles)[:, np.newaxis], count, axis=1)
         rows = y.reshape(-1, count)

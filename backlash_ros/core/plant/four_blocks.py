@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -68,7 +67,7 @@ def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> F
     product = np.convolve(placed, closed)
     known = np.convolve(a, np.eye(1, n)[0])  # S is monic: A z^(n-1) is on the left already
     right = (product - known)[1:]
-    unknown = linalg.lstsq(sylvester, right)[0]
+    unknown = np.linalg.lstsq(sylvester, right, rcond=None)[0]
     residual = float(np.linalg.norm(sylvester @ unknown - right))
     dc_gain = float(np.sum(b))
     if not residual <= WORST_RESIDUAL * float(np.linalg.norm(product)) or dc_gain == 0.0:

@@ -59,3 +59,12 @@ def _memory(model: TransferFunction) -> int:
     stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - 1e-6]
     slowest = max(stable, default=0.0)
     return int(min(max(3.0 / (1.0 - slowest), SHORTEST_MEMORY), LONGEST_MEMORY))
+
+
+def powers(a: Array, b: Array, count: int) -> Array:
+    """b, a b, a^2 b, ... for a (n, n) and b (n,) or (n, m), stacked `count` high."""
+    stack, factor = b[None], a
+    while len(stack) < count:
+        stack = np.concatenate([stack, factor @ stack if b.ndim > 1 else stack @ factor.T])
+        factor = factor @ factor
+    return stack[:count]

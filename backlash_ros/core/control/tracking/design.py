@@ -13,7 +13,7 @@ from backlash_ros.core.control.tracking.lq_preview import PreviewGains, preview_
 from backlash_ros.core.control.tracking.margin import Feedback, modulus_margin, tolerates
 from backlash_ros.core.control.tracking.reference_window import averages
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.state_model import StateModel, powers
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -198,15 +198,6 @@ def _noise_gains(model: StateModel, gains: PreviewGains) -> Array:
         np.linalg.norm(np.convolve(kernel, to_u))
         for kernel in averages(len(gains.preview) - 1)
     ])
-
-
-def powers(a: Array, b: Array, count: int) -> Array:
-    """b, a b, a^2 b, ... for a (n, n) and b (n,) or (n, m), stacked `count` high."""
-    stack, factor = b[None], a
-    while len(stack) < count:
-        stack = np.concatenate([stack, factor @ stack if b.ndim > 1 else stack @ factor.T])
-        factor = factor @ factor
-    return stack[:count]
 
 
 def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> Feedback:

@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.riccati import riccati
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
@@ -54,13 +54,13 @@ def preview_gains(
     # u in units of 1/sqrt(rho): the Riccati equation is then solved with weights of one size.
     unit = input_weight**-0.5
     a[:n, :n], b[:n, 0], c[0] = model.a, model.b * unit, model.c
-    q = np.outer(c, c)
+    q: Array = np.outer(c, c).astype(np.float64)
     if integrates:
         a[n, 0], a[n, n], e[n] = -model.c, 1.0, 1.0
         q[n, n] = integral_weight
     try:
-        p = linalg.solve_discrete_are(a, b, q, np.eye(1))
-    except (linalg.LinAlgError, ValueError):
+        p = riccati(a, b[:, 0], q)
+    except np.linalg.LinAlgError:
         raise ParameterError(
             'plant.numerator', 'G(z)', 'cannot be stabilised by feedback of its state',
             'a pole on or outside the unit circle is cancelled, or tracking.integral_weight > 0 '
@@ -93,7 +93,7 @@ def _preview(share: Array, closed: Array, first: Array, c: Array, window: int) -
         gains[j] = share @ row
         row = closed.T @ row
     # Held beyond the window: the geometric rest of the sum belongs to the last known value.
-    gains[window] += share @ linalg.solve(np.eye(len(c)) - closed.T, row)
+    gains[window] += share @ np.linalg.solve(np.eye(len(c)) - closed.T, row)
     return gains
 
 

@@ -8,8 +8,8 @@ from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
+from backlash_ros.core.plant.riccati import riccati
 from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
@@ -77,7 +77,7 @@ def _is_stable(
     loop[n:-1] += np.outer(correction, plant.c * loop[0] - seen @ loop[n:-1])
     if feedback.integral:
         loop[-1, 0], loop[-1, -1] = -plant.c, 1.0
-    return bool(np.abs(linalg.eigvals(loop)).max() < 1.0)
+    return bool(np.abs(np.linalg.eigvals(loop)).max() < 1.0)
 
 
 def _distance(plant: StateModel, feedback: Feedback, confidence: float) -> float:
@@ -114,7 +114,7 @@ def _correction(model: StateModel, confidence: float) -> Array | None:
     # A trace of noise on x keeps the equation regular.
     drift += 1e-12 * drift[n, n] * np.eye(n + 1)
     try:
-        p = linalg.solve_discrete_are(a.T, c[:, None], drift, np.eye(1))
-    except (linalg.LinAlgError, ValueError):
+        p = riccati(a.T, c, drift)
+    except np.linalg.LinAlgError:
         return None
     return np.asarray(p @ c / (c @ p @ c + 1.0))

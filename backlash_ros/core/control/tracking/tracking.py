@@ -144,7 +144,6 @@ class Tracking:
         if trust.full and abs(correction) < noise:
             u_d = trajectory.bounded(u_d, BEYOND * feedback.noise)
         u_d, handed_over = self.hand_over.apply(u_d, inverse, trust.state)
-        noise += trajectory.back
         side = self._side(asked, asked is not before_turn, u_d, noise, inverse)
         crossings = trust.state.crossings
         rest, before = self.rest.state, self.rest.state.mode
@@ -185,7 +184,7 @@ class Tracking:
         c_r, c_l = self.trust.state.crossings
         if c_r == c_l and asked is not Region.GAP and u_d != inverse.held_u:
             return Region.RIGHT if u_d > inverse.held_u else Region.LEFT  # nothing is crossed
-        return side_for(u_d, asked, turned, noise, inverse)
+        return side_for(u_d, asked, turned, noise, self.trajectory.back, inverse)
 
     def _invert(
         self, u_d: float, side: Region | None, crossings: Sequence[float],

@@ -1,0 +1,62 @@
+"""Riccati and Lyapunov equations beside SciPy's solutions, which a controller does not load."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from backlash_ros.core.plant.riccati import lyapunov, riccati
+from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.transfer_function import TransferFunction
+
+STARTS = """
+import sys
+from backlash_ros.core.assembly import WORKER_MODULES, build_controller
+from backlash_ros.core.estimation.worker import WorkerExecutor
+from backlash_ros.core.parameters import Parameters
+controller = build_controller(Parameters({'structure': 'tracking'}),
+                              executor=WorkerExecutor(WORKER_MODULES))
+for k in range(100):
+    controller.step(0.0, 0.01 * k)
+    controller.refine()
+controller.close()
+print([name for name in sys.modules if name.startswith('scipy')])
+"""
+
+
+@pytest.mark.parametrize('denominator', [
+    [1.0, -1.25, 0.53], [1.0, -1.9, 0.9], [1.0, -2.0, 1.0],
+    np.poly([0.9999, 0.95, 0.2 + 0.3j, 0.2 - 0.3j, 0.0]).real.tolist(),
+])
+@pytest.mark.parametrize('weight', [1e-4, 1.0, 1e4])
+def test_the_solution_stabilises_and_solves(denominator: list[float], weight: float) -> None:
+    model = StateModel(TransferFunction([0.1, 0.05], denominator))
+    a, b = model.a, model.b * weight**-0.5
+    q = np.zeros((model.order, model.order))
+    q[0, 0] = model.c**2
+    p = riccati(a, b, q)
+    gain = b @ p @ a / (1.0 + b @ p @ b)
+    assert np.abs(np.linalg.eigvals(a - np.outer(b, gain))).max() < 1.0
+    assert a.T @ p @ a - np.outer(a.T @ p @ b, gain) + q == pytest.approx(p, rel=1e-9, abs=1e-9)
+    known = linalg.solve_discrete_are(a, b[:, None], q, np.eye(1))
+    assert p == pytest.approx(known, rel=1e-6, abs=1e-6 * float(np.abs(known).max()))
+    stable = a - np.outer(b, gain)
+    known = linalg.solve_discrete_lyapunov(stable, q)
+    assert lyapunov(stable, q) == pytest.approx(known, rel=1e-6, abs=1e-9)
+
+
+def test_what_has_no_solution_is_refused() -> None:
+    unstable, nothing = np.diag([1.1, 0.5]), np.array([0.0, 1.0])
+    with pytest.raises(np.linalg.LinAlgError):
+        riccati(unstable, nothing, np.eye(2))
+    with pytest.raises(np.linalg.LinAlgError):
+        lyapunov(unstable, np.eye(2))
+
+
+def test_a_controller_whose_fits_are_made_elsewhere_does_not_load_scipy() -> None:
+    done = subprocess.run([sys.executable, '-c', STARTS], capture_output=True, text=True)
+    assert done.stdout.strip() == '[]', done.stdout + done.stderr
