@@ -1,7 +1,6 @@
 """A better model of G in the middle of a loop: who designs for it, when it is used, and how."""
 
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
 from math import pi
 
@@ -25,7 +24,6 @@ from backlash_ros.core.control.tracking.margin import modulus_margin
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.executor import Executor
-from backlash_ros.core.estimation.worker import WorkerExecutor
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import Backlash
@@ -179,15 +177,6 @@ def test_a_loop_that_the_told_model_makes_unstable_is_rescued() -> None:
     swapped = run(motor(), TRUE['late'], 300, 1200)
     assert np.abs(swapped.v[200:300]).max() > 1e3
     assert np.abs(swapped.v[1000:]).max() < 20.0
-
-
-def test_gains_that_another_process_makes_are_the_same() -> None:
-    with closing(WorkerExecutor()) as executor:
-        swapped = run(motor(), TRUE['faster'], 300, 700, executor=executor)
-        assert executor.alive
-    assert 300 <= swapped.learner.adopted_at < 700
-    here = run(motor(), TRUE['faster'], 300, 700)
-    assert swapped.v.tolist() == here.v.tolist()
 
 
 def redesigned(

@@ -1,6 +1,5 @@
 """The command replay: the run's own estimates to the last bit, or where it parts from them."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -84,18 +83,6 @@ def test_the_command_says_that_nothing_parts(recorded, tmp_path, capsys):
 def test_the_command_says_where_it_parts(recorded, tmp_path, capsys):
     assert main([str(recorded), '--set', 'plant.uncertainty=0.1', '--out', str(tmp_path)]) == 0
     assert 'part from those of the run at t = 0.' in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures('undrawn')
-def test_several_runs_and_values_give_a_table(recorded: Path, tmp_path: Path) -> None:
-    assert main([str(recorded), str(recorded), '--sweep', 'plant.uncertainty=0,0.1',
-                 '--out', str(tmp_path)]) == 0
-    with (tmp_path / 'replays.csv').open(newline='') as file:
-        rows = list(csv.DictReader(file))
-    assert [row['changed'] for row in rows] == [
-        'plant.uncertainty=0', 'plant.uncertainty=0.1',
-    ] * 2
-    assert all(float(row['c_r']) == pytest.approx(3.0, rel=0.05) for row in rows)
 
 
 @pytest.mark.parametrize('arguments', [

@@ -85,11 +85,9 @@ def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
     ('arguments', 'message'),
     [
         (['--set', 'sed=1'], 'did you mean seed?'),
-        (['--set', 'estimator.bounds.m=[2, 1]'], 'low < high'),
         (['--config', 'nothing.yaml'], 'nothing.yaml: cannot be read'),
         (['--duration', '0.015'], 'whole multiple of sample_period=0.01'),
         (['--duration', '-1'], 'must be finite and > 0'),
-        (['--duration', 'nan'], 'must be finite and > 0'),
         (['--duration', 'x'], "invalid float value: 'x'"),
         (['--seeds', '0'], '--seeds=0 must be >= 1'),
         (['--seed', '-1'], 'seed=-1'),
@@ -97,8 +95,6 @@ def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
         (['--sweep', 'seed'], 'must be KEY=v1,v2,...'),
         (['--sweep', 'seed=1', '--sweep', 'seed=2'], 'names seed twice'),
         (['--sweep', 'backlash.m=1,-1'], 'backlash.m=-1.0 must be > 0'),
-        (['--sweep', 'backlash.c_l=-1,5'], 'must be < backlash.c_r'),
-        (['--set', 'waveform=file'], 'must name a CSV'),
         (['--nonsense'], 'unrecognized arguments: --nonsense'),
     ],
 )
@@ -119,12 +115,10 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     ('text', 'expected'),
     [
         ('seed=1,2', Sweep('seed', (1, 2))),
-        ('amplitude=1,2e0', Sweep('amplitude', (1.0, 2.0))),
         ('estimator.law=lms, printed', Sweep('estimator.law', ('lms', 'printed'))),
         ('backlash.rate=[0,0,0],[0,0,1]',
          Sweep('backlash.rate', ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))),
         ('control.max=5,.inf', Sweep('control.max', (5.0, inf))),
-        ('lockstep=true,false', Sweep('lockstep', (True, False))),
     ],
 )
 def test_sweep_lists_values_as_in_yaml(text: str, expected: Sweep) -> None:

@@ -9,7 +9,7 @@ from strategies import plays, signals, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.plant.backlash import Backlash, Region
+from backlash_ros.core.plant.backlash import Backlash
 
 
 def as_printed(
@@ -21,17 +21,6 @@ def as_printed(
     if u_d < u_d_before:
         return u_d / m + c_l
     return u_d / m + c_r
-
-
-@given(play=plays(), u=st.floats(-100.0, 100.0), signal=signals())
-def test_exact_inverse_cancels_any_backlash_after_the_first_engagement(play, u, signal):
-    backlash, inverse = Backlash(play.m, play.c_r, play.c_l, u), BacklashInverse()
-    engaged = False
-    for u_d in signal:
-        u = backlash.step(inverse.step(u_d, play.m, play.c_r, play.c_l))
-        engaged = engaged or (inverse.side != Region.GAP and backlash.region == inverse.side)
-        if engaged:
-            assert u == pytest.approx(u_d, abs=play.rounding(u_d))
 
 
 @given(samples=st.lists(st.tuples(plays(), st.floats(-100.0, 100.0)), min_size=1, max_size=40))

@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
 from scipy import signal
-from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR, plants
+from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -17,27 +16,6 @@ PAPER = TransferFunction(PAPER_NUMERATOR, PAPER_DENOMINATOR)
 
 def answer(model: TransferFunction, u: np.ndarray) -> np.ndarray:
     return signal.lfilter(model.numerator, model.denominator, u)
-
-
-def well_separated(model: TransferFunction) -> bool:
-    """Poles and zeros are so far apart that a solution is well determined."""
-    poles, zeros = model.poles, model.zeros
-    apart = [abs(p - z) for p in poles for z in zeros]
-    return min(apart, default=1.0) > 0.1 and abs(float(np.sum(model.numerator))) > 1e-3
-
-
-@settings(max_examples=40, deadline=None)
-@given(plants())
-def test_gains_solve_the_diophantine_equation(model: TransferFunction) -> None:
-    assume(well_separated(model))
-    closed = np.real(np.poly(np.full(model.order, 0.5)))
-    blocks = place_poles(model, closed, 0.3)
-    s = blocks.filter - np.concatenate([[0.0], blocks.theta_1])
-    r = blocks.theta_20 * blocks.filter + np.concatenate([[0.0], blocks.theta_2])
-    left = np.convolve(model.denominator, s)
-    left[1:] -= np.convolve(model.numerator[1:], r)
-    right = np.convolve(blocks.filter, closed)
-    np.testing.assert_allclose(left, right, atol=1e-6 * np.abs(right).max())
 
 
 @pytest.mark.parametrize('filter_pole', [0.0, 0.6, 0.9])

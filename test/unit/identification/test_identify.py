@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 from test_identification import PERIOD_S, motion, record
 
-from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimates_file import load_estimate, save_estimate
+from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.identify.command import main
-from backlash_ros.tools.records.messages import from_messages
 from backlash_ros.tools.records.reading import read_record
 
 QUICK = ('--order', '1-2', '--delay', '0-1')
@@ -88,13 +86,6 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
     build_controller(parameters)
 
 
-def test_a_controller_begins_with_what_was_found(result: Path) -> None:
-    estimate = load_estimate(effective_parameters(result / 'identified.yaml'))
-    assert estimate is not None
-    assert estimate.learned
-    assert estimate.c_r == pytest.approx(0.5, abs=0.02)
-
-
 @pytest.mark.usefixtures('undrawn')
 def test_the_loop_with_the_file_follows(result: Path, tmp_path: Path) -> None:
     out = tmp_path / 'out'
@@ -126,16 +117,6 @@ def test_bad_options_are_told_in_one_line(tmp_path, monkeypatch, capsys, argumen
     write_csv(tmp_path / 'a.csv', *record(100))
     assert main(arguments) == 2
     assert capsys.readouterr().err.count('\n') == 1
-
-
-def test_delays_of_single_samples_do_not_add_up_to_a_lost_one() -> None:
-    # A driver that keeps its time, and is late by up to 0.6 of a period: steps of 1.6, 0.7, 0.7.
-    late = np.tile([0.0, 0.6, 0.3], 40)
-    at = ((np.arange(120) + late) * PERIOD_S * 1e9).astype(np.int64)
-    found = from_messages({
-        topics.PLANT_OUTPUT: (at, np.arange(120.0)), topics.CONTROL: (at + 1, np.arange(120.0)),
-    }, PERIOD_S)
-    assert found.y.tolist() == list(range(120))
 
 
 def test_a_span_is_cut_out(tmp_path: Path) -> None:

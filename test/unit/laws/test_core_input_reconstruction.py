@@ -73,10 +73,7 @@ def test_it_is_the_least_squares_solution_of_random_walk_and_noise(noise_std: fl
     ('numerator', 'denominator'),
     [
         pytest.param([1.0, -1.0], [1.0, -0.5, 0.1], id='zero at 1'),
-        pytest.param([2.0, -2.0], [1.0, -1.3, 0.4], id='zero at 1, gain 2'),
         pytest.param([1e-3, -1e-3], [1.0, -1.9, 0.9025], id='zero at 1, slow poles'),
-        pytest.param([1.0, -1.5, 0.5], [1.0, -0.5, 0.1, 0.02], id='zeros at 1 and 0.5'),
-        pytest.param([1.0, -3.0, 2.0], [1.0, -1.3, 0.4, 0.0], id='zeros at 1 and 2'),
         pytest.param([1.0, 0.0, -1.0], [1.0, -0.5, 0.1, 0.02], id='zeros at 1 and -1'),
         pytest.param([1.0, -2.0, 1.0], [1.0, -0.5, 0.1, 0.02], id='double zero at 1'),
     ],

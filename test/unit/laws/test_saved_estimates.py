@@ -66,15 +66,6 @@ def test_estimates_of_another_plant_or_law_are_refused(tmp_path, name, value):
         load_estimate(parameters(file, **{name: value}))
 
 
-def test_constants_that_are_given_are_never_saved_as_learned() -> None:
-    for status in Status:
-        given_ones = replace(LEARNED, std_m=0.0, std_c_r=0.0, std_c_l=0.0, status=status)
-        assert not worth_saving(given_ones)
-    controller = build_controller(Parameters({'estimator.law': 'fixed'}))
-    controller.step(0.0, 1.0)
-    assert not worth_saving(controller.estimator.estimate)
-
-
 @pytest.mark.parametrize(('law', 'std', 'reason'), [
     ('kalman', 0.01, ''),
     ('kalman', 0.0, 'holds constants that were given'),

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from backlash_ros.nodes.monitor.followed import ControllerState
-from backlash_ros.nodes.monitor.view import axis_end, bar, plain_line, screen
+from backlash_ros.nodes.monitor.view import axis_end, bar, screen
 
 VALUES = {
     'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',
@@ -96,10 +96,3 @@ def test_an_inactive_controller_is_told_by_its_message() -> None:
     state.take_diagnostics(0, 'unconfigured', {}, 100.0, '12:00:00')
     assert state.word(100.0) == 'unconfigured'
     assert any('unconfigured' in line for line in shown([state]))
-
-
-def test_a_plain_line_says_the_same_in_short() -> None:
-    assert plain_line(controller(), 100.0) == (
-        '/controller: tracking; m 1.3 ± 0.2, c_r 3 ± 0.4, c_l -3; '
-        'excitation 4.25, latency 0.912 ms, lost 5'
-    )

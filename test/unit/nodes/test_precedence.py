@@ -39,12 +39,6 @@ def test_without_a_word_presence_at_activation_decides() -> None:
     assert found == (Rival('/early', True), Rival('/late', False))
 
 
-def test_a_node_that_has_just_started_takes_whom_it_finds_for_earlier() -> None:
-    rivals = Rivals('b', settled_at=10.7)
-    rivals.begin(100, now=10.0)
-    assert rivals.among({'x': '/other'}, 10.5) == (Rival('/other', True),)
-
-
 def test_a_controller_that_says_nothing_any_more_is_gone_though_discovery_still_has_it() -> None:
     rivals = rivals_of()
     rivals.among({'x': '/other'}, 9.0)

@@ -54,11 +54,6 @@ def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(k, period):
     assert reference(k * period) == float(k)
 
 
-def test_file_holds_its_last_sample() -> None:
-    reference = ReferenceSignal('file', 2.0, bias=1.0, sample_period=0.1, samples=(5.0, 7.0))
-    assert [reference(t) for t in (0.0, 0.1, 0.2, 99.0)] == pytest.approx([11.0, 15.0, 15.0, 15.0])
-
-
 def test_unknown_waveform_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"waveform='sin' must be one of sine, "):
         ReferenceSignal('sin')

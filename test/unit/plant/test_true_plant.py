@@ -47,13 +47,6 @@ def test_scaled_frequency_is_the_motor_at_that_frequency(factor: float) -> None:
     assert_equal(altered_plant(motor(), Alteration(frequency=factor)), motor(20.0 * factor), 1e-12)
 
 
-@pytest.mark.parametrize('damping', [0.1, 0.4, 0.6, 0.99, 1.0, 1.7])
-def test_scaled_damping_is_the_motor_with_that_damping(damping: float) -> None:
-    altered = altered_plant(motor(), Alteration(damping=damping / 0.5))
-    # Two poles that meet are known to the square root of the rounding error only.
-    assert_equal(altered, motor(damping=damping), 1e-12)
-
-
 @given(plants(), st.integers(0, 2), st.integers(1, 3))
 def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(model, whole, quarters):
     assume(continuous(model))

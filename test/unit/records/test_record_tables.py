@@ -75,12 +75,6 @@ def test_a_table_is_read_as_it_is(tmp_path: Path, name: str) -> None:
     assert record.y.tolist() == Y.tolist()
 
 
-@pytest.mark.parametrize('encoding', ['utf-8-sig', 'utf-16', 'latin-1'])
-def test_files_of_any_encoding(tmp_path: Path, encoding: str) -> None:
-    text = 't,v (°),y (°)\n' + rows()
-    assert read_record(written(tmp_path / 'a.csv', text, encoding)).v.tolist() == V.tolist()
-
-
 @pytest.mark.parametrize('word', ['', 'NULL', 'NaN', 'n/a', '-', 'inf'])
 def test_what_was_not_read_is_lost(tmp_path: Path, word: str) -> None:
     lines = ('t,v,y\n' + rows()).split('\n')

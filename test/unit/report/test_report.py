@@ -15,7 +15,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools import report as report
-from backlash_ros.tools.cli import InputError, Span
+from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs import figure_data
 from backlash_ros.tools.runs.bag import read_bag
@@ -60,22 +60,6 @@ def test_page_holds_the_pictures_that_lie_beside_it(page: Path) -> None:
         'parameter_errors.png', 'estimates.png', 'control_error.png', 'laws.png',
         'hysteresis.png', 'output.png', 'input.png',
     }
-
-
-def test_summary_of_a_bag_tells_the_newest_model(run: RunRecord, tmp_path: Path) -> None:
-    models = {5: believed([1.0, -0.5]), 50: believed([1.0, -0.6, 0.2]), 70: believed([1.0, -0.7])}
-    bag = write_bag(tmp_path / 'bag', run, models=models)
-    found = read_bag(bag, run.sample_period).record
-    summary = summarise(found, None)
-    assert summary['model'] == {
-        'numerator': [0.1], 'denominator': [1.0, -0.7], 'delay_samples': 1,
-    }
-    assert (summary['noise_ratio'], summary['unexplained']) == (1.2, 0.03)
-    part = read_bag(bag, run.sample_period, Span(to_s=60 * run.sample_period)).record
-    assert part.learned is not None
-    assert part.learned.denominator == (1.0, -0.6, 0.2)
-    early = read_bag(bag, run.sample_period, Span(to_s=5 * run.sample_period)).record
-    assert early.learned is None
 
 
 @pytest.mark.parametrize('models', [{}, {5: believed([1.0, -0.5], tail=1)}])

