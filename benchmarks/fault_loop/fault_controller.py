@@ -12,8 +12,8 @@ from math import isfinite
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.loop.command_history import AWAITED_REPORTS
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.report_use import AWAITED_REPORTS
 from backlash_ros.core.loop.sample_counter import KEPT_OUTPUTS, Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from fault_loop.fault_world import Driver

@@ -23,8 +23,7 @@ from backlash_ros.core.driver_check.findings import (
 )
 from backlash_ros.core.driver_check.record_fit import RecordFit, fit_record
 from backlash_ros.core.identification.verdict import SHOWS
-from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
-from backlash_ros.core.loop.report_use import ReportUse, report_use
+from backlash_ros.core.loop.command_history import REPORTED, ReportUse, report_use, v_of_intervals
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 

@@ -1,17 +1,71 @@
-"""Which v the plant had over each sample interval, as far as the controller can know."""
+"""Which v acted over each sample interval: told from commands, from reports, or both."""
 
 from __future__ import annotations
 
 from collections import deque
+from enum import Enum
 from math import inf, nan
 
-from backlash_ros.core.loop.report_use import ReportTrust, ReportUse
+import numpy as np
+from numpy.typing import NDArray
 
+from backlash_ros.core.parameters import Parameters
+
+Array = NDArray[np.float64]
+Stamps = NDArray[np.int64]  # [ns], of one clock
+
+REPORTED = 0.9  # share of the samples that reports have to tell of to be believed
+# Outputs in a row with a report for each of their intervals after which reports are believed, and
+# without, after which they are given up. Messages that have nothing to do with the samples fit an
+# interval every other time at most: 20 times in a row by a chance of one in a million.
+CONSISTENT = 20
+# Outputs that stay without an answer while the driver may yet report its v, and for how long.
+AWAITED_REPORTS, AWAITED_S = 20, 0.5
 # Commands and reports that may wait: more than a stall of the controller can leave behind.
 REMEMBERED = 256
 LONGEST_TRANSIT = 0.25  # of a period: what is taken into account
 TRANSIT_STEP = 1e-3  # of a period: by which its median follows with every output
 FRESH = 1.5  # periods before an output up to which a report tells the v of its interval
+
+
+class ReportUse(Enum):
+    """Whether the v that the driver reports goes before the own command."""
+
+    NEVER = 'false'
+    AUTO = 'auto'
+    ALWAYS = 'true'
+
+
+def report_use(p: Parameters) -> ReportUse:
+    """What estimator.use_applied_control comes to.
+
+    With control.delay_samples a driver may report v before or after that delay: auto leaves it
+    alone then. In lockstep every v is applied at once.
+    """
+    use = ReportUse(p.estimator.use_applied_control)
+    delayed = use is ReportUse.AUTO and p.control.delay_samples > 0
+    return ReportUse.NEVER if delayed or p.lockstep else use
+
+
+def awaited_reports(p: Parameters) -> int:
+    """How many outputs may stay without an answer while the driver may yet report its v."""
+    return min(AWAITED_REPORTS, max(int(AWAITED_S / p.sample_period), 1))
+
+
+class ReportTrust:
+    """Whether reports are used at present: always, never, or as long as none is missing."""
+
+    def __init__(self, use: ReportUse) -> None:
+        self.trusted = use is ReportUse.ALWAYS
+        self._use = use
+        self._contrary = 0  # outputs in a row that speak against `trusted`
+
+    def note(self, complete: bool) -> bool:
+        """Note whether each interval before an output had its report; returns `trusted`."""
+        self._contrary = 0 if complete is self.trusted else self._contrary + 1
+        if self._use is ReportUse.AUTO and self._contrary == CONSISTENT:
+            self.trusted, self._contrary = complete, 0
+        return self.trusted
 
 
 class CommandHistory:
@@ -124,3 +178,44 @@ class CommandHistory:
                 return v, older if since <= until else later
             later_ns, later = stamp_ns, v
         return self._published[0][1], nan
+
+
+class HeldControl:
+    """The newest v acts from its arrival on; before, the one before it."""
+
+    def __init__(self) -> None:
+        self.newest = 0.0
+        self._before, self._arrived_ns = 0.0, 0
+
+    def take(self, v: float, arrived_ns: int) -> None:
+        """A v has come, at this time."""
+        self._before, self.newest, self._arrived_ns = self.newest, v, arrived_ns
+
+    def over(self, ended_ns: float) -> float:
+        """The v of a sample period that ended then: it counts for all of it if it came in it."""
+        return self.newest if self._arrived_ns < ended_ns else self._before
+
+
+def v_of_intervals(
+    index: NDArray[np.int64], output_ns: Stamps, command_ns: Stamps, v: Array, reported: bool,
+) -> Array:
+    """v over the interval after each sample, shape (N,), N = index[-1] + 1; nan before any v.
+
+    index: number of each sample whose y was heard, rising from 0. output_ns: stamps of these y.
+    command_ns, v (M,): messages of v in the order of time. reported: whether they are reports of
+    the v that acted, one just before each y; else commands, of which the newest acts that is there
+    when the interval ends with the next y.
+    """
+    begin = output_ns[0]
+    outputs, commands = (output_ns - begin).astype(float), (command_ns - begin).astype(float)
+    ends = np.interp(np.arange(1, index[-1] + 2), index, outputs)
+    ends[-1] = inf
+    acted: Array = np.append(v, nan)[np.searchsorted(commands, ends, side='right') - 1]
+    if reported:
+        until = np.searchsorted(commands, outputs, side='right')
+        intervals, reports = np.diff(index), np.diff(until)
+        # One each: in their order, since those of a driver that was held up come in a heap. One
+        # alone: nothing was sampled in between, and its v was in use all the time.
+        for i in np.flatnonzero((intervals > 1) & ((reports == intervals) | (reports == 1))):
+            acted[index[i]:index[i + 1]] = v[until[i]:until[i + 1]]
+    return acted

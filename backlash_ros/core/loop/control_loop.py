@@ -18,10 +18,9 @@ from backlash_ros.core.control.last_command import last_commands
 from backlash_ros.core.control.limits import Motion, at_rest, plausible
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.executor import Executor, InlineExecutor
-from backlash_ros.core.loop.command_history import CommandHistory
+from backlash_ros.core.loop.command_history import CommandHistory, report_use
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.phase import Event, Phase, after
-from backlash_ros.core.loop.report_use import report_use
 from backlash_ros.core.loop.sample_counter import Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 

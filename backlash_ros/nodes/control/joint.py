@@ -14,9 +14,9 @@ from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
+from backlash_ros.core.loop.command_history import awaited_reports
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.phase import Phase
-from backlash_ros.core.loop.report_use import awaited_reports
 from backlash_ros.core.loop.sample_counter import JointOutputs, Output
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError

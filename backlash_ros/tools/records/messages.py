@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.bags.reading import Topic
-from backlash_ros.core.loop.intervals import REPORTED, v_of_intervals
+from backlash_ros.core.loop.command_history import REPORTED, v_of_intervals
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows import in_order

@@ -133,7 +133,7 @@ def _reports(
     path: Path, run: RunRecord, parameters: Parameters, axis: str,
 ) -> Sequence[Sequence[float]]:
     """What the driver said to have applied before each row, where the controller uses it."""
-    from backlash_ros.core.loop.report_use import ReportUse, report_use
+    from backlash_ros.core.loop.command_history import ReportUse, report_use
     from backlash_ros.tools.runs.bag import read_reports
     from backlash_ros.tools.runs.reading import find_bag
     use = report_use(parameters)

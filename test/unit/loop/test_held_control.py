@@ -4,7 +4,7 @@ from math import inf
 
 import pytest
 
-from backlash_ros.core.loop.held_control import HeldControl
+from backlash_ros.core.loop.command_history import HeldControl
 
 PERIOD_NS = 10_000_000
 

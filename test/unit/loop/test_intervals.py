@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from backlash_ros.core.loop.intervals import v_of_intervals
+from backlash_ros.core.loop.command_history import v_of_intervals
 
 
 def told(

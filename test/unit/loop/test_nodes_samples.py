@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.loop.command_history import CommandHistory
-from backlash_ros.core.loop.report_use import CONSISTENT, ReportUse, report_use
+from backlash_ros.core.loop.command_history import CONSISTENT, CommandHistory, ReportUse, report_use
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Arrival, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
