@@ -31,7 +31,6 @@ from backlash_ros.core.identification.order_selection import (
     effective_rows,
     equal_delays,
     gives_way,
-    held_out_rms,
     lag_one,
     predicted,
     selected,
@@ -206,7 +205,7 @@ def identifying(
     s = yield from _searched(v[part], y[part], options, options.delays or EARLY)
     late = not options.delays and s.chosen.structure.delay == EARLY[-1]
     # What no G with a backlash explains, any delay explains a little better.
-    if late and not is_no_play(_observed(s.samples, s.best, quantum(s.samples.y))):
+    if late and _delay_open(s.samples, s.best) and not is_no_play(_observed(s.samples, s.best)):
         s = yield from _later(s, options)
     rows = effective_rows(s.samples, s.best)
     # With as many poles, some of them may fit worse.
@@ -301,8 +300,7 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
         yield 'searching later delays'
     # Of a smooth motion many delays tell alike.
     delay = min(delay for delay, squares in left.items() if squares <= ALIKE * min(left.values()))
-    if not delay:
-        return early
+    delay = max(delay, WINDOW)  # taps of a shorter one reach as far
     window = range(delay - 1, min(delay + WINDOW + 2, latest) + 1)
     late = yield from _searched(v, y, options, window)
     better = effective_rows(late.samples, late.best) * np.log(early.best.rms / late.best.rms)
@@ -438,7 +436,7 @@ def _described(
     step = quantum(samples.y)
     total = float(best.numerator.sum())
     verdict = judge(Findings(
-        _observed(samples, best, step), best.point.gap, float(np.sqrt(gap_var)), best.c_r,
+        _observed(samples, best), best.point.gap, float(np.sqrt(gap_var)), best.c_r,
         float(np.sqrt(c_r_var)),
         float(np.abs(uncertainty.response(best, np.sqrt(frequencies[:1] * frequencies[-1:])))[0]),
         total if best.structure.integrator else total / float(best.denominator.sum()),
@@ -491,17 +489,14 @@ def _still(samples: Samples, best: Fit) -> float:
     return max(float(r[-1, -1] * scale[-1]) ** 2, TINY)
 
 
-def _observed(samples: Samples, best: Fit, step: float) -> Observed:
+def _observed(samples: Samples, best: Fit) -> Observed:
     """The signals of a fit, each where it acts on y."""
+    noise = noise_of(samples.known.astype(float), samples.y[samples.known])
     return Observed(
         samples.v[samples.first:samples.last], samples.y,
         samples.delayed(best.p, best.structure.delay), best.simulated,
-        max(_noise(samples), step / np.sqrt(12.0)), best.point.gap,
+        max(noise, quantum(samples.y) / np.sqrt(12.0)), best.point.gap,
     )
-
-
-def _noise(samples: Samples) -> float:
-    return noise_of(samples.known.astype(float), samples.y[samples.known])
 
 
 def _proper(found: Fit) -> tuple[float, ...]:
@@ -519,7 +514,7 @@ def _held_out(samples: Samples, chosen: Compared, share: float) -> HeldOut:
     cut = samples.last - round(share * samples.count)
     later = samples.part(cut, samples.last)
     trained = chosen.trained
-    return HeldOut(cut, predicted(trained, later), held_out_rms(trained, later), trained.rms)
+    return HeldOut(cut, predicted(trained, later), chosen.held_out, trained.rms)
 
 
 def _as_parameter(spread: float) -> float:

@@ -225,11 +225,6 @@ def _with_a_pole(point: Point) -> list[Point]:
     ]
 
 
-def held_out_rms(found: Fit, later: Samples) -> float:
-    """Error of what the fit predicts for later samples."""
-    return _rms((later.y - predicted(found, later))[later.known])
-
-
 def _rms(error: Array) -> float:
     rms = float(np.sqrt(np.mean(error**2)))
     return rms if np.isfinite(rms) else inf
