@@ -20,8 +20,9 @@ from backlash_ros.core.estimation.explanations import (
     outside_bounds,
     problem_of,
 )
-from backlash_ros.core.estimation.fit import Fit, Problem
+from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.posterior import Fit
 from backlash_ros.core.estimation.settings import REVERSALS, STD_GAP, STD_SLOPE
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit import Fit, Problem
+from backlash_ros.core.estimation.fit import Problem
+from backlash_ros.core.estimation.posterior import Fit
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
-from backlash_ros.core.estimation.fit import FIRST_STEPS, Fit, Prior, Problem, Start
+from backlash_ros.core.estimation.fit import FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.posterior import Fit, Prior, Start
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.settings import (
     CHANCE,
@@ -159,7 +160,7 @@ def with_walk(p: Problem, f: Fit) -> Fit:
     if f.walk_std:
         still = p.walking(0.0)
         best = still.with_intervals(still.fitted(replace(f, step=0.0, noise_std=f.noise)))
-    if not best.valid or best.count * best.correlation <= 1.0:
+    if not best.valid or not best.systematic:
         return best
     for share in WALKS:
         walking = p.walking(share * f.m * f.gap / sqrt(len(p.v)))
@@ -208,7 +209,7 @@ def is_known(setup: Setup, f: Fit, turns: int) -> bool:
         return False
     if any(outside_bounds(setup.bounds, f)):
         return False
-    systematic = f.count * f.correlation > 1.0
+    systematic = f.systematic
     if systematic and f.unexplained > UNEXPLAINED and setup.family.count:
         return False
     factor = 1.0 / SYSTEMATIC if systematic else 1.0

@@ -9,23 +9,20 @@ integrated out in closed form (Normal-Gamma) over a grid of s, whose prior is lo
 G is about as wrong as configured. A leak has a prior of its own. The derivatives by g and p0 are
 those of the play: 1 where the left side was engaged last, and where none was. What older samples
 say is rows (R, d) on theta = (m, o, g, xi).
-
-Residuals that are correlated do not average out: with rho of theirs, N count as
-N / (1 - rho + N rho) independent ones.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from math import isfinite, log, sqrt
 from types import ModuleType
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, play, reversals
+from backlash_ros.core.estimation.posterior import Fit, Prior, Start
 from backlash_ros.core.estimation.reading import independence, step_of, told
 from backlash_ros.core.plant.filtering import lfilter
 
@@ -43,103 +40,6 @@ SHORTEST_STEP = 0.05  # share of a Gauss-Newton step that is tried
 LONGEST_STEP = 2.0  # prior deviations by which G moves at once
 TIGHT = 1e6  # weight of a beginning that is known
 VAGUE = 100.0  # prior deviation of the state before a record, over the largest reading
-
-
-class Prior(NamedTuple):
-    """What older samples say: R theta = d + noise of deviation 1, shapes (r, 3 + K), (r,)."""
-
-    rows: Array
-    values: Array
-
-
-class Start(NamedTuple):
-    """Where the play rests before a record: v at the last engagement, and on which side."""
-
-    v: float
-    left: bool
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Values of all unknowns with their posterior; compared, sent and printed like a number.
-
-    x: state before the record. knots: of the walk (W,), and walk_std, 0 for none. p0: p before the
-    record. theta: m, o, g, xi. noise_std: beside a step. step: of the readings where they are
-    taken for intervals, else 0.
-    scale: s, the likeliest. cov: of theta, as if residuals were white. prior: what the samples
-    say of theta, without the prior of xi. evidence: log-likelihood with unknowns integrated out.
-    correlation: rho. inflation: of cov, see above. count: of independent readings. rms: of the
-    residuals. turns: reversals of the engaged side.
-    """
-
-    x: Array
-    p0: float
-    theta: Array
-    noise_std: float
-    knots: Array = field(default_factory=lambda: np.zeros(0))
-    walk_std: float = 0.0
-    step: float = 0.0
-    scale: float = 1.0
-    cov: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    prior: Prior | None = None
-    volume: float = 0.0  # log of the posterior's volume: evidence minus likelihood
-    evidence: float = -np.inf
-    correlation: float = 0.0
-    inflation: float = 1.0
-    count: float = 0.0
-    rms: float = np.inf
-    turns: int = 0
-    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))  # of other gaps that fit alike
-
-    @property
-    def m(self) -> float:
-        """Slope."""
-        return float(self.theta[0])
-
-    @property
-    def gap(self) -> float:
-        """c_r - c_l."""
-        return float(self.theta[2])
-
-    @property
-    def xi(self) -> list[float]:
-        """Error of G, K values."""
-        out: list[float] = self.theta[3:].tolist()
-        return out
-
-    @property
-    def crossings(self) -> Array:
-        """m, c_r, c_l, shape (3,)."""
-        m, o, g = self.theta[:3].tolist()
-        return np.array([m, o / m, o / m - g])
-
-    @property
-    def crossings_cov(self) -> Array:
-        """Covariance of m, c_r, c_l, shape (3, 3)."""
-        m, o, _ = self.theta[:3].tolist()
-        by = np.array([[1.0, 0.0, 0.0], [-o / m**2, 1.0 / m, 0.0], [-o / m**2, 1.0 / m, -1.0]])
-        return np.asarray(by @ self.cov[:3, :3] @ by.T * self.inflation + self.spread)
-
-    @property
-    def gap_std(self) -> float:
-        """Standard deviation of the gap."""
-        cov = self.crossings_cov
-        return sqrt(max(float(cov[1, 1] + cov[2, 2] - 2.0 * cov[1, 2]), 0.0))
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of a reading, rounding included."""
-        return sqrt(self.noise_std**2 + self.step**2 / 12.0)
-
-    @property
-    def unexplained(self) -> float:
-        """Correlated residual motion over m times the gap."""
-        return sqrt(self.correlation) * self.rms / (abs(self.m) * max(self.gap, 1e-12))
-
-    @property
-    def valid(self) -> bool:
-        """Whether it is a backlash with finite deviations."""
-        return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
 
 
 class Problem:

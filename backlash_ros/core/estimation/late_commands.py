@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.explanations import Record, with_swapped
-from backlash_ros.core.estimation.fit import Fit, Problem
+from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.play import play
+from backlash_ros.core.estimation.posterior import Fit
 from backlash_ros.core.estimation.settings import COMMAND_ODDS
 from backlash_ros.core.plant.filtering import lfilter
 

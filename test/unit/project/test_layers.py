@@ -25,8 +25,9 @@ ROOMS = (
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'executor', 'worker', 'plant_family', 'play', 'reading', 'fit', 'search',
-    'explanations', 'coasting', 'late_commands', 'learning', 'observer', 'following', 'estimator',
+    'settings', 'plant_family', 'play', 'reading', 'posterior', 'fit', 'search', 'explanations',
+    'late_commands', 'coasting', 'belief', 'forgetting', 'publishing', 'learning', 'observer',
+    'following', 'executor', 'worker', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
