@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import pairwise
-from math import inf
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,7 @@ def read_bag(
     content = read_topics(path, lambda topic: last_part(topic.name) in wanted
                           and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
-        tables, models, notes = _find_tables(path, content, axis)
+        tables, models, joint, notes = _find_tables(path, content, axis)
     except InputError as error:
         raise InputError(f'{error}; {content.damage}' if content.damage else str(error)) from None
     begin_ns = float(tables[topics.SIGNALS].stamps[0])
@@ -120,7 +120,7 @@ def read_bag(
             f'{heard.size - count.size} samples were left out: only one of signals and estimates '
             'is in the bag'
         )
-    learned = _newest_model(models, signals.stamps[0], begin_ns + span.to_s * 1e9)
+    learned = _newest_model(models, joint, signals.stamps[0], begin_ns + span.to_s * 1e9)
     record = RunRecord(
         rows, sample_period, int(heard[-1] - heard[0]) + 1 - heard.size, learned
     )
@@ -209,8 +209,8 @@ def last_part(name: str) -> str:
 
 def _find_tables(
     path: Path, content: Content, axis: str,
-) -> tuple[dict[str, Table], Sequence[tuple[int, Any]], list[str]]:
-    """The array topics of one axis, the messages of its model, and what else is in the bag."""
+) -> tuple[dict[str, Table], Sequence[tuple[int, Any]], str, list[str]]:
+    """The array topics of one axis, the messages of its model, its joint, what else is there."""
     tables: dict[str, Table] = {}
     models: Sequence[tuple[int, Any]] = ()
     notes: list[str] = []
@@ -225,9 +225,9 @@ def _find_tables(
             axis = name.strip('/').split('/')[0]
         messages = content.messages.get(name, ())
         if topic == topics.MODEL:
-            models = _of_joint(messages, joint)
+            models = messages
         elif messages:
-            tables[topic] = _tabulate(path, name, labels, _of_joint(messages, joint))
+            tables[topic] = _tabulate(path, name, labels, messages, joint)
         elif topic == topics.TRUTH:  # which a real plant does not know
             tables[topic] = Table(labels, np.empty((0, len(labels))), np.empty(0, np.int64))
         elif name:
@@ -236,7 +236,7 @@ def _find_tables(
             heard = ', '.join(sorted(content.names)) or 'nothing'
             of_axis = f' of axis {axis}' if axis else ''
             raise InputError(f'{path}: holds no {topic}{of_axis}, only {heard}')
-    return tables, models, notes
+    return tables, models, joint, notes
 
 
 def _names_of(content: Content, topic: str, labels: Sequence[str]) -> list[str]:
@@ -267,37 +267,26 @@ def _choose_joint(content: Content, axis: str) -> tuple[str, str]:
     return chosen, note
 
 
-def _of_joint(messages: Sequence[tuple[int, Any]], joint: str) -> Sequence[tuple[int, Any]]:
-    """The same with what is about one joint alone, under its plain labels; '' for all of it."""
-    if not joint:
-        return messages
-    found = []
-    for stamp, message in messages:
-        dims, data = [], []
-        begin = 0
-        for each in message.layout.dim:
-            if each.label.startswith(f'{joint}.'):
-                dims.append(replace(each, label=each.label[len(joint) + 1:]))
-                data += message.data[begin:begin + each.size].tolist()
-            begin += each.size
-        # A joint that was not answered has a row of nan.
-        if data and not np.isnan(data).all():
-            layout = replace(message.layout, dim=dims)
-            found.append((stamp, replace(message, layout=layout, data=np.array(data))))
-    return found
-
-
 def _tabulate(
-    path: Path, topic: str, labels: Sequence[str], messages: Sequence[tuple[int, Any]],
+    path: Path, topic: str, labels: Sequence[str], messages: Sequence[tuple[int, Any]], joint: str,
 ) -> Table:
+    """The messages of a topic, of several joints what is about one; '' for all of it."""
     given = tuple(each.label for each in messages[0][1].layout.dim) or tuple(labels)
-    missing = sorted(set(labels) - set(given))
-    if missing:
-        raise InputError(f'{path}: {topic} lacks {", ".join(missing)}')
     if any(len(message.data) != len(given) for _, message in messages):
         raise InputError(f'{path}: {topic} has a message without a value for each label')
+    of_joint = {
+        label.removeprefix(f'{joint}.'): i for i, label in enumerate(given)
+        if not joint or label.startswith(f'{joint}.')
+    }
+    missing = sorted(set(labels) - set(of_joint))
+    if missing:
+        raise InputError(f'{path}: {topic} lacks {", ".join(missing)}')
     values = np.array([message.data for _, message in messages], dtype=np.float64)
-    return Table(given, values, np.array([stamp for stamp, _ in messages], dtype=np.int64))
+    values = values[:, list(of_joint.values())]
+    stamps = np.array([stamp for stamp, _ in messages], dtype=np.int64)
+    # A joint that was not answered has a row of nan.
+    answered = slice(None) if not joint else ~np.isnan(values).all(axis=1)
+    return Table(tuple(of_joint), values[answered], stamps[answered])
 
 
 def _choose_section(tables: dict[str, Table], span: Span) -> str:
@@ -354,7 +343,11 @@ def _offset(v: Array, count: Stamps, truth: Table) -> int:
     """
     if np.intersect1d(count, truth.sample).size:
         return 0
-    (commands, of_commands), (applied, of_applied) = map(_unique, (v, truth.column('v')))
+    once = []
+    for values in (v, truth.column('v')):
+        unique, rows, times = np.unique(values, return_index=True, return_counts=True)
+        once.append((unique[times == 1], rows[times == 1]))
+    (commands, of_commands), (applied, of_applied) = once
     _, here, there = np.intersect1d(commands, applied, return_indices=True)
     if not here.size:
         return 0
@@ -362,12 +355,6 @@ def _offset(v: Array, count: Stamps, truth: Table) -> int:
         count[of_commands[here]] - truth.sample[of_applied[there]], return_counts=True
     )
     return int(offsets[np.argmax(times)])
-
-
-def _unique(values: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Values that occur once, and where."""
-    unique, rows, times = np.unique(values, return_index=True, return_counts=True)
-    return unique[times == 1], rows[times == 1]
 
 
 def _median_period(path: Path, count: Stamps, stamps: Stamps) -> float:
@@ -380,18 +367,23 @@ def _median_period(path: Path, count: Stamps, stamps: Stamps) -> float:
 
 
 def _newest_model(
-    messages: Sequence[tuple[int, Any]], begin_ns: float, end_ns: float,
+    messages: Sequence[tuple[int, Any]], joint: str, begin_ns: float, end_ns: float,
 ) -> LearnedModel | None:
     """The last G that was published within the span; one that is not complete is none."""
-    within = [message for stamp, message in messages if begin_ns <= stamp < end_ns]
-    if not within:
-        return None
-    ends = np.cumsum([each.size for each in within[-1].layout.dim])
-    values = np.split(within[-1].data, ends)
-    fields = {
-        each.label: part.tolist() for each, part in zip(within[-1].layout.dim, values, strict=False)
-    }
+    fields: dict[str, list[float]] = {}
+    for stamp, message in messages:
+        if begin_ns <= stamp < end_ns:
+            ends = np.cumsum([each.size for each in message.layout.dim])
+            found = {
+                each.label.removeprefix(f'{joint}.'): values.tolist()
+                for each, values in zip(
+                    message.layout.dim, np.split(message.data, ends), strict=False
+                ) if not joint or each.label.startswith(f'{joint}.')
+            }
+            # Of a joint that was not answered there is nothing but nan.
+            if not all(isnan(value) for values in found.values() for value in values):
+                fields = found
     try:
-        return from_fields(fields)
+        return from_fields(fields) if fields else None
     except (KeyError, IndexError, ValueError):
         return None
