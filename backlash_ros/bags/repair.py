@@ -15,7 +15,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Writer, WriterError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from backlash_ros.bags.reading import (
+from backlash_ros.bags.reader import (
     BAG_METADATA,
     STORAGE_OF_SUFFIX,
     BagError,

@@ -14,7 +14,7 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from backlash_ros.bags.reading import lock_folder
+from backlash_ros.bags.reader import lock_folder
 from backlash_ros.core.parameters.errors import ParameterError
 
 STORAGE = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}

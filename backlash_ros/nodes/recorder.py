@@ -23,7 +23,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.bags.reading import REPAIR_COMMAND
+from backlash_ros.bags.reader import REPAIR_COMMAND
 from backlash_ros.bags.repair import repair_command
 from backlash_ros.bags.writer import Bag, RecordingError
 from backlash_ros.core.loop.figures import Finding, Level

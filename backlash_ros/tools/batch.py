@@ -25,7 +25,7 @@ from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples
-from backlash_ros.tools.runs.reading import run_loop
+from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
 

@@ -27,7 +27,7 @@ from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.runs.figure_data import ErrorCurves, control_error, moving_rms
 from backlash_ros.tools.runs.files import result_directory
-from backlash_ros.tools.runs.reading import run_loop
+from backlash_ros.tools.runs.read_run import run_loop
 
 COMPARISON_WINDOW_S = 0.5  # over which the error of a curve is averaged
 # No gap is wider than this one by definition (2.1), which is as good as none.

@@ -41,7 +41,7 @@ from backlash_ros.tools.runs.files import (
     write_run,
     write_summary,
 )
-from backlash_ros.tools.runs.reading import read_run
+from backlash_ros.tools.runs.read_run import read_run
 from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
 from backlash_ros.topics import BACKLASH
 

@@ -23,7 +23,7 @@ from backlash_ros.tools.cli import NOTHING, InputError, format_table
 from backlash_ros.tools.cluster import run_on_cluster
 from backlash_ros.tools.config import effective_parameters, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
-from backlash_ros.tools.runs.reading import run_loop
+from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import estimate_table
 from backlash_ros.topics import BACKLASH
 

@@ -13,7 +13,7 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import effective_parameters
-from backlash_ros.tools.runs.reading import run_loop
+from backlash_ros.tools.runs.read_run import run_loop
 
 # No compensation: the inverse is told that there is no gap, and learns nothing.
 WITHOUT = {

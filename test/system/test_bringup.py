@@ -23,7 +23,7 @@ from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.records.reading import read_record
-from backlash_ros.tools.runs.reading import read_run
+from backlash_ros.tools.runs.read_run import read_run
 
 TWO_AXES = ROOT / 'config' / 'two_axes.yaml'
 BIAS = {'pan': 0.5, 'tilt': 0.25}

@@ -19,7 +19,7 @@ from rosbags.highlevel import AnyReader
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.bags.reading import BagError, BagReader, message_files
+from backlash_ros.bags.reader import BagError, BagReader, message_files
 from backlash_ros.bags.repair import damage
 from backlash_ros.tools import report
 from backlash_ros.tools.runs.bag import read_bag

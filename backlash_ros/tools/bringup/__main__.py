@@ -164,7 +164,7 @@ def _report(axis: AxisPlan, joint: str) -> bool:
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.bringup.watch import complain
     from backlash_ros.tools.report import REPORT_PAGE, write_report
-    from backlash_ros.tools.runs.reading import read_run
+    from backlash_ros.tools.runs.read_run import read_run
     from backlash_ros.tools.runs.summary import estimate_table
     out = axis.out / joint
     try:

@@ -20,7 +20,7 @@ from backlash_ros.tools.bringup.supervisor import ProcessPlan
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
 from backlash_ros.tools.config import Configuration, read_configuration, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, result_directory
-from backlash_ros.tools.runs.reading import BAG
+from backlash_ros.tools.runs.read_run import BAG
 
 ELSEWHERE = 'none'
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros import topics
-from backlash_ros.bags.reading import Topic
+from backlash_ros.bags.reader import Topic
 from backlash_ros.core.loop.command_history import REPORTED, v_of_intervals
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError
@@ -20,7 +20,7 @@ from backlash_ros.core.records.rows_to_record import record_of_samples, usable
 from backlash_ros.core.records.timing import LONGEST, numbered, rounded, seconds
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs.bag import choose_namespace, read_topics
-from backlash_ros.tools.runs.reading import read_run
+from backlash_ros.tools.runs.read_run import read_run
 
 Array = NDArray[np.float64]
 Messages = tuple[NDArray[np.int64], Array]  # stamps [ns] and values

@@ -46,7 +46,7 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
         return _from_table(read_table(path), period, columns)
     # What reads bags takes half a second to load.
     from backlash_ros.tools.records.messages import read_bag_record
-    from backlash_ros.tools.runs.reading import find_bag, read_run
+    from backlash_ros.tools.runs.read_run import find_bag, read_run
     bag = find_bag(path)
     if bag is not None:
         return read_bag_record(bag, period, axis, columns)

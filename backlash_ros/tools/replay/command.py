@@ -96,7 +96,7 @@ def _opened(
     from backlash_ros.tools.runs.files import SAMPLES_FILE
     if is_table(path) and path.name != SAMPLES_FILE:
         return _logged(path, options, span)
-    from backlash_ros.tools.runs.reading import read_run
+    from backlash_ros.tools.runs.read_run import read_run
     source = read_run(path.resolve(), options.config, span, options.axis)
     for text in source.notes:
         print(f'{EXECUTABLE}: warning: {text}', file=sys.stderr)
@@ -135,7 +135,7 @@ def _reports(
     """What the driver said to have applied before each row, where the controller uses it."""
     from backlash_ros.core.loop.command_history import ReportUse, report_use
     from backlash_ros.tools.runs.bag import read_reports
-    from backlash_ros.tools.runs.reading import find_bag
+    from backlash_ros.tools.runs.read_run import find_bag
     use = report_use(parameters)
     if use is ReportUse.NEVER:
         return ()

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 
 from backlash_ros import topics
-from backlash_ros.bags.reading import REPAIR_COMMAND, BagError, BagReader, Topic
+from backlash_ros.bags.reader import REPAIR_COMMAND, BagError, BagReader, Topic
 from backlash_ros.core.loop.learned_model import LearnedModel, from_fields
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span

@@ -18,7 +18,7 @@ from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.metrics import delayed_reference, delayed_tracking_error_rms
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.cli import BrokenOffError, InputError
-from backlash_ros.tools.runs.reading import run_loop
+from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import reference_delay
 
 Array = NDArray[np.float64]

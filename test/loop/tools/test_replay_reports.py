@@ -15,7 +15,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.replay.command import main
-from backlash_ros.tools.runs.reading import read_run
+from backlash_ros.tools.runs.read_run import read_run
 
 FLOAT = 'std_msgs/msg/Float64'
 START_NS, PERIOD_NS = 1_800_000_000_000_000_000, 10_000_000

@@ -20,7 +20,7 @@ from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs import figure_data
 from backlash_ros.tools.runs.bag import read_bag
 from backlash_ros.tools.runs.files import Run, write_run, write_summary
-from backlash_ros.tools.runs.reading import read_run
+from backlash_ros.tools.runs.read_run import read_run
 from backlash_ros.tools.runs.summary import summarise
 
 

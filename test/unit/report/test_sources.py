@@ -13,7 +13,7 @@ from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.records.reading import read_record
 from backlash_ros.tools.replay import command as replay
-from backlash_ros.tools.runs.reading import read_run
+from backlash_ros.tools.runs.read_run import read_run
 
 
 @pytest.fixture(scope='module')

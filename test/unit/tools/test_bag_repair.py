@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
-from backlash_ros.bags.reading import BagError, BagReader
+from backlash_ros.bags.reader import BagError, BagReader
 from backlash_ros.bags.repair import damage, repair, repair_command
 from backlash_ros.bags.writer import STORAGE, Bag
 

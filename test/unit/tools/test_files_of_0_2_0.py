@@ -10,7 +10,7 @@ from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.replay.command import main as replay
-from backlash_ros.tools.runs.reading import read_run
+from backlash_ros.tools.runs.read_run import read_run
 
 OLD = ROOT / 'test' / 'of_0_2_0'
 LAST = {'m': 1.30029, 'c_r': 3.00258, 'c_l': -2.99812}  # as 0.2.0 printed them

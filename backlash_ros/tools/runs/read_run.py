@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from backlash_ros.bags.reading import is_bag
+from backlash_ros.bags.reader import is_bag
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import RunRecord
