@@ -268,5 +268,5 @@ def test_joints_of_an_arm_have_one_controller_and_a_report_each(start, tmp_path)
     for joint, c_r in (('waist', 0.02), ('elbow', 0.05)):
         assert (session.out / joint / 'report.html').is_file()
         summary = json.loads((session.out / joint / 'summary.json').read_text())
-        assert summary['samples'] >= 100
+        assert summary['samples'] + summary['lost_samples'] >= 100
         assert summary['final']['c_r'] == c_r
