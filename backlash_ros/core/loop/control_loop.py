@@ -14,8 +14,7 @@ from backlash_ros.core.assembly import (
     first_guess,
 )
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
-from backlash_ros.core.control.last_command import last_commands
-from backlash_ros.core.control.limits import Motion, at_rest, plausible
+from backlash_ros.core.control.limits import Motion, at_rest, last_commands, plausible
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.executor import Executor, InlineExecutor
 from backlash_ros.core.loop.command_history import CommandHistory, report_use

@@ -15,8 +15,7 @@ from backlash_ros.core.assembly import (
 )
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.last_command import last_commands
-from backlash_ros.core.control.limits import Limits, at_rest
+from backlash_ros.core.control.limits import Limits, at_rest, last_commands
 from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.protocol import (

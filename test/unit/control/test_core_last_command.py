@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.assembly import build_controller
-from backlash_ros.core.control.last_command import last_commands
-from backlash_ros.core.control.limits import Limits, at_rest
+from backlash_ros.core.control.limits import Limits, at_rest, last_commands
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 

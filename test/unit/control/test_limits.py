@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.control.last_command import last_commands
-from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
+from backlash_ros.core.control.limits import LARGEST, Limits, at_rest, last_commands
 
 
 @given(st.one_of(st.floats(), st.just(1e300)), st.floats(-10.0, 10.0), st.floats(-20.0, 5.0),

@@ -21,7 +21,6 @@ from backlash_ros.core.control.tracking.handover import HandOver
 from backlash_ros.core.control.tracking.rest import OFF, Mode, Rest
 from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
 from backlash_ros.core.control.tracking.trust import Trust, shrunk_crossings
-from backlash_ros.core.control.tracking.turning import NOISE_BAND, side_for
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.noise_level import NoiseLevel
@@ -34,6 +33,7 @@ SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, (5, 20), 100
 BEYOND = 0.3  # deviations of noise in feedback, that u_d may go further onward than u* soon is
 IN_FEEDBACK = 4.0  # times the noise of u* that feedback makes of the same noise
 ROUNDING = 1e-9  # relative, of u*
+NOISE_BAND = 4.0  # deviations of the noise in feedback that are worth a crossing of the gap
 FORESEEN = 6  # samples in which u* is neither to turn nor to hurry when another design takes over
 
 
@@ -181,10 +181,25 @@ class Tracking:
     def _side(
         self, asked: Region, turned: bool, u_d: float, noise: float, inverse: BacklashInverse,
     ) -> Region:
+        """Return the side of the gap for u_d.
+
+        A crossing costs wear and noise. The trajectory has no noise and is known ahead, so it
+        decides: asked; turned says whether it asks so since this sample. Feedback may ask for the
+        other side as well, where y is pushed, by more than noise: what of u_d may be noise.
+        """
         c_r, c_l = self.trust.state.crossings
         if c_r == c_l and asked is not Region.GAP and u_d != inverse.held_u:
             return Region.RIGHT if u_d > inverse.held_u else Region.LEFT  # nothing is crossed
-        return side_for(u_d, asked, turned, noise, self.trajectory.back, inverse)
+        side = inverse.side
+        if asked is Region.GAP or side is Region.GAP:
+            return asked
+        back, come_back = (inverse.held_u - u_d) * side, self.trajectory.back
+        if turned:
+            # Limits may have kept v so far behind that u still has to go on.
+            return asked if side is asked or back > -(noise + come_back) else side
+        # Where feedback turned before the trajectory does, that is no reason to turn again.
+        band = come_back + (noise if side is asked else 0.0)
+        return Region(-side) if back > max(band, inverse.direction_band) else side
 
     def _invert(
         self, u_d: float, side: Region | None, crossings: Sequence[float],
