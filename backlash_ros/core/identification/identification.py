@@ -303,7 +303,8 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
     delay = max(delay, WINDOW)  # taps of a shorter one reach as far
     window = range(delay - 1, min(delay + WINDOW + 2, latest) + 1)
     late = yield from _searched(v, y, options, window)
-    better = effective_rows(late.samples, late.best) * np.log(early.best.rms / late.best.rms)
+    ratio = max(early.best.rms, TINY) / max(late.best.rms, TINY)
+    better = effective_rows(late.samples, late.best) * float(np.log(ratio))
     inner = late.best.structure.delay < max(window)
     if inner and better > LATER:
         return late
