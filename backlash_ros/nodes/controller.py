@@ -322,7 +322,9 @@ class ControllerNode(ManagedNode):
             joint.name for joint in self.joints
             if (loop := loops.by_name[joint.name]).begins and not loop.standing_down
             and joint.name in outputs.y
-            and not (self._knows_rivals() and joint.may_begin(outputs))
+            and not (self._knows_rivals() and joint.first_command.may_follow(
+                loop, outputs.of(joint.name), joint.p
+            ))
         }
 
     def _pair(self) -> None:

@@ -247,7 +247,7 @@ class RecorderNode(ProcessNode):
 
         self._with_bag(announce)
         self._channels.append(channel)
-        return partial(_is_published, subscription)
+        return lambda: subscription.get_publisher_count() > 0
 
     def _start(self) -> None:
         qos = output_qos(self.settings, RECORDER_DEPTH)
@@ -292,10 +292,6 @@ def _free_megabytes(folder: Path) -> float:
         return shutil.disk_usage(folder).free * 1e-6
     except OSError:  # somebody has removed the folder
         return nan
-
-
-def _is_published(subscription: Any) -> bool:
-    return bool(subscription.get_publisher_count() > 0)
 
 
 def _type_name(message_type: type[Any]) -> str:

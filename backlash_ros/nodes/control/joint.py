@@ -17,7 +17,7 @@ from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.command_history import awaited_reports
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.phase import Phase
-from backlash_ros.core.loop.sample_counter import JointOutputs, Output
+from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.nodes.control.diagnosis import Diagnosis, counts_of
@@ -146,11 +146,6 @@ class Joint:
         if self.loop is not None and self.loop.knows_v:
             self.first_command.before = self.loop.v
         self.loop = None
-
-    def may_begin(self, outputs: JointOutputs) -> bool:
-        """Whether it is known from which v the first command goes on, or waiting is in vain."""
-        assert self.loop is not None
-        return self.first_command.may_follow(self.loop, outputs.of(self.name), self.p)
 
     def follow(self, step: ControlStep, was_silent: bool) -> bool:
         """Tell of a step; returns whether there is something new to say in /diagnostics."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 
+from rclpy.duration import Duration
 from rclpy.timer import Timer
 
 from backlash_ros.core.loop.control_loop import ControlLoop
@@ -98,4 +99,5 @@ class LastCommandSender:
         if cut_short:
             for loop in held:
                 self._node.log.warning(f'v={loop.v:.6g} is held: {cut_short}')
-        self._io.wait_until_received(CONFIRMED_WITHIN_S)
+        confirmed_within = Duration(nanoseconds=int(CONFIRMED_WITHIN_S * 1e9))
+        self._io.publisher.wait_for_all_acked(confirmed_within)

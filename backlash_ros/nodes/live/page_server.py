@@ -52,7 +52,7 @@ class CurvePoints:
             elif label == U:
                 reconstructed.append((at_ns, value))
         for at_ns, u in reconstructed:
-            # u is sent with the v that it came from, after it: see watch_publisher.py.
+            # u is sent with the v that it came from, after it: see WatchPublisher.
             v = None
             while self._v and self._v[0][0] <= at_ns:
                 _, v = self._v.popleft()

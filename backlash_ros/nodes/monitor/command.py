@@ -133,7 +133,7 @@ class MonitorNode(ProcessNode):
                     due_s = time.monotonic() + SCREEN_PERIOD_S
                     self._refresh()
                     live.update(screen(
-                        self._states, self._selected, self._text_below(), time.monotonic(),
+                        self._followed.states, self._selected, self._text_below(), time.monotonic(),
                         console.width, console.height, blocks,
                     ), refresh=True)
 
@@ -144,9 +144,9 @@ class MonitorNode(ProcessNode):
             if time.monotonic() >= due_s:
                 due_s += LINE_S
                 self._refresh()
-                for state in self._states:
+                for state in self._followed.states:
                     print(plain_line(state, time.monotonic()), file=stream)
-                if not self._states:
+                if not self._followed.states:
                     print(self._followed.awaited, file=stream)
                 stream.flush()
 
@@ -172,20 +172,16 @@ class MonitorNode(ProcessNode):
     def _text_below(self) -> str:
         if time.monotonic() < self._notice_ends_s:
             return self._notice
-        return '' if self._states else self._followed.awaited
-
-    @property
-    def _states(self) -> list[ControllerState]:
-        return self._followed.states
+        return '' if self._followed.states else self._followed.awaited
 
     def _on_key(self, key: str) -> None:
         if key == 'q':
             self.exit_code, self.stopping = DONE, True
-        elif key == '\t' and self._states:
-            self._selected = (self._selected + 1) % len(self._states)
+        elif key == '\t' and self._followed.states:
+            self._selected = (self._selected + 1) % len(self._followed.states)
             self._confirmed_until_s = 0.0
-        elif key in ACTIONS and self._states:
-            self._act(key, self._states[self._selected])
+        elif key in ACTIONS and self._followed.states:
+            self._act(key, self._followed.states[self._selected])
 
     def _act(self, key: str, state: ControllerState) -> None:
         """Call the service behind a key."""

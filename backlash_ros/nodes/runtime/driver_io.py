@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -235,10 +234,6 @@ class DriverIo:
             elif all(row.get(name, len(passed)) < len(passed) for name in names):
                 setattr(message, field, [passed[row[name]] for name in names])
         return message
-
-    def wait_until_received(self, timeout_s: float) -> None:
-        """Wait until the driver has confirmed the newest v, or the timeout is over."""
-        self.publisher.wait_for_all_acked(Duration(nanoseconds=int(timeout_s * 1e9)))
 
     @property
     def has_reports(self) -> bool:

@@ -120,7 +120,7 @@ def test_estimates_are_frozen_reset_and_compensated_with_as_is_asked() -> None:
         made.run(100)
         assert estimates(made) == held
         assert made.set_bool('freeze_adaptation', False)
-        made.run(100)
+        made.run(200)
         assert estimates(made) != held
         assert np.abs(np.diff(made.sent[-100:])).max() > GAP
         assert made.set_bool('enable_compensation', False)
