@@ -59,6 +59,7 @@ class IdealTrajectory:
         )
         self.ahead: list[float] = [0.0]  # u* from now on, as far as the references are known
         self.onward = self.state.x  # x* of the next sample
+        self.noise_band = 0.0  # how far the noise of the references may turn u*
         self.noise = 0.0  # of u*: what is no turn
 
     def use(self, design: TrackingDesign) -> None:
@@ -92,6 +93,7 @@ class IdealTrajectory:
     def take(self, y_m: float) -> None:
         """Take in r(k + N), so that u* is known for this sample and those ahead."""
         self.references.append(y_m)
+        self.noise_band = TURN_BAND * self.references.u_noise_std
         self._look_ahead()
 
     @property
@@ -145,11 +147,6 @@ class IdealTrajectory:
         """By how much u* has come back without having turned."""
         state = self.state
         return max((state.extreme - self.ahead[0]) * state.side, 0.0)
-
-    @property
-    def noise_band(self) -> float:
-        """How far the noise of the references may turn u*."""
-        return TURN_BAND * self.references.u_noise_std
 
     @property
     def onward_u(self) -> float:
