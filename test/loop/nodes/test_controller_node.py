@@ -11,8 +11,6 @@ from lifecycle_msgs.msg import Transition
 from node_in_process import Bench, bench, look_for_silence
 from std_srvs.srv import Trigger
 
-from backlash_ros.core.parameters.errors import ParameterError
-
 RATE_MAX = 400.0
 STEP = RATE_MAX * 0.01 * (1.0 + 1e-9)
 GAP = 5.0  # less than that of the plant
@@ -44,20 +42,6 @@ def test_it_goes_through_its_life_and_commands_only_while_active() -> None:
         assert made.state == 'unconfigured'
         assert made.change(Transition.TRANSITION_UNCONFIGURED_SHUTDOWN)
         assert made.state == 'finalized'
-
-
-def test_a_node_whose_activation_fails_is_not_active(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail() -> None:
-        raise ParameterError('sample_period', 0.0, 'does not suit this test')
-
-    with bench(active=False) as made:
-        assert made.change(CONFIGURE)
-        monkeypatch.setattr(made.node, 'activate', fail)
-        assert not made.change(ACTIVATE)
-        assert not made.node.active
-        monkeypatch.undo()
-        made.node.trigger_activate()
-        assert made.node.active
 
 
 @pytest.mark.parametrize('steps', [

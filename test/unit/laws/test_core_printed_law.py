@@ -18,6 +18,12 @@ from backlash_ros.core.laws.printed_law import (
     printed_m,
 )
 
+
+def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:
+    estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0, f=estimator.estimate.f))
+    return estimator.estimate
+
+
 WIDE = Bounds((1e-9, 1e9), (0.0, 1e9), (-1e9, 0.0))
 WIDE_F = (-1e9, 1e9)
 START = Estimate(0.696, 0.5, -0.5, 0.22)
@@ -31,11 +37,6 @@ def law(initial: Estimate = START, bounds: Bounds = WIDE,
 
 def control(y_m: float, estimate: Estimate, inverse: BacklashInverse) -> Command:
     return Proportional().control(ControlInput(y_m, 0.0, estimate, NO_STATE), inverse)
-
-
-def feed(estimator: PrintedLaw, u: float, y_m: float) -> Estimate:
-    estimator.update(u, Interval(v=0.0, y_m=y_m, u_d=0.0, f=estimator.estimate.f))
-    return estimator.estimate
 
 
 @given(u=SMALL, y_m=SMALL, m=eighths(1, 80), w=SMALL)

@@ -3,16 +3,6 @@
 import numpy as np
 
 from backlash_ros.core.loop.loop_statistics import Lately, LoopStatistics
-from backlash_ros.tools.runs.summary import latency_ms
-
-
-def test_diagnostics_and_report_agree_on_the_latency_of_the_same_samples() -> None:
-    latencies = np.random.default_rng(3).gamma(2.0, 1e-4, 40)
-    statistics = LoopStatistics()
-    for latency in latencies:
-        statistics.note(0.0, 0.0, False, float(latency))
-    reported = latency_ms(latencies)
-    assert reported == dict(zip(('p50', 'p99'), statistics.latencies_ms(0.5, 0.99), strict=True))
 
 
 def test_what_was_gained_lately_is_never_negative_after_a_new_beginning() -> None:
