@@ -12,7 +12,6 @@ from places import ROOT
 
 from backlash_ros.tools.bringup.environment import child_environment, free_domain
 
-EXAMPLES = ROOT / 'examples'
 BLOCKS = re.findall(
     r'^```bash\n(.*?)^```', (ROOT / 'docs' / 'driver.md').read_text(), re.MULTILINE | re.DOTALL
 )

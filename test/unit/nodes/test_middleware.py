@@ -13,10 +13,6 @@ from backlash_ros.middleware.loopback import (
 )
 
 HERE = {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
-MAPS = Path('/proc/self/maps')  # Linux
-SHARED_MEMORY = Path('/dev/shm')  # Linux
-PORT_SIZE = 52400  # of the file that Fast DDS makes for a port, in bytes
-PORTS_OF_TEN_PROCESSES = 32
 
 
 def chosen(environment: dict[str, str]) -> str | None:

@@ -33,7 +33,7 @@ class OtherStorage:
         self.abort = self._hidden.abort
 
 
-FLOAT, ARRAY = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
+FLOAT = 'std_msgs/msg/Float64'
 CDR = b'\x00\x01\x00\x00'
 MESSAGES, PER_FLUSH = 300, 60
 PAGE = 4096  # of SQLite
