@@ -31,7 +31,7 @@ from backlash_ros.core.estimation.settings import (
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-CANDIDATES = 3  # best gaps of a search that are fitted
+CANDIDATES = 6  # best gaps of a search that are fitted
 BEGINNINGS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
 WALKS = (0.005, 0.02, 0.08)  # of u over the whole record, over m times the gap, that are compared
 WALKING = 30.0  # log-likelihood by which a walk must be better than none

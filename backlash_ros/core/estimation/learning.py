@@ -133,9 +133,9 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
     ):
         # A first estimate has to be found twice: some samples alone may mislead.
         return replace(after, candidate=found, next_at=record.end + max(count // BLOCKS, FEWEST))
-    # What leaves correlated residuals must predict a quarter as many samples before it is believed.
-    systematic = found.systematic
-    must = max(before.must_predict, len(part.v) // 4 if systematic else 0)
+    # What leaves more than noise must predict a quarter as many samples before it is believed.
+    more = found.systematic or found.noise > AS_GOOD * configured_noise(setup, found)
+    must = max(before.must_predict, len(part.v) // 4 if more else 0)
     after = replace(after, older=None, start=None, must_predict=must)
     return _adopted(setup, part, found, after)
 

@@ -6,7 +6,7 @@ QR for each of some 300 hypotheses. Rows are averaged to some 1,500, as densely 
 
 from __future__ import annotations
 
-from math import isfinite
+from math import inf, isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from backlash_ros.core.plant.filtering import lfilter
 Array = NDArray[np.float64]
 
 GAPS, STARTS = 32, 5  # that are compared, and beginnings within each
+PEAKS = 3  # that come first
 SMALLEST = 0.01  # gap that is compared, over the swing of v
 # Gaps of the second look, over the best of the first.
 ZOOM: Array = np.array([0.8 + 0.025 * k for k in range(17)])
@@ -42,7 +43,9 @@ class Hypothesis(NamedTuple):
 def search(
     family: PlantFamily, v: Array, y: Array, noise_std: float, widest: float,
 ) -> tuple[list[Hypothesis], float]:
-    """Hypotheses, the likeliest first, and the evidence of a u that never moves.
+    """Hypotheses, and the evidence of a u that never moves.
+
+    The likeliest one and those of other gaps that are likelier than their neighbours come first.
 
     v, y: (N,), y nan where lost. widest: gap that is considered.
     """
@@ -51,11 +54,19 @@ def search(
     top = min(swing, widest)
     gaps: Array = np.append(NONE * swing, np.geomspace(SMALLEST * min(swing, top), top, GAPS))
     starts: Array = np.arange(STARTS) / (STARTS - 1.0)
-    found = compared.evidence(gaps, starts)
-    best = max(found).gap
+    found = [h for h in compared.evidence(gaps, starts) if isfinite(h.evidence)]
+    if not found:
+        return [], compared.null
     between = 0.5 * (starts[1:] + starts[:-1])
-    found += compared.evidence(best * ZOOM, np.append(starts, between))
-    return sorted((h for h in found if isfinite(h.evidence)), reverse=True), compared.null
+    closer = compared.evidence(max(found).gap * ZOOM, np.append(starts, between))
+    first = sorted({max([*closer, max(found)]), *_peaks(found)}, reverse=True)[:PEAKS]
+    return [*first, *sorted({*closer, *found} - {*first}, reverse=True)], compared.null
+
+
+def _peaks(found: list[Hypothesis]) -> list[Hypothesis]:
+    """Those of growing gaps that are likelier than their neighbours."""
+    e = [-inf, *(h.evidence for h in found), -inf]
+    return [h for k, h in enumerate(found) if e[k] < e[k + 1] > e[k + 2]]
 
 
 class _Comparison:

@@ -22,7 +22,7 @@ MARKS_S = (2.0, 6.0)
 
 def test_noise_free_example_is_exact_after_one_second() -> None:
     found = judged(build_closed_loop(Parameters(EXACT)).run(601))
-    assert found.error[35:].max() <= 0.01
+    assert found.error[37:].max() <= 0.01
     assert max(found.error[100:].max(), found.m[100:].max()) <= 1e-5
 
 
