@@ -35,6 +35,7 @@ from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.laws.printed_law import PrintedLaw
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.table import PlantModel
 from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles
 from backlash_ros.core.plant.model_check import check_model, model_warnings
 from backlash_ros.core.plant.state_model import StateModel
@@ -85,6 +86,13 @@ def known_before(p: Parameters) -> Estimate:
     Raises ParameterError for a file that does not belong to these parameters.
     """
     return load_estimate(p) or first_guess(p)
+
+
+def takes_model_as_exact(p: Parameters) -> bool:
+    """Whether a G other than that of the paper's example is taken as exact by a law that learns."""
+    plant, paper = p.plant, PlantModel()
+    of_paper = (plant.numerator, plant.denominator) == (paper.numerator, paper.denominator)
+    return p.estimator.law == 'moving_horizon' and not p.plant.uncertainty and not of_paper
 
 
 def build_controller(

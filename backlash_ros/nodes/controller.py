@@ -18,6 +18,7 @@ from backlash_ros.core.assembly import (
     WORKER_MODULES,
     build_controller,
     known_before,
+    takes_model_as_exact,
     warnings_of,
 )
 from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
@@ -162,6 +163,14 @@ class ControllerNode(ManagedNode):
                else 'autostart is false: waits for '
                     f'ros2 lifecycle set {self.get_fully_qualified_name()} configure')
         )
+        exact = [joint for joint in p.joint_names if takes_model_as_exact(p.of_joint(joint))]
+        if exact:
+            of = f' of {", ".join(exact)}' if exact[0] else ''
+            self.log.info(
+                f'plant.uncertainty{of} is 0: G is taken as exact, which no data can check. Where '
+                'it is not, estimates are off by more than their deviations: 0.2 allows for time '
+                'constants that are 20 % off'
+            )
 
     @property
     def configured(self) -> list[ControlLoop]:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from backlash_ros.core.assembly import build_controller, warnings_of
+from backlash_ros.core.assembly import build_controller, takes_model_as_exact, warnings_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
@@ -40,3 +40,14 @@ def test_plant_that_makes_it_hard_is_warned_of(parameters: Parameters, reason: s
 def test_the_example_is_neither_refused_nor_warned_of() -> None:
     build_controller(Parameters())
     assert warnings_of(Parameters()) == []
+
+
+@pytest.mark.parametrize(('changes', 'exact'), [
+    ({'plant.uncertainty': 0.0}, False),  # the paper assumes it of its example
+    ({'plant.uncertainty': 0.0, 'plant.numerator': [2e-5, 4e-5, 1e-5]}, True),
+    ({'plant.numerator': [2e-5, 4e-5, 1e-5]}, False),
+    ({'plant.uncertainty': 0.0, 'plant.numerator': [2e-5, 4e-5, 1e-5],
+      'estimator.law': 'fixed'}, False),
+])
+def test_a_model_that_is_taken_as_exact_is_known(changes, exact):
+    assert takes_model_as_exact(Parameters(changes)) is exact
