@@ -76,16 +76,18 @@ class BusServoDriver(Node):
         self._unheard += 1
         if self._unheard == HOLD_AFTER:
             self._wanted = {}
-        readings = {}
+        complete = False
         try:
             if self.cycles // RETRY_AFTER > before // RETRY_AFTER or not self._bus.goals:
                 self._bus.engage()
             readings = self._bus.read()
             self._publish(readings)
+            complete = len(readings) == len(self._joints)
             self._move()
         except UNPLUGGED:
             self._bus.lose()
-        self.lost += self.cycles - before - (len(readings) == len(self._joints))
+        finally:  # also where a signal ends the cycle
+            self.lost += self.cycles - before - complete
         self._tell()
 
     def _move(self) -> None:

@@ -35,7 +35,8 @@ def processes_in(
         folder = Path(name)
         environment = child_environment(folder, domain)
         stages = [
-            [ProcessPlan(who, tuple(command), folder / f'{who}.log', environment)]
+            [ProcessPlan(who, tuple(command), folder / f'{who}.log', environment,
+                         foreign='-m' not in command)]  # no node of the package
             for who, command in commands.items()
         ]
         with ProcessSupervisor(stages, lambda: False) as supervisor:
