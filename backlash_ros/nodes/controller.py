@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence, Set
 from concurrent.futures import Future
+from itertools import cycle
 from math import isfinite, nan
 from typing import NamedTuple
 
@@ -144,7 +145,12 @@ class ControllerNode(ManagedNode):
         let_parameters_change(
             self, self._check_change, self._take_up, lambda: self.loops is None
         )
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
+        # One joint at a time: all at once would hold up a command.
+        turn = cycle(self.joints)
+        self.create_timer(
+            DIAGNOSTICS_PERIOD_S / len(self.joints),
+            lambda: next(turn).diagnose(self._rivals, self.active), clock=self.steady_clock,
+        )
         if not p.lockstep:
             self.create_timer(0.05, self._look_for_silence, clock=self.steady_clock)
         self._announce()
