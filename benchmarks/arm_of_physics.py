@@ -1,96 +1,166 @@
-"""The tip of an arm with play in six joints, with and without its loops knowing of the gaps.
+"""An arm with play in six joints: each identified alone, then all of them on a trajectory.
 
-    python benchmarks/arm_of_physics.py [--write]
+    python benchmarks/arm_of_physics.py [--files DIR] [--passes 2] [--write]
 
-Everything is in one process and in simulated time: the arm of examples/arm_physics.py, the
-trajectory of examples/joint_trajectory.py, the loops of one controller with config/arm.yaml. y are
-encoders of 12 bits, v are whole steps of them. --write: draws docs/images/arm.png.
+Everything is in one process and in simulated time: the arm of examples/arm_physics.py, encoders of
+12 bits, commands in whole steps of them, which the driver reports. `identify` gets a record of each
+joint, moved as `identify --drive` moves it; one controller goes on with the files that it writes,
+on the trajectory of examples/joint_trajectory.py. --files: keeps those files, and uses those that
+are there. --write: makes the film of
+docs/arm.md, with libOSMesa (apt-get install libosmesa6) where there is no display.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+import tempfile
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from PIL import Image
 from reporting import ROOT, text_table
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / 'examples'))
+sys.path.append(str(ROOT / 'examples'))
+os.environ.setdefault('MUJOCO_GL', 'osmesa')  # mujoco reads it when it is imported
 
-from arm_physics import RESOLUTION, ArmPhysics
+from arm_physics import JOINTS, RESOLUTION, ArmPhysics, Joint
 from joint_trajectory import swing
 
-from backlash_ros.core.assembly import first_guess
+from backlash_ros.core.assembly import first_guess, known_before
+from backlash_ros.core.driver_check.gentle_drive import IdentificationDrive, drive_range
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.config import load_config
-from backlash_ros.tools.figures import TIME_LABEL, curve, label, new_figure, png
+from backlash_ros.tools.config import load_config, read_parameter_file
+from backlash_ros.tools.figures import TIME_LABEL, curve, label
+from backlash_ros.tools.identify.command import main as identify
 
 Array = NDArray[np.float64]
 
-AMPLITUDE, PERIOD_S, DURATION_S = 0.2, 8.0, 16.0  # of a swing [rad], and for how long
-PICTURE = ROOT / 'docs' / 'images' / 'arm.png'
+AMPLITUDE, PERIOD_S = 0.2, 8.0  # of a swing [rad]
+REACH, SPEED, DRIVE_S = 0.2, 0.15, 60.0  # of the motion for identify [rad], [rad/s]: no link coasts
+KNOWN_OF_SERVOS = ('--order', '1', '--integrator', 'no')  # position loops in slow motion
+OF_A_JOINT = ('plant.', 'estimator.', 'tracking.', 'control.delay_samples')  # of identified.yaml
+NAMES = [joint.name for joint in JOINTS]
+FILM = ROOT / 'docs' / 'images' / 'arm.gif'
+FRAME_S, COLOURS, VIEW_AT = 0.16, 48, (0.12, 0.0, 0.2)  # of the film
 
 
 class Motion(NamedTuple):
-    """The second period.
+    """One joint after the other in its columns, a sample in each row, beginning at rest.
 
-    t (N,) [s]. tip (N,): distance from where it belongs [m]. joints (N, 6): those of the joints
-    [rad].
+    errors (N, 6): of the joints [rad], and tip (N,): distance of the tip [m] from where it belongs,
+    for references as late as the loops follow them. gaps (N, 6): as estimated [rad].
+    poses (N, 12): of motors and joints, as the physics have them [rad].
     """
 
-    t: Array
+    errors: Array
     tip: Array
-    joints: Array
+    gaps: Array
+    poses: Array
 
 
-def move(share: float) -> Motion:
-    """The arm with loops that take this share of what each joint loses for its gap."""
-    arm = ArmPhysics()
-    p = parameters(arm, share)
-    sample_s = p.sample_period
-    v = dict.fromkeys(p.joint_names, 0.0)
-    now_ns = 0
-    loops = JointLoops(
-        p, v.update, lambda: now_ns,
-        {joint: first_guess(p.of_joint(joint)) for joint in p.joint_names},
-        SampleCounter(sample_s), dict(v),
-    )
-    references, positions = [], []
-    for k in range(round(DURATION_S / sample_s)):
-        now_ns = round((1.0 + k * sample_s) * 1e9)
-        references.append([
-            swing(k * sample_s, i, AMPLITUDE, PERIOD_S) for i in range(len(p.joint_names))
-        ])
-        positions.append(arm.links)
-        loops.take_references(dict(zip(p.joint_names, references[-1], strict=True)))
-        y = dict(zip(p.joint_names, arm.encoders(), strict=True))
-        loops.answer(JointOutputs(y, now_ns, now_ns, now_ns, k, numbered=False))
-        arm.move_to([RESOLUTION * round(v[joint] / RESOLUTION) for joint in p.joint_names])
-        arm.advance(sample_s)
-    delay = loops.by_name[p.joint_names[0]].core.structure.delay
-    first = len(positions) // 2
-    where, wanted = np.array(positions[first:]), np.array(references[first - delay:-delay])
-    tip = [
-        np.linalg.norm(arm.tip_at(a) - arm.tip_at(b)) for a, b in zip(where, wanted, strict=True)
-    ]
-    return Motion(sample_s * np.arange(len(tip)), np.array(tip), where - wanted)
+def shared_parameters() -> dict[str, object]:
+    """What config/arm.yaml says of all joints."""
+    given = load_config(ROOT / 'config' / 'arm.yaml')
+    return {name: value for name, value in given.items() if name.partition('.')[0] not in NAMES}
 
 
-def parameters(arm: ArmPhysics, share: float) -> Parameters:
-    """Those of config/arm.yaml with constants for the gaps."""
+def identify_joint(joint: Joint, folder: Path) -> None:
+    """Move one joint while the others are held, and let `identify` write what it finds."""
+    shared = shared_parameters()
+    period_s = Parameters(shared).sample_period
+    arm, at, goals = ArmPhysics(), NAMES.index(joint.name), [0.0] * len(JOINTS)
+    limits = drive_range(Parameters(shared), REACH, SPEED)
+    drive, rows = IdentificationDrive(limits, period_s, DRIVE_S), ['t,v,y']
+    for k in range(round(DRIVE_S / period_s)):
+        y, goals[at] = arm.encoders()[at], in_steps(drive.step())
+        rows.append(f'{k * period_s:.3f},{goals[at]!r},{y!r}')
+        arm.move_to(goals)
+        arm.advance(period_s)
+    record = folder / f'{joint.name}.csv'
+    record.write_text('\n'.join(rows) + '\n')
+    identify([str(record), *KNOWN_OF_SERVOS, '--out', str(folder / joint.name)])
+
+
+def identified(folder: Path) -> dict[str, object]:
+    """Parameters of the arm, with what `identify` has written of each joint."""
     values: dict[str, object] = {
-        **load_config(ROOT / 'config' / 'arm.yaml'), 'estimator.law': 'fixed',
+        **shared_parameters(), 'estimates.load': True,
+        'estimates.file': str(folder / '{joint}' / 'estimates.json'),
     }
-    for joint in arm.joints:
-        half = 0.5 * share * arm.lost_motion(joint)
-        values |= {f'{joint.name}.estimator.initial.c_r': half,
-                   f'{joint.name}.estimator.initial.c_l': -half}
-    return Parameters(values)
+    for name in NAMES:
+        found = read_parameter_file(folder / name / 'identified.yaml').values('')
+        values |= {f'{name}.{own}': value for own, value in found.items()
+                   if own.startswith(OF_A_JOINT)}
+    return values
+
+
+def with_gaps(values: dict[str, object], share: float) -> dict[str, object]:
+    """The same with constants: this share of what each joint loses for its gap."""
+    fixed = {**values, 'estimator.law': 'fixed', 'estimates.load': False}
+    for joint in JOINTS:
+        half = 0.5 * share * ArmPhysics().lost_motion(joint)
+        fixed |= {f'{joint.name}.estimator.initial.c_r': half,
+                  f'{joint.name}.estimator.initial.c_l': -half,
+                  f'{joint.name}.estimator.law': 'fixed'}
+    return fixed
+
+
+def move(p: Parameters, passes: int) -> Motion:
+    """The arm with these loops on so many periods of the trajectory."""
+    arm, period_s, now_ns = ArmPhysics(), p.sample_period, 0
+    v = dict.fromkeys(NAMES, 0.0)
+    reports: dict[str, deque[tuple[float, int]]] = {name: deque() for name in NAMES}
+    before = known_before if p.estimates.load else first_guess
+    loops = JointLoops(
+        p, v.update, lambda: now_ns, {name: before(p.of_joint(name)) for name in NAMES},
+        SampleCounter(period_s), dict(v), lambda name: emptied(reports[name]),
+    )
+    references, positions, gaps, poses = [], [], [], []
+    for k in range(round(passes * PERIOD_S / period_s)):
+        now_ns = round((1.0 + k * period_s) * 1e9)
+        references.append([swing(k * period_s, i, AMPLITUDE, PERIOD_S) for i in range(len(v))])
+        positions.append(arm.links)
+        poses.append(arm.data.qpos.copy())
+        loops.take_references(dict(zip(NAMES, references[-1], strict=True)))
+        y = dict(zip(NAMES, arm.encoders(), strict=True))
+        loops.answer(JointOutputs(y, now_ns, now_ns, now_ns, k, numbered=False))
+        estimates = [loop.estimate for loop in loops.by_name.values()]
+        gaps.append([one.c_r - one.c_l for one in estimates])
+        for loop in loops.by_name.values():
+            loop.core.refine()
+        goals = [in_steps(v[name]) for name in NAMES]
+        for name, goal in zip(NAMES, goals, strict=True):
+            reports[name].append((goal, now_ns + round(period_s * 1e9)))
+        arm.move_to(goals)
+        arm.advance(period_s)
+    delays = [loop.core.structure.delay for loop in loops.by_name.values()]
+    late = np.maximum(np.arange(len(positions))[:, None] - delays, 0)
+    wanted, where = np.take_along_axis(np.array(references), late, 0), np.array(positions)
+    tip = np.array([
+        np.linalg.norm(arm.tip_at(a) - arm.tip_at(b)) for a, b in zip(where, wanted, strict=True)
+    ])
+    return Motion(where - wanted, tip, np.array(gaps), np.array(poses))
+
+
+def in_steps(v: float) -> float:
+    """A command as the servos take it [rad]."""
+    return RESOLUTION * round(v / RESOLUTION)
+
+
+def emptied(reports: deque[tuple[float, int]]) -> Iterator[tuple[float, int]]:
+    """What has been reported since the last time."""
+    while reports:
+        yield reports.popleft()
 
 
 def rms(values: Array) -> Array:
@@ -98,31 +168,88 @@ def rms(values: Array) -> Array:
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-def draw(without: Motion, compensated: Motion) -> None:
-    """Distance of the tip over time, both."""
-    figure = new_figure(3.2)
-    axes = figure.subplots()
-    curve(axes, without.t, 1e3 * without.tip, 'tab:red', 'gaps taken for 0')
-    curve(axes, compensated.t, 1e3 * compensated.tip, 'tab:blue', 'gaps known')
-    label(axes, 'Tip of an arm with play in six joints', 'from where it belongs [mm]', TIME_LABEL)
-    axes.legend()
-    axes.grid(alpha=0.3)
-    PICTURE.write_bytes(png(figure))
+def film(without: Motion, learned: Motion, pass_of: int) -> None:
+    """The last pass: the arm, and how far its tip is from where it belongs, with and without."""
+    import mujoco  # what it draws with is known by now
+
+    drawn, step = ArmPhysics(), round(FRAME_S * pass_of / PERIOD_S)
+    data, camera = mujoco.MjData(drawn.model), mujoco.MjvCamera()
+    camera.lookat, camera.distance, camera.azimuth, camera.elevation = VIEW_AT, 0.75, 130.0, -15.0
+    frames = []
+    t = np.arange(pass_of) * PERIOD_S / pass_of
+    with mujoco.Renderer(drawn.model, 320, 320) as renderer:
+        for k in range(0, pass_of, step):
+            data.qpos[:] = learned.poses[k - pass_of]
+            mujoco.mj_forward(drawn.model, data)
+            renderer.update_scene(data, camera)
+            figure = Figure(figsize=(8.0, 3.4), dpi=80, layout='tight')
+            view, axes = figure.subplots(1, 2, width_ratios=(2, 3))
+            picture = renderer.render()
+            view.imshow(np.where(picture.any(-1, keepdims=True), picture, 255))
+            view.axis('off')
+            for motion, colour, name in ((without, 'tab:red', 'gaps taken for 0'),
+                                         (learned, 'tab:blue', 'gaps identified and learned')):
+                tip = 1e3 * motion.tip[-pass_of:]
+                curve(axes, t, tip, colour, name)
+                axes.plot(t[k], tip[k], 'o', color=colour)
+            label(axes, 'Tip from where it belongs', 'distance [mm]', TIME_LABEL)
+            axes.legend(loc='upper right')
+            axes.set_ylim(0.0, 14.0)
+            canvas = FigureCanvasAgg(figure)
+            canvas.draw()
+            frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())).convert('RGB'))
+    palette = frames[0].quantize(COLOURS)
+    pictures = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    pictures[0].save(FILM, save_all=True, append_images=pictures[1:], loop=0, optimize=True,
+                     duration=round(1e3 * FRAME_S))
 
 
 def main() -> None:
-    """Print what both come to."""
+    """Print what each joint and the tip come to."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument('--files', type=Path)
+    parser.add_argument('--passes', type=int, default=2)
     parser.add_argument('--write', action='store_true')
-    without, compensated = move(0.0), move(1.0)
-    if parser.parse_args().write:
-        draw(without, compensated)
-    rows = [['tip [mm]', *(f'{1e3 * rms(one.tip):.2f}' for one in (without, compensated))]]
-    for i, joint in enumerate(ArmPhysics().joints):
-        rows.append([f'{joint.name} [mrad]', *(
-            f'{1e3 * rms(one.joints)[i]:.2f}' for one in (without, compensated))])
-    print(text_table(('RMS error', 'gaps taken for 0', 'gaps known'), rows))
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = options.files or Path(name)
+        folder.mkdir(parents=True, exist_ok=True)
+        for joint in JOINTS:
+            if not (folder / joint.name / 'identified.yaml').exists():
+                identify_joint(joint, folder)
+        values = identified(folder)
+        without, known, learned = (
+            move(Parameters(each), options.passes)
+            for each in (with_gaps(values, 0.0), with_gaps(values, 1.0), values)
+        )
+    period_s = Parameters(values).sample_period
+    pass_of = round(PERIOD_S / period_s)
+    print(table(without, known, learned, pass_of))
+    if options.write:
+        film(without, learned, pass_of)
+
+
+def table(without: Motion, known: Motion, learned: Motion, pass_of: int) -> str:
+    """Errors in the passes, each of so many samples, and the gaps after them over those there are.
+
+    The first pass begins at rest and lasts until all joints swing: it is learned from, not judged.
+    """
+    passes = [slice(k, k + pass_of) for k in range(0, len(learned.tip), pass_of)]
+    judged = [without.tip[passes[-1]], known.tip[passes[-1]], *(learned.tip[p] for p in passes)]
+    rows = [['tip [mm]', *(f'{1e3 * rms(tip):.2f}' for tip in judged)]]
+    for i, joint in enumerate(JOINTS):
+        judged = [without.errors[passes[-1], i], known.errors[passes[-1], i],
+                  *(learned.errors[p, i] for p in passes)]
+        lost = ArmPhysics().lost_motion(joint)
+        gaps = learned.gaps[[0, *(p.stop - 1 for p in passes)], i] / lost
+        rows.append([f'{joint.name} [mrad]', *(f'{1e3 * rms(error):.2f}' for error in judged),
+                     *(f'{gap:.3f}' for gap in gaps)])
+    numbers = range(1, len(passes) + 1)
+    header = ('RMS error', 'gaps 0', 'gaps known', *(f'pass {n}' for n in numbers),
+              'gap identified', *(f'after pass {n}' for n in numbers))
+    rows[0] += [''] * (len(header) - len(rows[0]))
+    return text_table(header, rows)
 
 
 if __name__ == '__main__':
