@@ -134,16 +134,12 @@ def reports_with_holes() -> Heard:
 
 
 NUMERATOR, DENOMINATOR = model(0.004)
-SLOW_NUMERATOR, SLOW_DENOMINATOR = model(0.2)
 
 
 @pytest.mark.parametrize(('heard', 'changes', 'subject', 'told'), [
     (heard_from_driver, {'sample_period': 0.05}, 'rate', ['25 Hz', 'set sample_period']),
     (heard_from_driver, {'plant__numerator': NUMERATOR, 'plant__denominator': DENOMINATOR},
      'G(z)', ['about 0.004 s']),
-    (heard_from_driver,
-     {'plant__numerator': SLOW_NUMERATOR, 'plant__denominator': SLOW_DENOMINATOR},
-     'G(z)', ['about 0.2 s']),
     (lambda: with_outputs(some_lost), {}, 'lost samples', ['20 of 200 samples']),
     (lambda: with_outputs(
         lambda sent: [m._replace(number=k + 1) for k, m in enumerate(some_lost(sent))]
