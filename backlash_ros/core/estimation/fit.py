@@ -33,6 +33,7 @@ LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
 KNOTS, KNOT_SAMPLES = 36, 8  # of a walk over a record at most, and samples between them at least
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 FAR_STEPS = 4  # the first of them, over which G is no further off than told
+REMEMBERED_FITS = 3  # whose p, u and y are not computed again
 # --- guards
 LEAST_MOVE = 0.02  # deviations of the gap that a step may still move it by at the end
 LEAST_GAIN = 1.0  # log-likelihood that a step may still gain at the end
@@ -61,6 +62,7 @@ class Problem:
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = step_of(y)
         self.walk_std = walk_std
+        self._newest: list[tuple[Fit, tuple[Array, Array, Array]]] = []
         self._hats = _hats(len(v)) if walk_std else np.zeros((0, len(v)))
         self._knot_std = walk_std * sqrt(len(v) / max(len(self._hats), 1))
 
@@ -74,16 +76,26 @@ class Problem:
 
     def input(self, f: Fit) -> tuple[Array, Array]:
         """p and u = m p - o + d over the record, both (N,)."""
+        return self._evaluated(f)[:2]
+
+    def output(self, f: Fit) -> Array:
+        """y that is expected (N,)."""
+        return self._evaluated(f)[2]
+
+    def _evaluated(self, f: Fit) -> tuple[Array, Array, Array]:
+        """p, u and y at f; those of the newest values of the unknowns are remembered."""
+        for other, evaluated in self._newest:
+            if (f.x is other.x and f.theta is other.theta and f.knots is other.knots
+                    and f.p0 == other.p0):
+                return evaluated
         p = play(self.v, max(f.gap, 0.0), f.p0)
         u = f.m * p - f.theta[1]
         if len(f.knots):
             u += walk(f.knots, len(self.v))
-        return p, u
-
-    def output(self, f: Fit) -> Array:
-        """y that is expected (N,)."""
         b, a = self.family.at(f.xi)
-        return filtered(b, a, self.input(f)[1], f.x)[0]
+        evaluated = p, u, filtered(b, a, u, f.x)[0]
+        self._newest = [(f, evaluated), *self._newest[:REMEMBERED_FITS - 1]]
+        return evaluated
 
     def residual(self, f: Fit) -> Array:
         """y minus what is expected (N,), nan where it was lost."""
@@ -148,10 +160,9 @@ class Problem:
 
     def _around(self, f: Fit) -> tuple[Array, Array]:
         """State before the record, as long as that of G is now, and y (N,) at f."""
-        b, a = self.family.at(f.xi)
-        x = np.zeros(len(a) - 1)
+        x = np.zeros(len(self.family.at(f.xi)[1]) - 1)
         x[:min(len(x), len(f.x))] = f.x[:len(x)]
-        return x, filtered(b, a, self.input(f)[1], x)[0]
+        return x, self.output(f)
 
     def _knots_of(self, f: Fit) -> Array:
         return f.knots if len(f.knots) == len(self._hats) else np.zeros(len(self._hats))

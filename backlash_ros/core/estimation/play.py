@@ -9,8 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.plant.backlash import play_outputs
-
 Array = NDArray[np.float64]
 Sides = NDArray[np.int8]
 
@@ -18,18 +16,23 @@ RIGHT, LEFT, NEITHER = 1, -1, 0  # side of the gap that was engaged last
 
 
 def play(v: Array, gap: float, before: float) -> Array:
-    """p after each v (N,); before: p before the first of them."""
-    return np.array(play_outputs(v.tolist(), gap, before))
-
-
-def plays(v: Array, gaps: Array, before: Array) -> Array:
-    """The same for many gaps (H,) and beginnings (H,) at once, shape (H, N).
+    """p after each v (N,); before: p before the first of them.
 
     Between two turns of v, p is the larger of v and what was held, or the smaller of v + gap and
     it: only the turns are stepped.
     """
-    rises = np.append(False, v[1:] > v[:-1])
-    last = np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
+    rises, last = _turns(v)
+    held, at_turns = min(max(before, v[0]), v[0] + gap), []
+    for value, rising in zip(v[last].tolist(), rises[last].tolist(), strict=True):
+        at_turns.append(held)
+        held = max(held, value) if rising else min(held, value + gap)
+    p = np.repeat(at_turns, np.diff(last, prepend=-1))
+    return np.where(rises, np.maximum(p, v), np.minimum(p, v + gap))
+
+
+def plays(v: Array, gaps: Array, before: Array) -> Array:
+    """The same for many gaps (H,) and beginnings (H,) at once, shape (H, N)."""
+    rises, last = _turns(v)
     held = np.minimum(np.maximum(before, v[0]), v[0] + gaps)
     at_turns = np.empty((len(gaps), len(last)))
     for k, (value, rising) in enumerate(zip(v[last].tolist(), rises[last].tolist(), strict=True)):
@@ -37,6 +40,12 @@ def plays(v: Array, gaps: Array, before: Array) -> Array:
         held = np.maximum(held, value) if rising else np.minimum(held, value + gaps)
     p = np.repeat(at_turns, np.diff(last, prepend=-1), axis=1)
     return np.where(rises, np.maximum(p, v), np.minimum(p, v + gaps[:, None]))
+
+
+def _turns(v: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Whether v rises to each sample (N,), and the last samples before it does otherwise."""
+    rises = np.append(False, v[1:] > v[:-1])
+    return rises, np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
 
 
 def engaged(v: Array, p: Array, gap: float) -> Sides:
