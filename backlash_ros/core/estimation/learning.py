@@ -54,6 +54,7 @@ from backlash_ros.core.estimation.settings import (
     MOST_PREDICTED,
     OUTLIER_SHARE,
     PREDICTED,
+    UNEXPLAINED,
 )
 
 Array = NDArray[np.float64]
@@ -180,8 +181,10 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
         known = before.published
         crosses = known is not None and np.ptp(record.v) > known[1] - known[2]
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
-    systematic = found.systematic
-    wrong = found.m < 0.0 or (systematic and found.noise > AS_GOOD * configured_noise(setup, found))
+    # Beside the gap of the first guess, too: until v has swung past the gap, a fit may have none.
+    unexplained = found.unexplained * found.gap / max(found.gap, setup.guess)
+    more = found.systematic and found.noise > AS_GOOD * configured_noise(setup, found)
+    wrong = found.m < 0.0 or (more and unexplained > UNEXPLAINED)
     contradicts = before.published is not None and is_known(setup, found, found.turns)
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
 
