@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, play, reversals
 from backlash_ros.core.estimation.posterior import Fit, Prior, Start
-from backlash_ros.core.estimation.reading import independence, step_of, told
+from backlash_ros.core.estimation.reading import independence, likelihood, step_of
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
@@ -115,7 +115,8 @@ class Problem:
             r = self.y - y
             w = self.weights(y) if w is None else w
             if f.step:
-                value = float((told(r, f.noise_std, f.step).likelihood * w)[self.known].sum())
+                each = likelihood(r, f.noise_std, f.step).log_density
+                value = float((each * w)[self.known].sum())
             else:
                 squares, count = float((w * r) @ r), float(w.sum()) + 1.0
                 value = -0.5 * count * log((squares + self.nominal**2) / count) \
@@ -141,7 +142,7 @@ class Problem:
         """
         x, y = self._around(f)
         weights = self.weights(y)
-        _, score, information = told(self.y - y, f.noise_std, f.step)
+        _, score, information = likelihood(self.y - y, f.noise_std, f.step)
         jacobian = self.jacobian(f, y)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
         root = np.sqrt(information * weights)
@@ -352,7 +353,7 @@ class Problem:
         y = self.output(f)
         r = np.where(self.known, self.y - y, 0.0)
         w = self.weights(y) if w is None else w
-        likelihood, score, information = told(r, f.noise_std, f.step)
+        log_density, score, information = likelihood(r, f.noise_std, f.step)
         known = self.known
         count = float(w.sum())
         whole = score / sqrt(float(information.mean())) if f.step else r / f.noise_std
@@ -363,7 +364,7 @@ class Problem:
         rho = max(0.0, rho - 3.0 / sqrt(max(count, 1.0)))
         rho *= min(1.0, squares / max(count, 1.0))  # below the noise there may be anything
         return replace(
-            f, evidence=float((likelihood * w)[known].sum()) + f.volume, correlation=rho,
+            f, evidence=float((log_density * w)[known].sum()) + f.volume, correlation=rho,
             inflation=1.0 - rho + count * rho, count=count,
             rms=sqrt(float(r @ r) / max(int(known.sum()), 1)),
             turns=len(reversals(engaged(self.v, p, max(f.gap, 0.0)))),

@@ -30,10 +30,10 @@ SAME_PLACE = 16  # parts of a step within which an output counts as standing sti
 REACH, PLACES = 6, 200  # of the average information: steps to both sides, and places within one
 
 
-class Told(NamedTuple):
+class Likelihood(NamedTuple):
     """Of each reading (N,): log of its density, its derivative by the output, and information."""
 
-    likelihood: Array
+    log_density: Array
     score: Array
     information: Array
 
@@ -49,10 +49,10 @@ def step_of(y: Array) -> float:
     return float(apart.min()) if abs(steps - np.round(steps)).max() < EVEN else 0.0
 
 
-def told(r: Array, noise_std: float, step: float) -> Told:
+def likelihood(r: Array, noise_std: float, step: float) -> Likelihood:
     """What readings say of outputs that they are off from by r (N,); step 0: none."""
     if not step:
-        return Told(
+        return Likelihood(
             -0.5 * (r / noise_std) ** 2 - log(sqrt(2.0 * pi) * noise_std), r / noise_std**2,
             np.full(len(r), noise_std**-2),
         )
@@ -63,17 +63,19 @@ def told(r: Array, noise_std: float, step: float) -> Told:
     mirrored = lower > 0.0
     more = log_ndtr(np.where(mirrored, -lower, upper))
     less = log_ndtr(np.where(mirrored, -upper, lower))
-    likelihood = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
+    log_probability = more + np.log(-np.expm1(np.minimum(less - more, -1e-300)))
     at_upper, at_lower = (
-        np.exp(-0.5 * edge**2 - likelihood) / sqrt(2.0 * pi) for edge in (upper, lower)
+        np.exp(-0.5 * edge**2 - log_probability) / sqrt(2.0 * pi) for edge in (upper, lower)
     )
     score = (at_lower - at_upper) / noise_std
     curvature = (at_lower - at_upper) ** 2 + upper * at_upper - lower * at_lower
     # Readings deep within their interval say nothing, and would leave unknowns open.
     least = mean_information(round(step / noise_std, 6)) / step**2
     # As a density, to be compared with that of readings without a step.
-    likelihood = likelihood - log(step)
-    return Told(likelihood, score, np.clip(curvature / noise_std**2, least, noise_std**-2))
+    log_density = log_probability - log(step)
+    return Likelihood(
+        log_density, score, np.clip(curvature / noise_std**2, least, noise_std**-2)
+    )
 
 
 @lru_cache(maxsize=256)
