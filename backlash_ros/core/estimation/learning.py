@@ -41,6 +41,7 @@ from backlash_ros.core.estimation.explanations import (
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.forgetting import excess, shortened
 from backlash_ros.core.estimation.late_commands import likelier
+from backlash_ros.core.estimation.play import engaged, play, reversals
 from backlash_ros.core.estimation.posterior import Fit
 from backlash_ros.core.estimation.publishing import configured_noise, published
 from backlash_ros.core.estimation.settings import (
@@ -49,6 +50,7 @@ from backlash_ros.core.estimation.settings import (
     FEWEST,
     FIRST_FIT,
     GROWTH,
+    HELD_REVERSALS,
     LONGEST,
     MISFIT,
     MOST_PREDICTED,
@@ -181,10 +183,12 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
         known = before.published
         crosses = known is not None and np.ptp(record.v) > known[1] - known[2]
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
-    # Beside the gap of the first guess, too: until v has swung past the gap, a fit may have none.
-    unexplained = found.unexplained * found.gap / max(found.gap, setup.guess)
+    # Until v has swung past the gap a fit may have none: the gap of the first guess counts then.
+    gap = max(found.gap, setup.guess)
+    turns = len(reversals(engaged(record.v, play(record.v, gap, float(record.v[0])), gap)))
+    large = found.unexplained * found.gap > UNEXPLAINED * gap or turns >= HELD_REVERSALS
     more = found.systematic and found.noise > AS_GOOD * configured_noise(setup, found)
-    wrong = found.m < 0.0 or (more and unexplained > UNEXPLAINED)
+    wrong = found.m < 0.0 or (more and large)
     contradicts = before.published is not None and is_known(setup, found, found.turns)
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
 
