@@ -125,9 +125,10 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
     if found is not None:
         found, others = _with_commands(setup, part, found, before.swapped)
         after = replace(after, swapped=others)
-    coasts = found is not None and found.m > 0.0 and why is Status.INCONSISTENT \
+    coasts = found is not None and found.m > 0.0 and _leaves_more(setup, found) \
         and _coasts(problem_of(setup, part), found, before.published)
-    after = replace(after, tried=found, reason=why, coasts=coasts)
+    reason = Status.INCONSISTENT if coasts else why
+    after = replace(after, tried=found, reason=reason, coasts=coasts)
     if found is None or not is_known(setup, found, found.turns):
         return replace(after, candidate=None)
     candidate = before.candidate
@@ -187,10 +188,14 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
     gap = max(found.gap, setup.guess)
     turns = len(reversals(engaged(record.v, play(record.v, gap, float(record.v[0])), gap)))
     large = found.unexplained * found.gap > UNEXPLAINED * gap or turns >= HELD_REVERSALS
-    more = found.systematic and found.noise > AS_GOOD * configured_noise(setup, found)
-    wrong = found.m < 0.0 or (more and large)
+    wrong = found.m < 0.0 or (large and _leaves_more(setup, found))
     contradicts = before.published is not None and is_known(setup, found, found.turns)
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
+
+
+def _leaves_more(setup: Setup, found: Fit) -> bool:
+    """Whether a fit leaves more than noise, and correlated."""
+    return found.systematic and found.noise > AS_GOOD * configured_noise(setup, found)
 
 
 def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
