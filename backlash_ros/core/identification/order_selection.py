@@ -134,8 +134,9 @@ def _finalists(first: Mapping[Structure, Compared]) -> list[Structure]:
     by_prediction = sorted(first, key=lambda s: first[s].held_out)
     good = {*by_criterion[:FINALISTS], *by_prediction[:FINALISTS]}
     good |= {best._replace(delay=s.delay) for best in by_criterion[:1] for s in first}
-    for s in list(good):
-        good |= {Structure(s.order - 1, s.delay, also) for also in (False, s.integrator)}
+    for _ in range(2):  # what they give way to may have a pole that is cancelled as well
+        for s in list(good):
+            good |= {Structure(s.order - 1, s.delay, also) for also in (False, s.integrator)}
     return [structure for structure in first if structure in good]
 
 
