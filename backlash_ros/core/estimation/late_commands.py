@@ -14,7 +14,7 @@ estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1976) 1
 
 from __future__ import annotations
 
-from math import log
+from math import log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from backlash_ros.core.plant.filtering import lfilter
 Array = NDArray[np.float64]
 
 MOST = 200  # swaps of one look
+OWN_NOISE = 0.25  # of correlated residuals: what is noise of readings
 
 
 def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozenset[int],
@@ -51,6 +52,9 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     size = np.maximum(np.abs(jacobian).max(axis=0), 1e-300)
     q = np.linalg.qr(jacobian / size)[0]
     residual = (problem.y - y) * known
+    # Correlated residuals are for the most part made by the commands that are looked for.
+    noise = fit.noise * (OWN_NOISE if fit.systematic else 1.0)
+    noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))
     v, other = record.v.copy(), record.other.copy()
     p = play(v, fit.gap, fit.p0)
     odds = log(COMMAND_ODDS)
@@ -66,7 +70,7 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
             seen = s * known[k:end]
             explained = q[k:end].T @ seen
             gain = float(seen @ rest[k:end] - 0.5 * (seen @ seen - explained @ explained))
-            gain /= fit.noise**2
+            gain /= noise**2
             gain -= odds if (record.first + k in back) == (k in chosen) else -odds
             if gain > best:
                 best, place, change = gain, k, s
