@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.explanations import (
+    SMALLEST_NOISE,
     Record,
     Setup,
     afresh,
@@ -34,7 +35,6 @@ FEWEST = 10  # samples per unknown of G and u below which nothing is said
 SURE = 5.0  # standard deviations of the gap by which the play output must move to count
 LIKELIER = 1.0  # log-likelihood by which another G than the nominal one must be better
 NO_GAP = 0.01  # standard deviation of a gap over the swing of v that counts as known: there is none
-SMALLEST_NOISE = 1e-12  # of y, at least
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def _described(
     """All there is to say about a fit."""
     fit, family = best.fit, best.setup.family
     m, c_r, c_l = fit.crossings.tolist()
-    std_m, std_c_r, std_c_l = np.sqrt(np.maximum(np.diag(fit.crossings_cov), 0.0)).tolist()
+    std_m, std_c_r, std_c_l = fit.crossings_std.tolist()
     p, _ = best.problem.input(fit)
     found = RecordFit(
         m=best.sign * m, c_r=c_r, c_l=c_l, gap=fit.gap,

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.belief import Belief, Inherited
 from backlash_ros.core.estimation.executor import Executor, Failure, InlineExecutor, Samples
-from backlash_ros.core.estimation.explanations import Record, Setup, with_swapped
+from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Record, Setup, with_swapped
 from backlash_ros.core.estimation.following import Following, Place, place_of
 from backlash_ros.core.estimation.learning import learn
 from backlash_ros.core.estimation.observer import Gains, gains_of
@@ -39,7 +39,6 @@ Array = NDArray[np.float64]
 
 NO_DATA = 20  # lost samples in a row that are worth a state
 CAPACITY = LONGEST + 16_384  # samples that are kept where fits are made
-SMALLEST_NOISE = 1e-12  # of y
 WORTH = 1.0  # log-likelihood by which another G must be better to be proposed
 
 

@@ -15,6 +15,7 @@ from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Fit, Prior, Start
 from backlash_ros.core.estimation.search import search
 from backlash_ros.core.estimation.settings import (
+    AS_GOOD,
     CHANCE,
     ENGAGED,
     GATE,
@@ -40,6 +41,7 @@ FAR_BEHIND = 30.0  # log-likelihood by which a candidate is given up after a few
 BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
 # --- guards
 FIRST_NOISE = 0.05  # noise of a first step, over the deviation of y
+SMALLEST_NOISE = 1e-12  # of y, that a setup may have
 BOUND_ROUNDING = 1e-9  # relative distance from a bound that is none
 
 
@@ -134,7 +136,7 @@ def afresh(
             start = p.step(Fit(np.zeros(1), p0, theta, noise), 1.0, held=True)
             fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
     if also is not None and also.m > 0.0:
-        begins = replace(also, step=0.0, noise_std=also.noise, x=np.zeros(1))
+        begins = replace(also.without_intervals, x=np.zeros(1))
         fits.append(p.finished(p.fitted(begins, FIRST_STEPS)))
     fits = [f for f in fits if np.isfinite(f.evidence)]
     if not fits:
@@ -159,12 +161,12 @@ def with_walk(p: Problem, f: Fit) -> Fit:
     best = f
     if f.walk_std:
         still = p.walking(0.0)
-        best = still.with_intervals(still.fitted(replace(f, step=0.0, noise_std=f.noise)))
+        best = still.with_intervals(still.fitted(f.without_intervals))
     if not best.valid or not best.systematic:
         return best
     for share in WALKS:
         walking = p.walking(share * f.m * f.gap / sqrt(len(p.v)))
-        begin = replace(f, knots=np.zeros(0), step=0.0, noise_std=f.noise)
+        begin = replace(f.without_intervals, knots=np.zeros(0))
         g = walking.with_intervals(walking.fitted(begin, FIRST_STEPS))
         of_best, of_g = (each.evidence for each in walking.comparable([best, g]))
         if g.valid and of_g > of_best + (0.0 if best.walk_std else WALKING):
@@ -209,21 +211,29 @@ def is_known(setup: Setup, f: Fit, turns: int) -> bool:
         return False
     if any(outside_bounds(setup.bounds, f)):
         return False
-    systematic = f.systematic
-    if systematic and f.unexplained > UNEXPLAINED and setup.family.count:
+    if moves_unexplained(setup, f):
         return False
-    factor = 1.0 / SYSTEMATIC if systematic else 1.0
+    factor = 1.0 / SYSTEMATIC if f.systematic else 1.0
     std_gap = f.gap_std
     no_gap = f.gap < BY_CHANCE * std_gap and f.gap + BY_CHANCE * std_gap < NO_GAP * setup.guess
-    std_m, *of_crossings = np.sqrt(np.maximum(np.diag(f.crossings_cov), 0.0)).tolist()
+    std_m, *of_crossings = f.crossings_std.tolist()
     gap_known = max(std_gap, *of_crossings) < factor * STD_GAP * f.gap
     return std_m < factor * STD_SLOPE * f.m and (gap_known or no_gap)
 
 
+def moves_unexplained(setup: Setup, f: Fit) -> bool:
+    """Whether y moves by more than is tolerated in a way that no G makes, where G is uncertain."""
+    return f.systematic and f.unexplained > UNEXPLAINED and setup.family.count > 0
+
+
+def noisier(setup: Setup, f: Fit) -> bool:
+    """Whether readings are off by more than their configured noise, or their step, makes them."""
+    return f.noise > AS_GOOD * max(setup.noise_std, f.step / sqrt(12.0))
+
+
 def outside_bounds(bounds: Bounds, f: Fit) -> list[bool]:
     """Whether m, c_r, c_l lie outside of their bounds by more than chance."""
-    values = f.crossings
-    std = np.sqrt(np.maximum(np.diag(f.crossings_cov), 0.0))
+    values, std = f.crossings, f.crossings_std
     near = np.array(bounds.project(*values.tolist()))
     out: list[bool] = (
         np.abs(values - near) > BY_CHANCE * std + BOUND_ROUNDING * np.abs(values)
@@ -238,6 +248,11 @@ def agree(one: Array, other: Array, cov: Array) -> bool:
     apart = one - other
     squares = float(apart @ np.linalg.lstsq(cov, apart, rcond=1e-14)[0])
     return squares < float(chdtri(len(one), CHANCE))
+
+
+def alike(one: Fit, other: Fit) -> bool:
+    """Whether the backlashes of two fits differ by chance."""
+    return agree(one.crossings, other.crossings, one.crossings_cov + other.crossings_cov)
 
 
 def outliers(z: Array) -> Flags:

@@ -13,6 +13,7 @@ say is rows (R, d) on theta = (m, o, g, xi).
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from math import isfinite, log, sqrt
 from types import ModuleType
@@ -32,7 +33,7 @@ SCALES: Array = np.append(0.0, np.geomspace(1e-3, 10.0, 13))  # of the error of 
 LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
 KNOTS, KNOT_SAMPLES = 36, 8  # of a walk over a record at most, and samples between them at least
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
-FAR_STEPS = 4  # the first of them, over which G is no further off than told
+FAR_STEPS = 4  # the first of them, over which G is no further off than configured
 REMEMBERED_FITS = 3  # whose p, u and y are not computed again
 # --- guards
 LEAST_MOVE = 0.02  # deviations of the gap that a step may still move it by at the end
@@ -61,16 +62,20 @@ class Problem:
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = step_of(y)
-        self.walk_std = walk_std
         self._newest: list[tuple[Fit, tuple[Array, Array, Array]]] = []
-        self._hats = _hats(len(v)) if walk_std else np.zeros((0, len(v)))
-        self._knot_std = walk_std * sqrt(len(v) / max(len(self._hats), 1))
+        self._walk_by(walk_std)
 
     def walking(self, walk_std: float) -> Problem:
         """The same for another walk of u."""
-        y = np.where(self.known, self.y, np.nan)
-        return Problem(self.family, self.v, y, self.nominal, self.older, self.start,
-                       self.most_scale, walk_std)
+        other = copy(self)
+        other._walk_by(walk_std)
+        return other
+
+    def _walk_by(self, walk_std: float) -> None:
+        count = len(self.v)
+        self._hats = _hats(count) if walk_std else np.zeros((0, count))
+        self._knot_std = walk_std * sqrt(count / max(len(self._hats), 1))
+        self.walk_std = walk_std
 
     # --- the model -----------------------------------------------------------------------------
 
@@ -93,7 +98,7 @@ class Problem:
         if len(f.knots):
             u += walk(f.knots, len(self.v))
         b, a = self.family.at(f.xi)
-        evaluated = p, u, filtered(b, a, u, f.x)[0]
+        evaluated = p, u, filtered(b, a, u, f.x)
         self._newest = [(f, evaluated), *self._newest[:REMEMBERED_FITS - 1]]
         return evaluated
 
@@ -393,23 +398,23 @@ class Problem:
                 break
         if found is not None and found.rms < 1.5 * f.noise:
             return found
-        return self.finished(self.fitted(replace(f, step=0.0, noise_std=f.noise)))
+        return self.finished(self.fitted(f.without_intervals))
 
     def state(self, f: Fit) -> Array:
         """The state before the record that explains it best, everything else held."""
         b, a = self.family.at(f.xi)
         order = len(a) - 1
         columns = state_columns(a, len(self.v))[self.known]
-        r = (self.y - filtered(b, a, self.input(f)[1], np.zeros(order))[0])[self.known]
+        r = (self.y - filtered(b, a, self.input(f)[1], np.zeros(order)))[self.known]
         return np.asarray(np.linalg.lstsq(columns, r, rcond=1e-12)[0])
 
 
-def filtered(b: list[float], a: list[float], u: Array, x: Array) -> tuple[Array, Array]:
-    """Output of the filter b / a from the state x before u (N,), and its state after it."""
+def filtered(b: list[float], a: list[float], u: Array, x: Array) -> Array:
+    """Output of the filter b / a from the state x before u (N,)."""
     state = np.zeros(len(a) - 1)
     length = min(len(state), len(x))
     state[:length] = x[:length]
-    return lfilter(b, a, u, zi=state)
+    return lfilter(b, a, u, zi=state)[0]
 
 
 def state_columns(a: list[float], count: int) -> Array:

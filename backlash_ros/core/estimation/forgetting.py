@@ -52,7 +52,7 @@ def shortened(setup: Setup, record: Record, belief: Belief, cut: int) -> Belief:
     if prior is not None:
         discount = sqrt(fit.inflation)
         older = _drifted(setup, fit, Prior(prior.rows / discount, prior.values / discount), cut)
-        if fit.walk_std:
+        if older is not None and fit.walk_std:
             older = _without_offset(older)
     for beside in ((older, start), (None, None)):
         problem = problem_of(setup, rest, *beside, walk_std=fit.walk_std)
@@ -94,10 +94,8 @@ def _drifted(setup: Setup, fit: Fit, prior: Prior, samples: int) -> Prior | None
     return Prior(root, root @ theta)
 
 
-def _without_offset(prior: Prior | None) -> Prior | None:
+def _without_offset(prior: Prior) -> Prior:
     """What a prior says of all but o, which has walked on since."""
-    if prior is None:
-        return None
     rows = np.column_stack([prior.rows[:, 1], np.delete(prior.rows, 1, axis=1), prior.values])
     r = np.asarray(np.linalg.qr(rows, mode='r'))[1:]
     return Prior(np.insert(r[:, 1:-1], 1, 0.0, axis=1), r[:, -1])

@@ -30,8 +30,9 @@ from backlash_ros.core.estimation.explanations import (
     Record,
     Setup,
     afresh,
-    agree,
+    alike,
     is_known,
+    noisier,
     of_xi,
     outliers,
     problem_of,
@@ -43,12 +44,13 @@ from backlash_ros.core.estimation.forgetting import excess, shortened
 from backlash_ros.core.estimation.late_commands import likelier
 from backlash_ros.core.estimation.play import engaged, play, reversals
 from backlash_ros.core.estimation.posterior import Fit
-from backlash_ros.core.estimation.publishing import configured_noise, published
+from backlash_ros.core.estimation.publishing import published
 from backlash_ros.core.estimation.settings import (
     AS_GOOD,
     BLOCKS,
     FEWEST,
     FIRST_FIT,
+    GATE,
     GROWTH,
     HELD_REVERSALS,
     LONGEST,
@@ -56,6 +58,7 @@ from backlash_ros.core.estimation.settings import (
     MOST_PREDICTED,
     OUTLIER_SHARE,
     PREDICTED,
+    REVERSALS,
     UNEXPLAINED,
 )
 
@@ -132,13 +135,11 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
     if found is None or not is_known(setup, found, found.turns):
         return replace(after, candidate=None)
     candidate = before.candidate
-    if candidate is None or not agree(
-        candidate.crossings, found.crossings, candidate.crossings_cov + found.crossings_cov
-    ):
+    if candidate is None or not alike(candidate, found):
         # A first estimate has to be found twice: some samples alone may mislead.
         return replace(after, candidate=found, next_at=record.end + max(count // BLOCKS, FEWEST))
     # What leaves more than noise must predict a quarter as many samples before it is believed.
-    more = found.systematic or found.noise > AS_GOOD * configured_noise(setup, found)
+    more = found.systematic or noisier(setup, found)
     must = max(before.must_predict, len(part.v) // 4 if more else 0)
     after = replace(after, older=None, start=None, must_predict=must)
     return _adopted(setup, part, found, after)
@@ -195,16 +196,14 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
 
 def _leaves_more(setup: Setup, found: Fit) -> bool:
     """Whether a fit leaves more than noise, and correlated."""
-    return found.systematic and found.noise > AS_GOOD * configured_noise(setup, found)
+    return found.systematic and noisier(setup, found)
 
 
 def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
     """The fit of this record is what is believed."""
     count, must = len(record.v), before.must_predict
-    contradicted, noisier = before.fit, before.published is None or fit.walk_std > 0.0
-    if contradicted is not None and noisier and agree(
-        fit.crossings, contradicted.crossings, fit.crossings_cov + contradicted.crossings_cov
-    ):
+    another_noise = before.published is None or fit.walk_std > 0.0
+    if before.fit is not None and another_noise and alike(fit, before.fit):
         must = min(must, PREDICTED)  # another noise, or a walk, but not another backlash
     after = replace(
         before, state=State.KNOWN, must_predict=must, fit=fit, first=record.first, end=record.end,
@@ -239,8 +238,8 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
     if _contradicts(problem, fit, z, new):
         fit = problem.fitted(held)  # before anything is blamed
         z = problem.residual(fit)[new:] / held.noise
-    noisier = before.on_probation and fit.noise > AS_GOOD * before.adopted_noise
-    if noisier or _contradicts(problem, fit, z, new):
+    grown = before.on_probation and fit.noise > AS_GOOD * before.adopted_noise
+    if grown or _contradicts(problem, fit, z, new):
         beyond = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
         change = int(np.argmax(np.cumsum(beyond[::-1])[::-1]))
         return replace(
@@ -285,7 +284,7 @@ def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> 
     """The fit of a short record, or another one that is likelier, mixed with each other."""
     fit = replace(problem.with_intervals(fit), spread=fit.spread * 0.0)
     other = afresh(setup, record)
-    if other is None or not is_known(setup, other, 9):
+    if other is None or not is_known(setup, other, REVERSALS):
         return fit
     fit, other = problem.comparable([fit, other])
     best = other if other.evidence > fit.evidence + 3.0 else fit
@@ -303,7 +302,7 @@ def _contradicts(problem: Problem, fit: Fit, z: Array, new: int) -> bool:
     count = float(weights[np.isfinite(z)].sum())
     if not count:
         return False
-    wild = np.abs(z) > 6.0
+    wild = np.abs(z) > GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / count
     free = max(count, 1.0)
     limit = max(MISFIT, float(chdtri(free, CONTRADICTION)) / free)
@@ -352,9 +351,7 @@ def _doubted(setup: Setup, record: Record, before: Belief) -> Belief:
             if whole.evidence > apart:
                 break
         candidate = before.candidate
-        if candidate is not None and agree(
-            candidate.crossings, found.crossings, candidate.crossings_cov + found.crossings_cov
-        ):
+        if candidate is not None and alike(candidate, found):
             changed = replace(after, older=known_xi, start=None)
             return _adopted(setup, part, found, changed)
         return replace(after, candidate=found)

@@ -19,6 +19,8 @@ from math import cos, cosh, exp, floor, log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.plant.model_check import ON_CIRCLE
+from backlash_ros.core.plant.state_model import memory_of
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
@@ -29,7 +31,6 @@ LATEST = 40.0  # samples of lag, at most
 FURTHEST = 3.0  # by which ln Omega and ln D may be off, at most
 MOST_LEAK = 0.1  # per sample
 SLOPE_STEP = 1e-5  # of xi, for the derivatives of the coefficients
-ON_CIRCLE = 1e-6  # distance from the unit circle, or from 0, that is none
 
 
 class PlantFamily:
@@ -70,7 +71,7 @@ class PlantFamily:
         wide = np.convolve(shorter * b.sum() / shorter.sum(), [1.0, -2.0, 1.0])
         self._b, self._wide = b.tolist(), wide.tolist()
         slowest = max((abs(pole) for pole in poles[moving]), default=0.0)
-        self.memory = int(min(max(3.0 / (1.0 - slowest), 150), 5000))
+        self.memory = memory_of(slowest)
 
     def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
         """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length.

@@ -26,8 +26,7 @@ def play(v: Array, gap: float, before: float) -> Array:
     for value, rising in zip(v[last].tolist(), rises[last].tolist(), strict=True):
         at_turns.append(held)
         held = max(held, value) if rising else min(held, value + gap)
-    p = np.repeat(at_turns, np.diff(last, prepend=-1))
-    return np.where(rises, np.maximum(p, v), np.minimum(p, v + gap))
+    return _between(v, rises, last, np.array(at_turns), gap)
 
 
 def plays(v: Array, gaps: Array, before: Array) -> Array:
@@ -38,14 +37,21 @@ def plays(v: Array, gaps: Array, before: Array) -> Array:
     for k, (value, rising) in enumerate(zip(v[last].tolist(), rises[last].tolist(), strict=True)):
         at_turns[:, k] = held
         held = np.maximum(held, value) if rising else np.minimum(held, value + gaps)
-    p = np.repeat(at_turns, np.diff(last, prepend=-1), axis=1)
-    return np.where(rises, np.maximum(p, v), np.minimum(p, v + gaps[:, None]))
+    return _between(v, rises, last, at_turns, gaps[:, None])
 
 
 def _turns(v: Array) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
     """Whether v rises to each sample (N,), and the last samples before it does otherwise."""
     rises = np.append(False, v[1:] > v[:-1])
     return rises, np.append(np.flatnonzero(rises[1:] != rises[:-1]), len(v) - 1)
+
+
+def _between(
+    v: Array, rises: NDArray[np.bool_], last: NDArray[np.intp], held: Array, gap: Array | float,
+) -> Array:
+    """p (..., N), from what was held (..., T) before each of the turns."""
+    p = np.repeat(held, np.diff(last, prepend=-1), axis=-1)
+    return np.where(rises, np.maximum(p, v), np.minimum(p, v + gap))
 
 
 def engaged(v: Array, p: Array, gap: float) -> Sides:

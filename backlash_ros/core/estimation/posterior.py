@@ -6,7 +6,7 @@ N / (1 - rho + N rho) independent ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import NamedTuple
 
@@ -36,11 +36,10 @@ class Fit:
 
     x: state before the record. knots: of the walk (W,), and walk_std, 0 for none. p0: p before the
     record. theta: m, o, g, xi. noise_std: beside a step. step: of the readings where they are
-    taken for intervals, else 0.
-    scale: s, the likeliest. cov: of theta, as if residuals were white. prior: what the samples
-    say of theta, without the prior of xi. evidence: log-likelihood with unknowns integrated out.
-    correlation: rho. inflation: of cov, see above. count: of independent readings. rms: of the
-    residuals. turns: reversals of the engaged side.
+    taken for intervals, else 0. scale: s, the likeliest. cov: of theta, as if residuals were white.
+    prior: what the samples say of theta, without the prior of xi. evidence: log-likelihood with
+    unknowns integrated out. correlation: rho. inflation: of cov, see above. count: of independent
+    readings. rms: of the residuals. turns: reversals of the engaged side.
     """
 
     x: Array
@@ -92,6 +91,11 @@ class Fit:
         return np.asarray(by @ self.cov[:3, :3] @ by.T * self.inflation + self.spread)
 
     @property
+    def crossings_std(self) -> Array:
+        """Standard deviations of m, c_r, c_l, shape (3,)."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.crossings_cov), 0.0)))
+
+    @property
     def gap_std(self) -> float:
         """Standard deviation of the gap."""
         cov = self.crossings_cov
@@ -111,6 +115,11 @@ class Fit:
     def systematic(self) -> bool:
         """Whether residuals are correlated beyond chance: they do not average out."""
         return self.count * self.correlation > 1.0
+
+    @property
+    def without_intervals(self) -> Fit:
+        """The same values with readings that are normal, rounding being part of the noise."""
+        return replace(self, step=0.0, noise_std=self.noise)
 
     @property
     def valid(self) -> bool:

@@ -9,9 +9,15 @@ import numpy as np
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation.belief import Belief, Inherited
-from backlash_ros.core.estimation.explanations import Setup, agree, is_known
+from backlash_ros.core.estimation.explanations import (
+    Setup,
+    agree,
+    is_known,
+    moves_unexplained,
+    noisier,
+)
 from backlash_ros.core.estimation.posterior import Fit
-from backlash_ros.core.estimation.settings import AS_GOOD, HELD_REVERSALS, LOST_MOTION, UNEXPLAINED
+from backlash_ros.core.estimation.settings import HELD_REVERSALS, LOST_MOTION, REVERSALS
 
 REPLACING = 0.05  # std of the gap over the gap, from which samples alone replace what was known
 
@@ -22,7 +28,7 @@ def published(setup: Setup, belief: Belief) -> Belief:
     assert fit is not None
     if belief.inherited is not None:
         return _beside_inherited(setup, belief, fit, belief.inherited)
-    if not is_known(setup, fit, 9):
+    if not is_known(setup, fit, REVERSALS):
         return replace(belief, reason=Status.INCONSISTENT)
     if belief.predicted < belief.must_predict:
         return belief
@@ -48,24 +54,17 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
     if not agree(fit.crossings, known.crossings, cov + prior):
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
         # A gear that is no play leaves systematic residuals, and denies nothing.
-        white = not fit.systematic and fit.noise < AS_GOOD * configured_noise(setup, fit)
+        white = not fit.systematic and not noisier(setup, fit)
         sure = std < REPLACING * fit.gap and white and fit.turns >= HELD_REVERSALS
         if sure and belief.predicted >= belief.must_predict:
             belief = replace(belief, inherited=None)  # it was that of another plant
         return replace(belief, reason=Status.INCONSISTENT)
     gain = prior @ np.linalg.pinv(cov + prior)
     joined = known.crossings + gain @ (fit.crossings - known.crossings)
-    systematic = fit.systematic and setup.family.count > 0
-    wrong = systematic and fit.unexplained > UNEXPLAINED
     left = prior - gain @ prior
     if np.trace(left[1:, 1:]) > np.trace(known.cov[1:, 1:]):
         joined, left = known.crossings, known.cov  # agreement makes nothing less certain
     return replace(
         belief, published=joined, cov=left,
-        reason=Status.INCONSISTENT if wrong else Status.TRACKING,
+        reason=Status.INCONSISTENT if moves_unexplained(setup, fit) else Status.TRACKING,
     )
-
-
-def configured_noise(setup: Setup, fit: Fit) -> float:
-    """Standard deviation of a reading as configured, or as its step makes it."""
-    return max(setup.noise_std, fit.step / sqrt(12.0))

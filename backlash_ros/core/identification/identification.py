@@ -25,6 +25,7 @@ from backlash_ros.core.identification.least_response import least_response
 from backlash_ros.core.identification.not_play import Observed
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
+    TINY,
     Compared,
     cancelled_poles,
     compare,
@@ -74,7 +75,6 @@ SAME = 0.005  # relative distance of two gaps that are one
 NEAR = np.linspace(0.8, 1.2, 13)  # gaps around the best one, relative
 WHOLE = 24  # gaps over the swing of v
 LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
-TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.play import LEFT, engaged, plays
+from backlash_ros.core.estimation.play import LEFT, engaged, play
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
@@ -397,8 +397,7 @@ class _Family:
 
 def _played(v: Array, gap: float) -> Array:
     """p (N,) of v (N,), from the middle of the gap."""
-    p: Array = plays(v, np.array([gap]), v[:1] + 0.5 * gap)[0]
-    return p
+    return play(v, gap, float(v[0]) + 0.5 * gap)
 
 
 def _dead_zone(v: Array, centre: float, half: float) -> Array:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from backlash_ros.core.estimation.play import LEFT, NEITHER, Sides, plays, reversals
+from backlash_ros.core.estimation.play import LEFT, NEITHER, Sides, play, plays, reversals
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
@@ -132,8 +132,7 @@ class Samples:
 
     def played(self, gap: float, start: float) -> Array:
         """p (N,) for a gap and p before the first sample."""
-        p: Array = plays(self.v, np.array([gap]), np.array([start]))[0]
-        return p
+        return play(self.v, gap, start)
 
 
 class Point(NamedTuple):

@@ -19,18 +19,6 @@ def clamp(held: float, low: float, high: float) -> float:
     return low if held <= low else high if held >= high else held
 
 
-def play_outputs(v: list[float], gap: float, p: float) -> list[float]:
-    """What a play with this gap holds after each v, p before them: `clamp`, without its calls."""
-    held = []
-    for value in v:
-        if p <= value:
-            p = value
-        elif p >= value + gap:
-            p = value + gap
-        held.append(p)
-    return held
-
-
 def check_backlash(m: float, c_r: float, c_l: float, prefix: str = 'backlash') -> None:
     """Raise ParameterError unless m > 0 and c_l < c_r, all finite."""
     for name, value in (('m', m), ('c_r', c_r), ('c_l', c_l)):

@@ -8,7 +8,7 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
-ON_CIRCLE = 1e-6  # distance from the unit circle, or between two roots, that counts as none
+ON_CIRCLE = 1e-6  # distance from the unit circle, from 0, or between two roots, that is none
 SLOWEST = 1e4  # samples: longer time constants leave too little per sample
 FEWEST, MOST = 10.0, 1e5  # samples per period of the reference
 WORST_CONDITION = 1e9  # of the map between states and outputs

@@ -58,6 +58,11 @@ def _memory(model: TransferFunction) -> int:
     """Samples after which the slowest stable mode of G has died out, within reason."""
     stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - 1e-6]
     slowest = max(stable, default=0.0)
+    return memory_of(slowest)
+
+
+def memory_of(slowest: float) -> int:
+    """Samples after which a mode has died out whose pole has this size, within reason."""
     return int(min(max(3.0 / (1.0 - slowest), SHORTEST_MEMORY), LONGEST_MEMORY))
 
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.records.samples import TO_STD
+
 Array = NDArray[np.float64]
 
 FEWEST = 20  # readings that tell anything
 CLOSE = 0.05  # of the mean distance: neighbours closer than this predict nothing
-TO_STD = 1.4826  # of the median of absolute values
 
 
 def _residuals(t: Array, s: Array, reach: int) -> Array:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
+
 Array = NDArray[np.float64]
 
 SEARCHED_AT_MOST = 6000  # samples of a record that a search for the gap looks at
-GATE, OUTLIER_SHARE = 6.0, 0.2  # deviations from which a reading is an outlier; share that may be
 MOTION = (0.1, 0.9)  # shares of the power of the moves of y below which its frequencies lie
 TO_STD = 1.4826  # median absolute deviation of a normal distribution to its standard deviation
 

@@ -35,7 +35,7 @@ DECIDED = 0.05  # log of the roughness that tells late stamps from true ones
 FINER = (1, 2, 4)  # parts of a period
 HIDDEN, LEAST = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
 ROUNDING = 12.0**-0.5  # deviation of rounding to whole numbers
-TO_STD = 0.61  # of what 90 % of normal values stay within
+NINE_TENTHS_TO_STD = 0.61  # of what 90 % of normal values stay within
 MOST_SHARED = 0.02  # share of the readings that may fall onto one instant
 LONGEST = 1_000_000  # samples of a grid
 SPARSE, LONG_BREAK = 20.0, 100.0  # samples per row, and periods of a gap that ends a stretch
@@ -306,7 +306,7 @@ def _moved_by(t: Array, y: Array, off: Array) -> float:
     """How much y moves from its instants to others, a standard deviation but for steps."""
     if len(t) < 2:
         return 0.0
-    return TO_STD * float(np.percentile(np.abs(np.gradient(y, t) * off), 90.0))
+    return NINE_TENTHS_TO_STD * float(np.percentile(np.abs(np.gradient(y, t) * off), 90.0))
 
 
 def _bracketed(t: Array, y: Array, step: float) -> tuple[Numbers, Array]:

@@ -1,6 +1,7 @@
 """What was learned before the run: what confirms it, what replaces it, and what leaves it alone."""
 
 from dataclasses import replace
+from itertools import accumulate, islice
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.law import Law
-from backlash_ros.core.plant.backlash import play_outputs
+from backlash_ros.core.plant.backlash import clamp
 
 Array = NDArray[np.float64]
 
@@ -30,7 +31,8 @@ def run(
     known: gap that the estimator begins with. also: what moves y besides.
     """
     estimator = estimator_knowing(replace(KNOWN, c_r=0.5 * known, c_l=-0.5 * known))
-    y = answers([p - 0.5 for p in play_outputs(v.tolist(), 1.0, 0.5)], late)
+    held = accumulate(v.tolist(), lambda p, low: clamp(p, low, low + 1.0), initial=0.5)
+    y = answers([p - 0.5 for p in islice(held, 1, None)], late)
     y = y + NOISE * np.random.default_rng(1).standard_normal(len(v)) + also
     rows = []
     for applied, reading in zip(v.tolist(), y.tolist(), strict=True):
