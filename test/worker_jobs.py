@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from backlash_ros.core.estimation.executor import Samples
+from backlash_ros.core.jobs.executor import Samples
 
 
 def checksum(samples: Samples, factor: float) -> tuple[int, int, float]:

@@ -26,7 +26,7 @@ from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.core.estimation.estimator import MovingHorizon, fitted
-from backlash_ros.core.estimation.executor import Executor, InlineExecutor
+from backlash_ros.core.jobs.executor import Executor, InlineExecutor
 from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator

@@ -87,7 +87,7 @@ class Law:
     def refine(self, budget_s: float = inf) -> None:
         """Do what the command of this sample need not wait for, for about so long at most.
 
-        A law whose fits are made elsewhere (estimation/executor.py) takes up those that are
+        A law whose fits are made elsewhere (jobs/executor.py) takes up those that are
         finished, and submits the one that is due.
         """
 

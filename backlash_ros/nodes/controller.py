@@ -23,8 +23,8 @@ from backlash_ros.core.assembly import (
     warnings_of,
 )
 from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
-from backlash_ros.core.estimation.executor import Executor, InlineExecutor
-from backlash_ros.core.estimation.worker import WorkerExecutor
+from backlash_ros.core.jobs.executor import Executor, InlineExecutor
+from backlash_ros.core.jobs.worker import WorkerExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import (

@@ -9,7 +9,7 @@ from drivers.paced_driver import controller_and_driver
 from ros_processes import NodeProcess, ros_world
 from waiting import wait_until
 
-from backlash_ros.core.estimation import worker
+from backlash_ros.core.jobs import worker
 
 KILLED = 5  # times
 UNCERTAIN: dict[str, object] = {'plant.uncertainty': 0.2}

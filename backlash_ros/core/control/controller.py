@@ -12,7 +12,7 @@ from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
 from backlash_ros.core.control.protocol import ControlInput, Structure
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.executor import LOST, Channel, Executor, Failure, InlineExecutor
+from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure, InlineExecutor
 from backlash_ros.core.law import Interval, Law, StateSource
 from backlash_ros.core.plant.state_model import StateModel
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.belief import Belief, Inherited
-from backlash_ros.core.estimation.executor import Executor, Failure, InlineExecutor, Samples
 from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Record, Setup, with_swapped
 from backlash_ros.core.estimation.following import Following, Place, place_of
 from backlash_ros.core.estimation.learning import learn
@@ -29,6 +28,7 @@ from backlash_ros.core.estimation.observer import Gains, gains_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Fit
 from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, LONGEST
+from backlash_ros.core.jobs.executor import Executor, Failure, InlineExecutor, Samples
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters

@@ -16,7 +16,7 @@ from backlash_ros.core.assembly import (
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.limits import Motion, at_rest, last_commands, plausible
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.executor import Executor, InlineExecutor
+from backlash_ros.core.jobs.executor import Executor, InlineExecutor
 from backlash_ros.core.loop.command_history import CommandHistory, report_use
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.phase import Event, Phase, after

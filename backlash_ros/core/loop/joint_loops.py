@@ -7,7 +7,7 @@ from functools import partial
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.executor import Executor
+from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
 from backlash_ros.core.parameters import Parameters

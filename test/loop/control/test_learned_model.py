@@ -23,7 +23,7 @@ from backlash_ros.core.control.tracking.design import (
 from backlash_ros.core.control.tracking.margin import modulus_margin
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.executor import Executor
+from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import Backlash

@@ -16,21 +16,21 @@ from places import ROOT
 from waiting import wait_until
 from worker_jobs import checksum, foreign_modules, last_for_ever
 
-from backlash_ros.core.estimation.executor import (
+from backlash_ros.core.jobs.executor import (
     LOST,
     Channel,
     Failure,
     Record,
     Samples,
 )
-from backlash_ros.core.estimation.worker import NICENESS, WorkerExecutor
+from backlash_ros.core.jobs.worker import NICENESS, WorkerExecutor
 
 KILLED = 20  # times
 PARENT = f"""
 import sys, time
 sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'test')!r}]
 from pathlib import Path
-from backlash_ros.core.estimation.worker import WorkerExecutor
+from backlash_ros.core.jobs.worker import WorkerExecutor
 from worker_jobs import last_for_ever
 executor = WorkerExecutor()
 channel = executor.open()

@@ -16,7 +16,7 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 STARTS = """
 import sys
 from backlash_ros.core.assembly import WORKER_MODULES, build_controller
-from backlash_ros.core.estimation.worker import WorkerExecutor
+from backlash_ros.core.jobs.worker import WorkerExecutor
 from backlash_ros.core.parameters import Parameters
 controller = build_controller(Parameters({'structure': 'tracking'}),
                               executor=WorkerExecutor(WORKER_MODULES))

@@ -20,14 +20,14 @@ SHARED = {
 LAYERS = ('core', 'bags', 'nodes', 'tools')
 # Each room of the core imports from those before it only; likewise the parts of estimation.
 ROOMS = (
-    'parameters', 'plant', 'reference', 'estimate', 'law', 'laws', 'estimation',
-    'control', 'scenario', 'estimates_file', 'assembly', 'loop', 'records', 'simulation',
+    'jobs', 'parameters', 'plant', 'reference', 'estimate', 'law', 'laws', 'estimation', 'control',
+    'scenario', 'estimates_file', 'assembly', 'loop', 'records', 'simulation',
     'identification', 'driver_check',
 )
 ESTIMATION = (
     'settings', 'plant_family', 'play', 'reading', 'posterior', 'fit', 'search', 'explanations',
     'late_commands', 'coasting', 'belief', 'forgetting', 'publishing', 'learning', 'observer',
-    'following', 'executor', 'worker', 'estimator',
+    'following', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')

@@ -24,7 +24,7 @@ from struct import Struct
 from threading import Event, Thread
 from typing import Any, NamedTuple
 
-from backlash_ros.core.estimation.executor import LOST, Channel, Failure, Job, Record, computed
+from backlash_ros.core.jobs.executor import LOST, Channel, Failure, Job, Record, computed
 
 NICENESS = 5  # beyond that of the loop
 OPEN, EXTEND, SUBMIT, CLOSE, RESULT, READY = range(6)  # kinds of messages

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.estimation.executor import (
+from backlash_ros.core.jobs.executor import (
     BLOCK,
     Failure,
     InlineExecutor,
