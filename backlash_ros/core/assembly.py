@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -35,7 +34,7 @@ from backlash_ros.core.laws.lms import NormalisedLms
 from backlash_ros.core.laws.printed_law import PrintedLaw
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import PlantModel
+from backlash_ros.core.parameters.table import BY_NAME, PlantModel
 from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles
 from backlash_ros.core.plant.model_check import check_model, model_warnings
 from backlash_ros.core.plant.state_model import StateModel
@@ -49,50 +48,28 @@ from backlash_ros.core.scenario import (
 )
 
 __all__ = [
-    'ESTIMATORS', 'STRUCTURES', 'WORKER_MODULES', 'build_controller', 'build_four_blocks',
+    'LAWS', 'STRUCTURES', 'WORKER_MODULES', 'build_controller', 'build_four_blocks',
     'build_limits', 'build_model', 'build_plant', 'build_reference', 'build_state_model',
     'build_structure', 'build_true_model', 'first_guess', 'known_before', 'law_fits', 'warnings_of',
 ]
 
 # What a process imports that makes fits and gains.
 WORKER_MODULES = (fitted.__module__, better_design.__module__)
-# A law averages over the noise of u by itself, but not over the bias of smoothing it away.
-LITTLE_SMOOTHING = 0.1
+LAWS = tuple(dict.fromkeys(
+    dict(BY_NAME['estimator.law'].aliases).get(law, law)
+    for law in BY_NAME['estimator.law'].choices
+))
+STRUCTURES = BY_NAME['structure'].choices
 # Laws that belong to one structure, and why.
-ONLY_IN = {'printed': 'proportional', 'gradient': 'pole_placement'}
-WHY_ONLY = {
-    'printed': 'the law solves u_d = y_m + f v (3.2), which no other structure has',
-    'gradient': 'the law learns behind the filters of that loop',
+ONLY_IN = {
+    'printed': ('proportional', 'the law solves u_d = y_m + f v (3.2), which no other one has'),
+    'gradient': ('pole_placement', 'the law learns behind the filters of that loop'),
 }
 
 
-def build_state_model(p: Parameters) -> StateModel:
-    """The state space of G(z), one and the same for the same G(z)."""
-    model = build_model(p)
-    return _state_model(tuple(model.numerator), tuple(model.denominator))
-
-
-def first_guess(p: Parameters) -> Estimate:
-    """The estimates that estimator.initial names."""
-    return Estimate(
-        p.estimator.initial.m, p.estimator.initial.c_r,
-        p.estimator.initial.c_l, p.proportional.f,
-    )
-
-
-def known_before(p: Parameters) -> Estimate:
-    """The estimates to begin with: those in estimates.file if they are to be loaded and there.
-
-    Raises ParameterError for a file that does not belong to these parameters.
-    """
-    return load_estimate(p) or first_guess(p)
-
-
-def takes_model_as_exact(p: Parameters) -> bool:
-    """Whether a G other than that of the paper's example is taken as exact by a law that learns."""
-    plant, paper = p.plant, PlantModel()
-    of_paper = (plant.numerator, plant.denominator) == (paper.numerator, paper.denominator)
-    return p.estimator.law == 'moving_horizon' and not p.plant.uncertainty and not of_paper
+def law_fits(law: str, structure: str) -> bool:
+    """Whether a law belongs into a structure."""
+    return law not in ONLY_IN or ONLY_IN[law][0] == structure
 
 
 def build_controller(
@@ -107,165 +84,68 @@ def build_controller(
     check_model(build_model(p))
     _check_first_guess(p)
     check_last_commands(p)
-    period = p.sample_period
-    inverse = BacklashInverse(
-        p.inverse.direction_band, p.inverse.take_up_rate * period
+    inverse = BacklashInverse(p.inverse.direction_band, p.inverse.take_up_rate * p.sample_period)
+    law = p.estimator.law
+    if not law_fits(law, p.structure):
+        only, why = ONLY_IN[law]
+        raise ParameterError(
+            'structure', p.structure, f'must be {only} for estimator.law: {law}',
+            f'{why}; moving_horizon, lms and fixed fit any structure',
+        )
+    executor, actuator = executor or InlineExecutor(), build_actuator(p)
+    estimator = build_law(p, estimate or known_before(p), executor)
+    serial = None if actuator is None else SerialPlant(
+        actuator, build_state_model(p), p.estimator.output_noise_std
     )
-    _check_structure(p)
-    executor = executor or InlineExecutor()
-    estimator = ESTIMATORS[p.estimator.law](p, estimate or known_before(p), executor)
     return AdaptiveController(
-        estimator, build_structure(p), inverse, build_limits(p), p.plant.adapt,
-        _serial(p), executor,
+        estimator, build_structure(p), inverse, build_limits(p), p.plant.adapt, serial, executor
     )
 
 
-def _serial(p: Parameters) -> SerialPlant | None:
-    actuator = build_actuator(p)
-    if actuator is None:
-        return None
-    return SerialPlant(actuator, build_state_model(p), p.estimator.output_noise_std)
-
-
-def _commanded_model(p: Parameters) -> StateModel:
-    """What y does of the command: G, or L G where there is an actuator in front."""
-    model, actuator = build_model(p), build_actuator(p)
-    if actuator is not None:
-        model = actuator.in_front_of(model)
-    return _state_model(tuple(model.numerator), tuple(model.denominator))
+def build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
+    """The law that estimator.law names; initial: estimates to begin with."""
+    options, model, noise_std = p.estimator, build_state_model(p), p.estimator.output_noise_std
+    bounds = Bounds(options.bounds.m, options.bounds.c_r, options.bounds.c_l)
+    if options.law == 'moving_horizon':
+        observer = None
+        if p.structure != 'proportional':
+            given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
+            observer = FixedBacklash(given, model, noise_std, DOUBT)
+        return MovingHorizon(
+            initial, bounds, model, noise_std, options.input_noise_std, options.drift_std,
+            p.sample_period, p.plant.uncertainty, observer, executor,
+        )
+    if options.law == 'fixed':
+        return FixedBacklash(initial, model, noise_std, p.fixed.doubt)
+    # The others take c_l < 0 < c_r for granted, unless they are told otherwise.
+    (low_r, high_r), (low_l, high_l) = bounds.c_r, bounds.c_l
+    bounds = replace(
+        bounds, c_r=(max(low_r, 0.0) if high_r > 0.0 else low_r, high_r),
+        c_l=(low_l, min(high_l, 0.0) if low_l < 0.0 else high_l),
+    )
+    if options.law == 'gradient':
+        blocks = build_four_blocks(p)
+        return GradientEstimator(initial, bounds, blocks, p.gradient.step, noise_std)
+    # A law averages over the noise of u by itself, but not over the bias of smoothing it away.
+    reconstruction = InputReconstruction(build_model(p), noise_std, options.lag, smoothed=0.1)
+    if options.law == 'printed':
+        return PrintedLaw(initial, bounds, p.proportional.bounds, reconstruction)
+    return NormalisedLms(
+        initial, bounds, p.proportional.bounds, reconstruction, p.lms.step, p.lms.step_f
+    )
 
 
 def build_structure(p: Parameters) -> Structure:
     """The linear part alone."""
-    return STRUCTURES[p.structure](p)
-
-
-def _check_structure(p: Parameters) -> None:
-    law, structure = p.estimator.law, p.structure
-    if not law_fits(law, structure):
-        raise ParameterError(
-            'structure', structure, f'must be {ONLY_IN[law]} for estimator.law: {law}',
-            f'{WHY_ONLY[law]}; moving_horizon, lms and fixed fit any structure',
-        )
-
-
-def _check_first_guess(p: Parameters) -> None:
-    bounds = _bounds(p)
-    for name in ('m', 'c_r', 'c_l'):
-        low, high = getattr(bounds, name)
-        value = getattr(p.estimator.initial, name)
-        if not low <= value <= high:
-            raise ParameterError(
-                f'estimator.initial.{name}', value, f'must lie within [{low:g}, {high:g}]',
-                f'change it or estimator.bounds.{name}',
-            )
-    c_r, c_l = p.estimator.initial.c_r, p.estimator.initial.c_l
-    if c_l > c_r:
-        raise ParameterError(
-            'estimator.initial.c_l', c_l, f'must be <= estimator.initial.c_r={c_r!r}'
-        )
-    low, high = p.proportional.bounds
-    if low >= high:
-        raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')
-
-
-def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
-    """What is allowed but will make the estimate hard, a sentence each.
-
-    with_reference: whether the parameters of the reference are those in use.
-    """
-    frequency = p.frequency if with_reference else None
-    return model_warnings(build_model(p), p.sample_period, frequency)
-
-
-def build_limits(p: Parameters) -> Limits:
-    """Limits of v per sample."""
-    period = p.sample_period
-    return Limits(
-        p.control.min, p.control.max,
-        p.control.rate_max * period,
-        p.control.acceleration_max * period**2,
-    )
-
-
-def _bounds(p: Parameters) -> Bounds:
-    return Bounds(
-        p.estimator.bounds.m, p.estimator.bounds.c_r,
-        p.estimator.bounds.c_l,
-    )
-
-
-def _bounds_around_zero(p: Parameters) -> Bounds:
-    """The bounds for laws that take c_l < 0 < c_r for granted, unless they are told otherwise."""
-    bounds = _bounds(p)
-    (low_r, high_r), (low_l, high_l) = bounds.c_r, bounds.c_l
-    return replace(
-        bounds, c_r=(max(low_r, 0.0) if high_r > 0.0 else low_r, high_r),
-        c_l=(low_l, min(high_l, 0.0) if low_l < 0.0 else high_l),
-    )
-
-
-def _reconstruction(p: Parameters) -> InputReconstruction:
-    return InputReconstruction(
-        build_model(p), p.estimator.output_noise_std, p.estimator.lag,
-        LITTLE_SMOOTHING,
-    )
-
-
-def _moving_horizon(p: Parameters, initial: Estimate, executor: Executor) -> Law:
-    observer = None
-    if p.structure != 'proportional':
-        given = initial if initial.learned else replace(initial, c_r=0.0, c_l=0.0)
-        observer = FixedBacklash(
-            given, build_state_model(p), p.estimator.output_noise_std,
-            DOUBT,
-        )
-    return MovingHorizon(
-        initial, _bounds(p), build_state_model(p), p.estimator.output_noise_std,
-        p.estimator.input_noise_std, p.estimator.drift_std,
-        p.sample_period, p.plant.uncertainty, observer, executor,
-    )
-
-
-def _lms(p: Parameters, initial: Estimate, executor: Executor) -> Law:
-    return NormalisedLms(
-        initial, _bounds_around_zero(p), p.proportional.bounds, _reconstruction(p),
-        p.lms.step, p.lms.step_f,
-    )
-
-
-def _printed(p: Parameters, initial: Estimate, executor: Executor) -> Law:
-    return PrintedLaw(
-        initial, _bounds_around_zero(p), p.proportional.bounds, _reconstruction(p)
-    )
-
-
-def _fixed(p: Parameters, initial: Estimate, executor: Executor) -> Law:
-    return FixedBacklash(
-        initial, build_state_model(p), p.estimator.output_noise_std,
-        p.fixed.doubt,
-    )
-
-
-def law_fits(law: str, structure: str) -> bool:
-    """Whether a law belongs into a structure."""
-    return ONLY_IN.get(law, structure) == structure
-
-
-def _gradient(p: Parameters, initial: Estimate, executor: Executor) -> Law:
-    blocks = build_four_blocks(p)
-    return GradientEstimator(
-        initial, _bounds_around_zero(p), blocks, p.gradient.step,
+    if p.structure == 'proportional':
+        return Proportional()
+    if p.structure == 'pole_placement':
+        return PolePlacement(build_four_blocks(p))
+    weights = Weights(p.tracking.input_weight, p.tracking.integral_weight, p.tracking.preview)
+    return Tracking(
+        design(_commanded_model(p), weights), weights, p.inverse.caution,
         p.estimator.output_noise_std,
     )
-
-
-def _proportional(p: Parameters) -> Structure:
-    return Proportional()
-
-
-def _pole_placement(p: Parameters) -> Structure:
-    return PolePlacement(build_four_blocks(p))
 
 
 def build_four_blocks(p: Parameters) -> FourBlocks:
@@ -278,15 +158,26 @@ def build_four_blocks(p: Parameters) -> FourBlocks:
     return place_poles(model, closed, p.pole_placement.filter_pole)
 
 
-def _tracking(p: Parameters) -> Structure:
-    weights = Weights(
-        p.tracking.input_weight, p.tracking.integral_weight,
-        p.tracking.preview,
+def build_limits(p: Parameters) -> Limits:
+    """Limits of v per sample."""
+    control, period = p.control, p.sample_period
+    return Limits(
+        control.min, control.max, control.rate_max * period, control.acceleration_max * period**2
     )
-    return Tracking(
-        design(_commanded_model(p), weights), weights, p.inverse.caution,
-        p.estimator.output_noise_std,
-    )
+
+
+def build_state_model(p: Parameters) -> StateModel:
+    """The state space of G(z), one and the same for the same G(z)."""
+    model = build_model(p)
+    return _state_model(tuple(model.numerator), tuple(model.denominator))
+
+
+def _commanded_model(p: Parameters) -> StateModel:
+    """What y does of the command: G, or L G where there is an actuator in front."""
+    model, actuator = build_model(p), build_actuator(p)
+    if actuator is not None:
+        model = actuator.in_front_of(model)
+    return _state_model(tuple(model.numerator), tuple(model.denominator))
 
 
 # Remembered: a controller that restarts does so in the middle of a loop.
@@ -295,10 +186,50 @@ def _state_model(numerator: tuple[float, ...], denominator: tuple[float, ...]) -
     return StateModel(TransferFunction(numerator, denominator))
 
 
-ESTIMATORS: dict[str, Callable[[Parameters, Estimate, Executor], Law]] = {
-    'moving_horizon': _moving_horizon, 'lms': _lms, 'printed': _printed, 'fixed': _fixed,
-    'gradient': _gradient,
-}
-STRUCTURES: dict[str, Callable[[Parameters], Structure]] = {
-    'proportional': _proportional, 'tracking': _tracking, 'pole_placement': _pole_placement,
-}
+def first_guess(p: Parameters) -> Estimate:
+    """The estimates that estimator.initial names."""
+    initial = p.estimator.initial
+    return Estimate(initial.m, initial.c_r, initial.c_l, p.proportional.f)
+
+
+def known_before(p: Parameters) -> Estimate:
+    """The estimates to begin with: those in estimates.file if they are to be loaded and there.
+
+    Raises ParameterError for a file that does not belong to these parameters.
+    """
+    return load_estimate(p) or first_guess(p)
+
+
+def takes_model_as_exact(p: Parameters) -> bool:
+    """Whether a G other than that of the paper's example is taken as exact by a law that learns."""
+    plant, paper = p.plant, PlantModel()
+    of_paper = (plant.numerator, plant.denominator) == (paper.numerator, paper.denominator)
+    return p.estimator.law == 'moving_horizon' and not plant.uncertainty and not of_paper
+
+
+def warnings_of(p: Parameters, with_reference: bool = True) -> list[str]:
+    """What is allowed but will make the estimate hard, a sentence each.
+
+    with_reference: whether the parameters of the reference are those in use.
+    """
+    frequency = p.frequency if with_reference else None
+    return model_warnings(build_model(p), p.sample_period, frequency)
+
+
+def _check_first_guess(p: Parameters) -> None:
+    initial = p.estimator.initial
+    for name in ('m', 'c_r', 'c_l'):
+        (low, high), value = getattr(p.estimator.bounds, name), getattr(initial, name)
+        if low < high and not low <= value <= high:
+            raise ParameterError(
+                f'estimator.initial.{name}', value, f'must lie within [{low:g}, {high:g}]',
+                f'change it or estimator.bounds.{name}',
+            )
+    if initial.c_l > initial.c_r:
+        raise ParameterError(
+            'estimator.initial.c_l', initial.c_l,
+            f'must be <= estimator.initial.c_r={initial.c_r!r}',
+        )
+    low, high = p.proportional.bounds
+    if low >= high:
+        raise ParameterError('proportional.bounds', [low, high], 'must be [low, high], low < high')

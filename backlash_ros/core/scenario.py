@@ -20,20 +20,13 @@ from backlash_ros.core.reference.signal import ReferenceSignal
 def build_model(p: Parameters) -> TransferFunction:
     """G(z), and the delay between control and its effect as poles at 0."""
     delay = (0.0,) * p.control.delay_samples
-    return TransferFunction(
-        p.plant.numerator, p.plant.denominator + delay
-    )
+    return TransferFunction(p.plant.numerator, p.plant.denominator + delay)
 
 
 def build_actuator(p: Parameters) -> Actuator | None:
     """What lies between control and applied_control; None where nothing does."""
-    numerator = p.actuator.numerator
-    denominator = p.actuator.denominator
-    if not (numerator or denominator):
-        return None
-    return Actuator(
-        TransferFunction(numerator, denominator, 'actuator'), p.actuator.wind_up
-    )
+    lag = p.actuator.numerator, p.actuator.denominator
+    return Actuator(TransferFunction(*lag, 'actuator'), p.actuator.wind_up) if any(lag) else None
 
 
 def build_true_model(p: Parameters) -> TransferFunction:
@@ -41,53 +34,34 @@ def build_true_model(p: Parameters) -> TransferFunction:
 
     Raises ParameterError where that G(z) cannot be altered as truth.* asks.
     """
-    delay = p.truth.delay_samples
-    if delay < 0:
-        delay = p.control.delay_samples
-    numerator, denominator = p.truth.numerator, p.truth.denominator
+    truth, plant = p.truth, p.plant
     base = TransferFunction(
-        numerator or p.plant.numerator,
-        denominator or p.plant.denominator,
-        'truth' if numerator or denominator else 'plant',
+        truth.numerator or plant.numerator, truth.denominator or plant.denominator,
+        'truth' if truth.numerator or truth.denominator else 'plant',
     )
     altered = altered_plant(base, Alteration(
-        p.truth.scale_frequency, p.truth.scale_damping,
-        p.truth.extra_lag / p.sample_period,
+        truth.scale_frequency, truth.scale_damping, truth.extra_lag / p.sample_period
     ))
-    return delayed(altered, delay)
+    samples = truth.delay_samples if truth.delay_samples >= 0 else p.control.delay_samples
+    return delayed(altered, samples)
 
 
 def build_plant(p: Parameters) -> SimulatedPlant:
     """The simulated plant with its hidden backlash."""
-    backlash = Backlash(
-        p.backlash.m, p.backlash.c_r, p.backlash.c_l,
-        p.backlash.initial_u,
-    )
+    hidden = p.backlash
     imperfections = Imperfections(
-        p.output_noise_std,
-        p.output_quantum,
-        p.input_disturbance,
-        p.truth.walk_std,
-        p.backlash.rate,
-        p.backlash.jump_time,
-        p.backlash.jump,
+        p.output_noise_std, p.output_quantum, p.input_disturbance, p.truth.walk_std,
+        hidden.rate, hidden.jump_time, hidden.jump,
     )
-    rng = np.random.default_rng(p.seed)
     return SimulatedPlant(
-        build_true_model(p), backlash, p.sample_period, rng, imperfections,
-        build_actuator(p),
+        build_true_model(p), Backlash(hidden.m, hidden.c_r, hidden.c_l, hidden.initial_u),
+        p.sample_period, np.random.default_rng(p.seed), imperfections, build_actuator(p),
     )
 
 
 def build_reference(p: Parameters) -> ReferenceSignal:
     """y_m(t); reads the file for waveform: file."""
     return ReferenceSignal(
-        p.waveform,
-        p.amplitude,
-        p.frequency,
-        p.bias,
-        p.frequency_start,
-        p.sweep_time,
-        p.sample_period,
-        read_reference_file(p),
+        p.waveform, p.amplitude, p.frequency, p.bias, p.frequency_start, p.sweep_time,
+        p.sample_period, read_reference_file(p),
     )

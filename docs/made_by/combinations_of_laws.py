@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from backlash_ros.core.assembly import (
-    ESTIMATORS,
+    LAWS,
     STRUCTURES,
     build_controller,
     build_plant,
@@ -131,7 +131,7 @@ def outcome(samples: list[Sample]) -> str:
 def rows() -> tuple[list[str], list[list[str]]]:
     """Header, and a line for each law in each structure that it fits, a column per condition."""
     header = ['law, structure', *CONDITIONS]
-    pairs = [(law, s) for s in STRUCTURES for law in ESTIMATORS if law_fits(law, s)]
+    pairs = [(law, s) for s in STRUCTURES for law in LAWS if law_fits(law, s)]
     return header, [
         [f'`{law}`, `{structure}`',
          *(outcome(run(law, structure, condition)) for condition in CONDITIONS.values())]

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from math import inf, isfinite, isinf, isnan
-from re import compile as pattern
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from backlash_ros.core.parameters.errors import ParameterError
 
 Value = bool | int | float | str | tuple[float, ...] | tuple[str, ...]
 Group = TypeVar('Group')
-
-LARGEST_NUMBER = 1e100  # squares, and products of two, still are numbers
-NAMESPACE = pattern(r'[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # a name that ROS takes for one
 
 
 @dataclass(frozen=True)
@@ -106,97 +103,84 @@ def as_yaml(value: Value) -> str:
 
 def check_value(parameter: Parameter, value: object) -> Value:
     """Return value in the type of the parameter; raises ParameterError."""
-    default = parameter.default
+    default, refused = parameter.default, partial(ParameterError, parameter.name)
     if isinstance(default, bool):
-        return _flag(parameter, value)
+        if not isinstance(value, (bool, str)) or str(value).lower() not in ('true', 'false'):
+            raise refused(value, 'must be true or false')
+        return str(value).lower() == 'true'
     if isinstance(default, str):
-        return _word(parameter, value)
+        if 'true' in parameter.choices and isinstance(value, (bool, str)):
+            value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
+        if not isinstance(value, str):
+            raise refused(value, 'must be a text')
+        if parameter.choices and value not in parameter.choices:
+            raise refused(value, 'must be one of ' + ', '.join(parameter.choices))
+        return dict(parameter.aliases).get(value, value)
     if isinstance(default, tuple):
-        return check_names_of(parameter, value) if parameter.names else _reals(parameter, value)
-    number = _real(parameter, value)
+        return list_of_names(parameter, value) if parameter.names else _numbers(parameter, value)
+    number = _number(parameter, value)
     if not isinstance(default, int):
         return number
     if number != int(number):
-        raise ParameterError(parameter.name, value, 'must be a whole number')
+        raise refused(value, 'must be a whole number')
     # Beyond 2^53 the detour over a float would lose digits.
     return value if isinstance(value, int) else int(number)
 
 
-def _flag(parameter: Parameter, value: object) -> bool:
-    if isinstance(value, str) and value.lower() in ('true', 'false'):
-        return value.lower() == 'true'
-    if not isinstance(value, bool):
-        raise ParameterError(parameter.name, value, 'must be true or false')
-    return value
-
-
-def _word(parameter: Parameter, value: object) -> str:
-    if 'true' in parameter.choices and isinstance(value, (bool, str)):
-        value = str(value).lower()  # YAML and ROS 2 take true and false for more than words
-    if not isinstance(value, str):
-        raise ParameterError(parameter.name, value, 'must be a text')
-    if parameter.choices and value not in parameter.choices:
-        raise ParameterError(
-            parameter.name, value, 'must be one of ' + ', '.join(parameter.choices)
-        )
-    return dict(parameter.aliases).get(value, value)
-
-
-def check_names_of(parameter: Parameter, value: object) -> tuple[str, ...]:
-    """Return a list of names; raises ParameterError."""
+def _elements(parameter: Parameter, value: object, kind: str) -> list[object]:
     if isinstance(value, str):
-        value = [name.strip() for name in value.strip('[] ').split(',') if name.strip()]
-    if not isinstance(value, Iterable) or isinstance(value, Mapping):
-        raise ParameterError(parameter.name, value, 'must be a list of names')
-    names = list(value)
+        listed = value.strip('[] ')
+        value = [element.strip() for element in listed.split(',')] if listed else []
+    if isinstance(value, Mapping) or not isinstance(value, Iterable):
+        raise ParameterError(parameter.name, value, f'must be a list of {kind}')
+    return list(value)
+
+
+def list_of_names(parameter: Parameter, value: object) -> tuple[str, ...]:
+    """Return a list of names, each once; raises ParameterError."""
+    names = _elements(parameter, value, 'names')
+    namespace = re.compile('[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*')  # as ROS takes it
     for name in names:
-        if not isinstance(name, str) or not NAMESPACE.fullmatch(name) or names.count(name) > 1:
+        if not isinstance(name, str) or not namespace.fullmatch(name) or names.count(name) > 1:
             raise ParameterError(
                 parameter.name, names, 'must be a list of names',
                 'each once, of letters, digits and single _, a letter first; quote true, on, ...',
             )
-    return tuple(names)
+    return tuple(map(str, names))
 
 
-def _reals(parameter: Parameter, value: object) -> tuple[float, ...]:
-    if isinstance(value, str):
-        listed = value.strip('[] ')
-        value = listed.split(',') if listed else []
-    if isinstance(value, (bool, int, float)) or not isinstance(value, Iterable):
-        raise ParameterError(parameter.name, value, 'must be a list of numbers')
-    numbers = tuple(_real(parameter, element) for element in value)
+def _numbers(parameter: Parameter, value: object) -> tuple[float, ...]:
+    elements = _elements(parameter, value, 'numbers')
+    numbers = tuple(_number(parameter, element) for element in elements)
     if parameter.length is not None and len(numbers) != parameter.length:
-        raise ParameterError(
-            parameter.name, list(numbers), f'must have {parameter.length} numbers'
-        )
+        raise ParameterError(parameter.name, elements, f'must have {parameter.length} numbers')
     if not numbers and parameter.default != ():
         raise ParameterError(parameter.name, [], 'must have at least one number')
     return numbers
 
 
-def _real(parameter: Parameter, value: object) -> float:
+def _number(parameter: Parameter, value: object) -> float:
+    refused = partial(ParameterError, parameter.name)
     if isinstance(value, str):
         # YAML 1.1 reads 1e-5 (no point, no sign) as a text, and tools of ROS 2 send .inf as one.
         try:
             value = float(value.replace('.inf', 'inf'))
         except ValueError:
-            raise ParameterError(parameter.name, value, 'must be a number') from None
+            raise refused(value, 'must be a number') from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise ParameterError(parameter.name, value, 'must be a number')
+        raise refused(value, 'must be a number')
     try:
         number = float(value)
     except OverflowError:
-        raise ParameterError(parameter.name, '...', 'is too large for a number') from None
+        raise refused('...', 'is too large for a number') from None
     if isnan(number) or not (isfinite(number) or parameter.infinite):
-        raise ParameterError(parameter.name, number, 'must be finite')
-    if isfinite(number) and abs(number) > LARGEST_NUMBER:
-        raise ParameterError(
-            parameter.name, number, f'must be within ±{LARGEST_NUMBER:g}', 'choose another unit'
-        )
+        raise refused(number, 'must be finite')
+    if isfinite(number) and abs(number) > 1e100:  # squares, and products of two, still are numbers
+        raise refused(number, 'must be within ±1e+100', 'choose another unit')
     unit = f' [{parameter.unit}]' if parameter.unit else ''
     if number < parameter.low or (parameter.above and number == parameter.low):
         sign = '>' if parameter.above else '>='
-        raise ParameterError(parameter.name, number, f'must be {sign} {parameter.low:g}{unit}')
+        raise refused(number, f'must be {sign} {parameter.low:g}{unit}')
     if number > parameter.high:
-        raise ParameterError(parameter.name, number, f'must be <= {parameter.high:g}{unit}')
+        raise refused(number, f'must be <= {parameter.high:g}{unit}')
     return number

@@ -4,30 +4,22 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Iterator, Mapping
-from math import hypot, isinf, sqrt
+from math import hypot, sqrt
 from pathlib import PurePath
 
 from backlash_ros.core.parameters.errors import UNTOLD, ParameterError
 from backlash_ros.core.parameters.parameter import (
     Parameter,
     Value,
-    check_names_of,
     check_value,
     filled,
+    list_of_names,
 )
-from backlash_ros.core.parameters.table import (
-    BY_NAME,
-    CONTROLLER,
-    JOINTS,
-    NOISE,
-    PARAMETERS,
-    ParameterTree,
-)
+from backlash_ros.core.parameters.table import BY_NAME, CONTROLLER, NOISE, ParameterTree
 
-JOINT_MODEL, ESTIMATES_FILE = 'plant.denominator', 'estimates.file'
 # A joint of which nobody has said what it is like: v = y_m, within its limits.
 PASS_THROUGH: dict[str, object] = {
-    'plant.numerator': (1.0,), JOINT_MODEL: (1.0, 0.0), 'estimator.law': 'fixed',
+    'plant.numerator': (1.0,), 'plant.denominator': (1.0, 0.0), 'estimator.law': 'fixed',
     'structure': 'proportional', 'proportional.f': 0.0, 'estimator.initial.m': 1.0,
     'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
 }
@@ -48,13 +40,18 @@ class Parameters(ParameterTree, Mapping[str, Value]):
     def __init__(self, values: Mapping[str, object] | None = None) -> None:
         """Take given values and the defaults of all others; raises ParameterError."""
         given = dict(values or {})
-        joints = check_names_of(BY_NAME[JOINTS], given.get(JOINTS, ()))
+        joints = list_of_names(BY_NAME['joints'], given.get('joints', ()))
         shared, own = split(given, joints)
-        _check_joints(joints)
+        for joint in joints:
+            if any(name.partition('.')[0] == joint for name in BY_NAME):
+                raise ParameterError(
+                    'joints', joint, 'is the first word of a parameter',
+                    'give the joint another name',
+                )
         check_names(shared, joints)
         checked = {
-            p.name: check_value(p, shared[p.name]) if p.name in shared else p.default
-            for p in PARAMETERS
+            name: check_value(p, shared[name]) if name in shared else p.default
+            for name, p in BY_NAME.items()
         }
         tree = filled(ParameterTree, checked)
         if NOISE not in shared:
@@ -88,11 +85,8 @@ class Parameters(ParameterTree, Mapping[str, Value]):
     @property
     def missing_limits(self) -> list[str]:
         """Names of the limits of v that are infinite."""
-        limits = {
-            'control.min': self.control.min, 'control.max': self.control.max,
-            'control.rate_max': self.control.rate_max,
-        }
-        return [name for name, limit in limits.items() if isinf(limit)]
+        names = 'control.min', 'control.max', 'control.rate_max'
+        return [name for name in names if self[name] == BY_NAME[name].default]
 
 
 def check_names(names: Iterable[str], joints: Iterable[str] = ()) -> None:
@@ -102,17 +96,6 @@ def check_names(names: Iterable[str], joints: Iterable[str] = ()) -> None:
             valid = [*BY_NAME, *(f'{joint}.{own}' for joint in joints for own in BY_NAME)]
             near = difflib.get_close_matches(name, valid, n=1, cutoff=0.0)[0]
             raise ParameterError(name, UNTOLD, 'is not a parameter', f'did you mean {near}?')
-
-
-def _of_joint(
-    joint: str, shared: Mapping[str, object], own: Mapping[str, object],
-) -> Parameters:
-    try:
-        return Parameters(_values_of(joint, shared, own))
-    except ParameterError as error:
-        if error.name in own:
-            raise error.under(joint) from None
-        raise
 
 
 def split(
@@ -135,38 +118,25 @@ def entry_of(name: str) -> Parameter | None:
     return BY_NAME.get(name) or BY_NAME.get(name.partition('.')[2])
 
 
-def _check_joints(joints: Iterable[str]) -> None:
-    """Raise ParameterError for a joint whose section would be taken for something else."""
-    groups = {name.partition('.')[0] for name in BY_NAME}
-    for joint in joints:
-        if joint in groups:
-            raise ParameterError(
-                JOINTS, joint, 'is the first word of a parameter', 'give the joint another name'
-            )
-
-
-def _values_of(
+def _of_joint(
     joint: str, shared: Mapping[str, object], own: Mapping[str, object],
-) -> dict[str, object]:
-    """Values of one joint by the names of the table; raises ParameterError."""
+) -> Parameters:
     for name, value in own.items():
         entry = BY_NAME.get(name)
-        if entry is not None and (entry.per_node or CONTROLLER not in entry.used_by):
+        if entry and (entry.per_node or CONTROLLER not in entry.used_by):
             raise ParameterError(
                 f'{joint}.{name}', value, 'is not for one joint alone', f'set {name}'
             )
     values = {**shared, **own, 'io.joint': joint}
-    del values[JOINTS]
-    if JOINT_MODEL not in values:
+    del values['joints']
+    if 'plant.denominator' not in values:
         values.update(PASS_THROUGH)
-    if values.get(ESTIMATES_FILE):
-        values[ESTIMATES_FILE] = _file_of(str(values[ESTIMATES_FILE]), joint)
-    return values
-
-
-def _file_of(file: str, joint: str) -> str:
-    """A file of a joint: `{joint}` in its name, else the joint before its suffix."""
-    if '{joint}' in file:
-        return file.replace('{joint}', joint)
-    path = PurePath(file)
-    return str(path.with_name(f'{path.stem}-{joint}{path.suffix}'))
+    if file := str(values.get('estimates.file', '')):
+        path = PurePath(file)
+        values['estimates.file'] = file.replace('{joint}', joint) if '{joint}' in file else str(
+            path.with_name(f'{path.stem}-{joint}{path.suffix}')
+        )
+    try:
+        return Parameters(values)
+    except ParameterError as error:
+        raise (error.under(joint) if error.name in own else error) from None

@@ -8,7 +8,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.assembly import ESTIMATORS, law_fits
+from backlash_ros.core.assembly import LAWS, law_fits
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -122,7 +122,7 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
     own = parameters.estimator.law
     e = control_error(run)[compared]
     traces = [LawTrace(own, run.column('t')[compared], e, moving_rms(e, window), True)]
-    for law in ESTIMATORS:
+    for law in LAWS:
         if law == own or not law_fits(law, parameters.structure):
             continue
         try:

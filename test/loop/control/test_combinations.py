@@ -9,7 +9,7 @@ import pytest
 from combinations_of_laws import AMPLITUDES, CONDITIONS, Sample, outcome, run
 from places import ROOT
 
-from backlash_ros.core.assembly import ESTIMATORS, STRUCTURES, build_controller, law_fits
+from backlash_ros.core.assembly import LAWS, STRUCTURES, build_controller, law_fits
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK
 from backlash_ros.core.estimates_file import was_given
@@ -17,7 +17,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
 DOCS = ROOT / 'docs'
-PAIRS = [(law, structure) for structure in STRUCTURES for law in ESTIMATORS]
+PAIRS = [(law, structure) for structure in STRUCTURES for law in LAWS]
 FIT = [pair for pair in PAIRS if law_fits(*pair)]
 LARGEST_F, LARGEST_CROSSING = 0.5, 100.0  # the default bounds
 # What the table of docs/faults.md promises of the default law.

@@ -2,7 +2,7 @@
 
 import pytest
 
-from backlash_ros.core.assembly import ESTIMATORS, build_controller
+from backlash_ros.core.assembly import LAWS, build_controller
 from backlash_ros.core.law import Law, LawReport
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import PARAMETERS
@@ -17,13 +17,13 @@ def law(name: str) -> Law:
     ).estimator
 
 
-@pytest.mark.parametrize('name', ESTIMATORS)
+@pytest.mark.parametrize('name', LAWS)
 def test_only_live_parameters_are_taken_up_while_a_law_runs(name: str) -> None:
     live = {p.name for p in PARAMETERS if p.live}
     assert set(law(name).RETUNED) <= live
 
 
-@pytest.mark.parametrize('name', sorted({*ESTIMATORS} - {'moving_horizon'}))
+@pytest.mark.parametrize('name', sorted({*LAWS} - {'moving_horizon'}))
 def test_a_law_that_learns_no_model_says_nothing_of_one(name: str) -> None:
     simple = law(name)
     assert simple.learned_model is simple.proposal is None
