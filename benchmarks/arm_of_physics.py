@@ -46,7 +46,7 @@ from backlash_ros.tools.identify.command import main as identify
 Array = NDArray[np.float64]
 
 AMPLITUDE, PERIOD_S = 0.2, 8.0  # of a swing [rad]
-REACH, SPEED, DRIVE_S = 0.2, 0.15, 60.0  # of the motion for identify [rad], [rad/s]: no link coasts
+REACH, SPEED, DRIVE_S = 0.2, 0.08, 120.0  # for identify [rad], [rad/s]: no link coasts
 KNOWN_OF_SERVOS = ('--order', '1', '--integrator', 'no')  # position loops in slow motion
 OF_A_JOINT = ('plant.', 'estimator.', 'tracking.', 'control.delay_samples')  # of identified.yaml
 NAMES = [joint.name for joint in JOINTS]

@@ -7,12 +7,12 @@ ROS 2 calls the DDS topic of /plant_output rt/plant_output, and std_msgs/msg/Flo
 std_msgs::msg::dds_::Float64_. Start it as docs/driver.md says.
 """
 
-import contextlib
 import math
 import os
 import signal
 import time
 from dataclasses import dataclass
+from threading import Event
 
 from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
@@ -74,9 +74,10 @@ class Plant:
 
 
 def main() -> None:
-    """Publish y(k) every sample period, for good."""
+    """Publish y(k) every sample period until SIGINT or SIGTERM."""
+    stopping = Event()  # an exception could be raised in the middle of reading a message
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, lambda *_: stopping.set())
     os.environ.setdefault('CYCLONEDDS_URI', LOCALHOST)  # read with the first participant
     participant = DomainParticipant(int(os.environ.get('ROS_DOMAIN_ID', '0')))
     control = DataReader(participant, Topic(participant, 'rt/control', Float64), qos=RELIABLE)
@@ -88,7 +89,7 @@ def main() -> None:
     )
     plant, v, sample = Plant(), 0.0, 0
     begin = time.monotonic()
-    while True:
+    while not stopping.is_set():
         time.sleep(max(begin + sample * SAMPLE_PERIOD_S - time.monotonic(), 0.0))
         for message in control.take(10):
             # What is not a sample tells that a publisher has come or gone.
@@ -104,5 +105,4 @@ def main() -> None:
 
 
 if __name__ == '__main__':
-    with contextlib.suppress(KeyboardInterrupt):
-        main()
+    main()

@@ -26,6 +26,7 @@ import math
 import signal
 import time
 from collections.abc import Sequence
+from threading import Event
 
 import rclpy
 from dynamixel_bus import CENTRE, STEP, UNPLUGGED, PatientPort, ServoBus
@@ -144,11 +145,12 @@ def main() -> None:
         lambda: PatientPort(options.port, options.baud, 1e-3 * options.patience),
         list(joints.values()))
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    stopping = Event()  # an exception could be raised in the middle of reading a message
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, lambda *_: stopping.set())
     node = BusServoDriver(bus, joints, options.rate, options.speed)
-    with contextlib.suppress(KeyboardInterrupt):
-        rclpy.spin(node)
+    while not stopping.is_set():
+        rclpy.spin_once(node, timeout_sec=0.1)
     try:
         left = bus.release()
     except UNPLUGGED:

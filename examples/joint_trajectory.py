@@ -12,11 +12,11 @@ in a phase of its own.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import math
 import signal
 import time
 from collections.abc import Sequence
+from threading import Event
 
 import rclpy
 from rclpy.node import Node
@@ -107,13 +107,13 @@ def main() -> None:
     parser.add_argument('--duration', type=float, default=math.inf, help='[s]')
     options = parser.parse_args()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    stopping = Event()  # an exception could be raised in the middle of reading a message
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, lambda *_: stopping.set())
     node = JointTrajectory(options.joints, options.amplitude, options.period, options.rate)
     end = time.monotonic() + options.duration
-    with contextlib.suppress(KeyboardInterrupt):
-        while time.monotonic() < end:
-            rclpy.spin_once(node, timeout_sec=0.1)
+    while time.monotonic() < end and not stopping.is_set():
+        rclpy.spin_once(node, timeout_sec=0.1)
     rclpy.try_shutdown()
 
 

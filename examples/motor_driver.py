@@ -5,9 +5,9 @@ whatever the controller promises. As it is, the file moves a tiny simulated moto
 a worn gear, the one that config/geared_motor.yaml describes. docs/driver.md explains it.
 """
 
-import contextlib
 import math
 import signal
+from threading import Event
 
 import rclpy
 from rclpy.node import Node
@@ -80,10 +80,12 @@ class MotorDriver(Node):
 def main() -> None:
     """Run until SIGINT or SIGTERM."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    stopping = Event()  # an exception could be raised in the middle of reading a message
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
-    with contextlib.suppress(KeyboardInterrupt):
-        rclpy.spin(MotorDriver())
+        signal.signal(number, lambda *_: stopping.set())
+    node = MotorDriver()
+    while not stopping.is_set():
+        rclpy.spin_once(node, timeout_sec=0.1)
     rclpy.try_shutdown()
 
 

@@ -11,8 +11,8 @@ The driver of the arm holds the other joints where they are. Start no controller
 from __future__ import annotations
 
 import argparse
-import contextlib
 import signal
+from threading import Event
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -57,13 +57,13 @@ def main() -> None:
     parser.add_argument('joint')
     options = parser.parse_args()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    stopping = Event()  # an exception could be raised in the middle of reading a message
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.default_int_handler)
+        signal.signal(number, lambda *_: stopping.set())
     executor = SingleThreadedExecutor()
     executor.add_node(OneJoint(options.joint))
-    with contextlib.suppress(KeyboardInterrupt):
-        while True:
-            executor.spin_once(timeout_sec=0.1)  # a signal does not end a longer wait
+    while not stopping.is_set():
+        executor.spin_once(timeout_sec=0.1)  # a signal does not end a longer wait
     rclpy.try_shutdown()
 
 

@@ -148,7 +148,9 @@ class RecorderNode(ProcessNode):
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         needed: list[Callable[[], bool]] = []
         self._driver = to = driver_topics(p)
-        wanted = (*NEEDED_PUBLISHERS, to.reference, to.control)
+        # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
+        truth = (topics.TRUTH,) if self._lockstep else ()
+        wanted = (*NEEDED_PUBLISHERS, *truth, to.reference, to.control)
         recorded = {
             **OF_THE_LOOP, to.reference: to.reference_type, to.applied: to.applied_type,
             to.control: to.control_type,

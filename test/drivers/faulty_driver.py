@@ -3,10 +3,10 @@
 second: another publisher of y. best_effort: both publish so, and below /motor.
 """
 
-import contextlib
 import signal
 import sys
 import time
+from threading import Event
 
 import rclpy
 from made_up_driver import PERIOD_S, plant_parameters
@@ -46,11 +46,11 @@ class FaultyDriver:
         self.sample += 1
         self.output.publish(Float64(data=self.plant.measure()))
 
-    def run(self) -> None:
+    def run(self, stopping: Event) -> None:
         executor = SingleThreadedExecutor()
         executor.add_node(self.node)
         begin = time.monotonic()
-        while True:
+        while not stopping.is_set():
             due = begin + self.sample * PERIOD_S
             while (remaining := due - time.monotonic()) > 0.0:
                 executor.spin_once(timeout_sec=remaining)
@@ -59,9 +59,9 @@ class FaultyDriver:
 
 
 if __name__ == '__main__':
+    stopping = Event()
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, lambda *_: stopping.set())
     driver = FaultyDriver(sys.argv[1:])
-    with contextlib.suppress(KeyboardInterrupt):
-        driver.run()
+    driver.run(stopping)
     rclpy.try_shutdown()

@@ -41,10 +41,12 @@ LOSSES = {
 # A driver that is none of this package: y follows v like a first-order lag, at 100 Hz.
 FOREIGN = """
 import signal, sys, rclpy
+from threading import Event
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import Float64
 rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-signal.signal(signal.SIGINT, signal.default_int_handler)
+stopping = Event()
+signal.signal(signal.SIGINT, lambda *_: stopping.set())
 signal.signal(signal.SIGUSR1, lambda number, frame: sys.exit('the fuse has blown'))
 node = rclpy.create_node('driver')
 output = node.create_publisher(Float64, 'plant_output', 10)
@@ -54,10 +56,9 @@ def tick():
     state['y'] += 0.1 * (state['v'] - state['y'])
     output.publish(Float64(data=state['y']))
 node.create_timer(0.01, tick)
-try:
-    rclpy.spin(node)
-except KeyboardInterrupt:
-    print('last command', state['v'], flush=True)
+while not stopping.is_set():
+    rclpy.spin_once(node, timeout_sec=0.1)
+print('last command', state['v'], flush=True)
 """
 
 
@@ -219,10 +220,12 @@ def test_a_driver_elsewhere_is_awaited_and_ctrl_c_is_the_regular_end_of_an_endle
 ARM = """
 import signal, rclpy
 from math import sin
+from threading import Event
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-signal.signal(signal.SIGINT, signal.default_int_handler)
+stopping = Event()
+signal.signal(signal.SIGINT, lambda *_: stopping.set())
 node, names, k = rclpy.create_node('arm'), ['waist', 'elbow'], 0
 y, v = dict.fromkeys(names, 0.0), dict.fromkeys(names, 0.0)
 states = node.create_publisher(JointState, 'robot_joint_states', 10)
@@ -239,10 +242,8 @@ def tick():
     message.header.stamp = now
     states.publish(message)
 node.create_timer(0.02, tick)
-try:
-    rclpy.spin(node)
-except KeyboardInterrupt:
-    pass
+while not stopping.is_set():
+    rclpy.spin_once(node, timeout_sec=0.1)
 """
 JOINTS = """
 /**: {ros__parameters: {joints: [waist, elbow], sample_period: 0.02, proportional: {f: 0.0},
