@@ -185,11 +185,11 @@ class Problem:
         impulse[0] = 1.0
         columns = np.array([f.m * (side == NEITHER), p, -np.ones(count), f.m * (side == LEFT),
                             *self._hats])
-        once = lfilter([1.0], a, np.concatenate([columns, [u, y, impulse]]), axis=1)
+        once = lfilter([1.0], a, np.concatenate([columns, [u, y, impulse]]))
         out = np.empty((count, order + walks + 4 + self.family.count), order='F')
         for i in range(order):
             out[:i, i], out[i:, i] = 0.0, once[-1, :count - i]
-        forced = lfilter(b, [1.0], once[:-3], axis=1)
+        forced = lfilter(b, [1.0], once[:-3])
         out[:, order:order + walks] = forced[4:].T
         out[:, order + walks:order + walks + 4] = forced[:4].T
         db, da = self.family.slopes(f.xi)
@@ -414,7 +414,7 @@ def filtered(b: list[float], a: list[float], u: Array, x: Array) -> Array:
     state = np.zeros(len(a) - 1)
     length = min(len(state), len(x))
     state[:length] = x[:length]
-    return lfilter(b, a, u, zi=state)[0]
+    return lfilter(b, a, u, state)
 
 
 def state_columns(a: list[float], count: int) -> Array:

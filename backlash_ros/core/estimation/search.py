@@ -111,15 +111,15 @@ class _Comparison:
         g = np.repeat(gaps, len(shares))
         begins = self._v[0] + np.tile(shares, len(gaps)) * g
         p = plays(self._v, g, begins)
-        once = lfilter([1.0], self._a, p, axis=1)
-        of_y = lfilter(self._b, [1.0], once, axis=1)
+        once = lfilter([1.0], self._a, p)
+        of_y = lfilter(self._b, [1.0], once)
         columns = [self._averaged(of_y)]
         if self._family.count:
             # xi changes no constant part of u: that keeps to o.
-            move = lfilter([1.0], self._a, p - p[:, :1], axis=1)
-            y_over_a = lfilter([1.0], self._a, lfilter(self._b, [1.0], move, axis=1), axis=1)
+            move = lfilter([1.0], self._a, p - p[:, :1])
+            y_over_a = lfilter([1.0], self._a, lfilter(self._b, [1.0], move))
             for db, da in zip(*self._slopes, strict=True):
-                column = lfilter(db, [1.0], move, axis=1) - lfilter(da, [1.0], y_over_a, axis=1)
+                column = lfilter(db, [1.0], move) - lfilter(da, [1.0], y_over_a)
                 columns.append(self._averaged(column))
         stack = self._without_common(np.stack(columns, axis=1))
         y = np.broadcast_to(self._y, (len(g), 1, self._rows))

@@ -308,7 +308,7 @@ class _Family:
         found = [np.append(np.full(k, w[0]), w[:len(w) - k]) for k in range(taps)]
         for lag in lags:
             a = float(np.exp(-1.0 / lag))
-            found.append(lfilter([1.0 - a], [1.0, -a], w, zi=[w[0] * a])[0])
+            found.append(lfilter([1.0 - a], [1.0, -a], w, state=[w[0] * a]))
         found.append(np.cumsum(w))
         return np.column_stack(found)[self.rows]
 

@@ -27,8 +27,6 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-WORST_RESIDUAL = 1e-6  # of the Diophantine equation, relative to its right side
-
 
 @dataclass(frozen=True)
 class FourBlocks:
@@ -70,7 +68,7 @@ def place_poles(model: TransferFunction, closed: Array, filter_pole: float) -> F
     unknown = np.linalg.lstsq(sylvester, right, rcond=None)[0]
     residual = float(np.linalg.norm(sylvester @ unknown - right))
     dc_gain = float(np.sum(b))
-    if not residual <= WORST_RESIDUAL * float(np.linalg.norm(product)) or dc_gain == 0.0:
+    if not residual <= 1e-6 * float(np.linalg.norm(product)) or dc_gain == 0.0:
         raise ParameterError(
             'structure', 'pole_placement', 'cannot place the poles of this G(z)',
             'cancel its common factors or take structure: tracking',

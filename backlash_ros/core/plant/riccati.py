@@ -13,9 +13,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MOST_DOUBLINGS = 60  # steps; each one doubles the number of samples that the solution covers
-LAST_CHANGE = 1e-16  # of the solution, relative, from which on it is stationary
-
 
 def riccati(a: Array, b: Array, q: Array) -> Array:
     """P = A'PA - A'PB (1 + B'PB)^-1 B'PA + Q, the stabilising one, shape (n, n).
@@ -27,7 +24,7 @@ def riccati(a: Array, b: Array, q: Array) -> Array:
     transition, g, p = a.copy(), np.outer(b, b), np.array(q, np.float64)
     unit = np.eye(len(a))
     with np.errstate(over='ignore', invalid='ignore'):
-        for _ in range(MOST_DOUBLINGS):
+        for _ in range(60):  # each time the solution covers twice as many samples
             inner = np.linalg.solve(unit + g @ p, np.hstack([transition, g]))
             more = transition.T @ p @ inner[:, :len(a)]
             g += transition @ inner[:, len(a):] @ transition.T
@@ -35,21 +32,11 @@ def riccati(a: Array, b: Array, q: Array) -> Array:
             p += 0.5 * (more + more.T)
             if not np.isfinite(p).all():
                 break
-            if float(np.abs(more).max()) <= LAST_CHANGE * float(np.abs(p).max()):
+            if float(np.abs(more).max()) <= 1e-16 * float(np.abs(p).max()):
                 return p
     raise np.linalg.LinAlgError('no feedback stabilises A')
 
 
 def lyapunov(a: Array, q: Array) -> Array:
     """P = A P A' + Q for a stable A, shape (n, n); raises numpy.linalg.LinAlgError for another."""
-    transition, p = a.copy(), np.array(q, np.float64)
-    with np.errstate(over='ignore', invalid='ignore'):
-        for _ in range(MOST_DOUBLINGS):
-            more = transition @ p @ transition.T
-            p += more
-            transition = transition @ transition
-            if not np.isfinite(p).all():
-                break
-            if float(np.abs(more).max()) <= LAST_CHANGE * float(np.abs(p).max()):
-                return p
-    raise np.linalg.LinAlgError('A is not stable')
+    return riccati(a.T, np.zeros(len(a)), q)

@@ -104,5 +104,4 @@ class SimulatedPlant:
             for value, rate, jump in zip(self._initial, self._extra.rate, jumped, strict=True)
         )
         check_backlash(m, c_r, c_l)
-        backlash = self.backlash
-        backlash.m, backlash.c_r, backlash.c_l = m, c_r, c_l
+        self.backlash.m, self.backlash.c_r, self.backlash.c_l = m, c_r, c_l

@@ -9,25 +9,25 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-SHORTEST_MEMORY, LONGEST_MEMORY = 150, 5000  # samples
-
 
 class StateModel:
     """x(k+1) = A x + B u, y = c x_0 with observability Gramian I over a finite horizon.
 
     A unit state in any direction then shows with the same energy in y, so that one number tells
     how unknown x is, and covariances stay well scaled however close the poles of G lie to 1.
-    Only the first state shows in y at once: its factor c is all there is of C.
+    Only the first state shows in y at once: its factor c is all there is of C. memory: samples
+    after which the slowest stable mode has died out. equilibrium: x at rest with y = 1, shape (n,):
+    a constant u holds it, none in an integrator.
     """
 
     def __init__(self, model: TransferFunction) -> None:
         self.transfer_function = model
         a, b, c = model.state_space()
-        self.order = model.order
-        rows, row = [], c
-        for _ in range(_horizon(model)):
-            rows.append(row)
-            row = row @ a
+        n = self.order = model.order
+        # A horizon within which the slow dynamics show, bounded for integrators.
+        rows = [c]
+        while len(rows) < max(10 * n, 50):
+            rows.append(rows[-1] @ a)
         # R of the observability matrix: R' R is its Gramian, without squaring the condition.
         r = np.linalg.qr(np.array(rows))[1]
         # A rotation keeps the Gramian and turns C onto the first axis.
@@ -38,32 +38,16 @@ class StateModel:
         self.a: Array = self.to_state @ a @ self.to_observer
         self.b: Array = self.to_state @ b
         self.c = float(triangle[0, 0])
-        self.memory = _memory(model)
-        self.equilibrium = self._equilibrium()
-
-    def _equilibrium(self) -> Array:
-        """State x at rest with y = 1, shape (n,): a constant u holds it, none in an integrator."""
-        n = self.order
+        stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - 1e-6]
+        self.memory = memory_of(max(stable, default=0.0))
         rest = np.zeros((n + 1, n + 1))
         rest[:n, :n], rest[:n, n], rest[n, 0] = self.a - np.eye(n), self.b, self.c
-        return np.asarray(np.linalg.lstsq(rest, np.eye(n + 1)[n])[0][:n])
-
-
-def _horizon(model: TransferFunction) -> int:
-    """Samples within which the slow dynamics show, bounded for integrators."""
-    return max(10 * model.order, 50)
-
-
-def _memory(model: TransferFunction) -> int:
-    """Samples after which the slowest stable mode of G has died out, within reason."""
-    stable = [abs(pole) for pole in model.poles if abs(pole) < 1.0 - 1e-6]
-    slowest = max(stable, default=0.0)
-    return memory_of(slowest)
+        self.equilibrium: Array = np.linalg.lstsq(rest, np.eye(n + 1)[n])[0][:n]
 
 
 def memory_of(slowest: float) -> int:
     """Samples after which a mode has died out whose pole has this size, within reason."""
-    return int(min(max(3.0 / (1.0 - slowest), SHORTEST_MEMORY), LONGEST_MEMORY))
+    return int(min(max(3.0 / (1.0 - slowest), 150), 5000))
 
 
 def powers(a: Array, b: Array, count: int) -> Array:

@@ -92,13 +92,9 @@ class TransferFunction:
         Beside so few numbers a call of NumPy takes longer.
         """
         y = x[0]
-        terms = self._terms
-        last = len(terms) - 1
-        for i in range(last):
-            a, b = terms[i]
-            x[i] = x[i + 1] + a * y + b * u
-        a, b = terms[last]
-        x[last] = a * y + b * u
+        last = len(x) - 1
+        for i, (a, b) in enumerate(self._terms):
+            x[i] = (x[i + 1] if i < last else 0.0) + a * y + b * u
         return x[0]
 
 
@@ -106,11 +102,10 @@ def _polynomial(name: str, coefficients: Sequence[float]) -> Array:
     values = np.asarray(coefficients, dtype=np.float64)
     if values.ndim != 1 or values.size == 0:
         raise ParameterError(name, coefficients, 'must be a list of at least one number')
-    if not np.all(np.isfinite(values)):
+    if not np.isfinite(values).all():
         raise ParameterError(name, coefficients, 'must be finite')
-    nonzero = np.flatnonzero(values)
-    if nonzero.size == 0:
+    if not values.any():
         raise ParameterError(name, coefficients, 'must not be zero')
-    if name.endswith('.denominator') and nonzero[0] != 0:
+    if name.endswith('.denominator') and values[0] == 0.0:
         raise ParameterError(name, coefficients, 'must have a leading coefficient other than 0')
-    return values[nonzero[0]:]
+    return np.trim_zeros(values, 'f')

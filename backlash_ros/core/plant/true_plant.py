@@ -1,9 +1,9 @@
 """A G(z) that differs from a known one as real plants do: resonance, damping, dead time.
 
-With the zero-order hold, G(z) without its delay is the sampled response of one G(s):
+With the zero-order hold, G(z) without its delay is the sampled response of one G(s),
+x' = A x + b u:
 
-    poles        s_i = log(z_i), per sample; z = 1 stays an integrator, z = 0 stays a delay
-    numerator    that of G(z) is linear in that of G(s): n numerators s^j make the matrix
+    exp [A b; 0 0] = [A_z b_z; 0 1]     z = 1 stays an integrator, z = 0 stays a delay
     frequency    G(s / f) / f^k with k integrators: gain at rest, or of the velocity, is kept
     damping      s^2 + 2 d w s + w^2 with kappa d for d, d >= 1 makes two real poles; the numerator
                  of G(s), and with it the gain at rest, is kept
@@ -24,10 +24,6 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 Roots = NDArray[np.complex128]
-
-NEAR = 1e-6  # distance of two roots that counts as none: rounding moves a double one by 1e-8
-WHOLE = 1e-9  # share of a sample by which a whole number of them may be missed
-CURE = 'give truth.numerator and truth.denominator instead'
 
 
 @dataclass(frozen=True)
@@ -55,95 +51,83 @@ def altered_plant(model: TransferFunction, alteration: Alteration) -> TransferFu
     Raises ParameterError for a pole on the negative real axis, which no G(s) of this order has,
     and for a numerator that is not that of a delay by whole samples.
     """
-    whole = int(alteration.lag + WHOLE)
+    whole = int(alteration.lag + 1e-9)
     part = max(alteration.lag - whole, 0.0)
-    if alteration.frequency == 1.0 and alteration.damping == 1.0 and part <= WHOLE:
+    if alteration.frequency == 1.0 and alteration.damping == 1.0 and part <= 1e-9:
         return delayed(model, whole)
+    from scipy.linalg import expm, logm  # takes long to load, and few plants need it
+
     inner, delay = _without_delay(model)
     poles = _continuous_poles(inner)
-    numerator = np.linalg.solve(_Sampled(poles).from_numerator(), inner.numerator[1:])
+    n = len(poles)
+    sampled = _block(*inner.state_space()[:2])
+    sampled[n, n] = 1.0
+    block = np.real(logm(sampled))
+    numerator = _numerator(block[:n, :n], block[:n, n], np.real(np.poly(poles)))
     poles = _damped(poles, alteration.damping) * alteration.frequency
-    integrators = np.count_nonzero(poles == 0.0)
-    powers = np.arange(1, len(poles) + 1) - integrators
-    sampled = _Sampled(poles)
-    numerator *= alteration.frequency**powers
-    b, a = sampled.from_numerator(1.0 - part) @ numerator, sampled.denominator
-    if part > WHOLE:
-        # What was commanded a sample before acts for the first part of this one.
-        b = np.append(b, 0.0) + np.append(0.0, sampled.from_numerator(part, 1.0 - part) @ numerator)
-        a = np.append(a, 0.0)
-    return delayed(TransferFunction(b.tolist(), a.tolist()), delay + whole)
+    numerator *= alteration.frequency**(np.arange(1, n + 1) - np.count_nonzero(poles == 0.0))
+    altered = TransferFunction(numerator.tolist(), np.real(np.poly(poles)).tolist())
+    a, b = altered.state_space()[:2]
+    over, over_part = expm(_block(a, b) * (1.0 - part)), expm(_block(a, b) * part)
+    transition = over[:n, :n] @ over_part[:n, :n]
+    denominator = np.real(np.poly(np.exp(poles)))
+    b_z = np.append(_numerator(transition, over[:n, n], denominator), 0.0)
+    # What was commanded a sample before acts for the first part of this one.
+    b_z[1:] += _numerator(transition, over[:n, :n] @ over_part[:n, n], denominator)
+    return delayed(
+        TransferFunction(b_z.tolist(), [*denominator, 0.0]) if part > 1e-9
+        else TransferFunction(b_z[:n].tolist(), denominator.tolist()), delay + whole,
+    )
 
 
-class _Sampled:
-    """G(s) = (c_0 s^(n-1) + ... + c_(n-1)) / D(s) under a zero-order hold, in samples.
+def _block(a: Array, b: Array) -> Array:
+    """[a b; 0 0], whose exponential gives the response to a u that is held."""
+    return np.vstack([np.column_stack([a, b]), np.zeros(len(a) + 1)])
 
-    Observer form: x' = A x + c u, y = x_0.
+
+def _numerator(a: Array, b: Array, denominator: Array) -> Array:
+    """Numerator (n,) of C (z I - A)^-1 b with C = (1, 0, ...), of s as of z.
+
+    The Markov parameters C A^i b times the denominator.
     """
-
-    def __init__(self, poles: Roots) -> None:
-        # Takes as long to load as all else that a plant needs, and few plants need it.
-        from scipy.linalg import expm, toeplitz
-        self._expm = expm
-        n = len(poles)
-        self._a = np.zeros((n, n))
-        self._a[:, 0] = -np.real(np.poly(poles))[1:]
-        self._a[:-1, 1:] = np.eye(n - 1)
-        self.denominator: Array = np.real(np.poly(np.exp(poles)))
-        transition = expm(self._a)
-        rows = [np.eye(n)[0]]
-        for _ in range(n - 1):
-            rows.append(rows[-1] @ transition)
-        # Impulse response times denominator is the numerator.
-        self._to_numerator = toeplitz(self.denominator[:n], np.eye(n)[0]) @ np.array(rows)
-
-    def from_numerator(self, held: float = 1.0, after: float = 0.0) -> Array:
-        """Matrix (n, n) from c to the numerator of G(z) for a u that acts over a share of a sample.
-
-        held: that share, `after` it passes until the sample ends.
-        """
-        n = len(self._a)
-        block = np.zeros((2 * n, 2 * n))
-        block[:n, :n], block[:n, n:] = self._a, np.eye(n)
-        effect = self._expm(block * held)[:n, n:]
-        return np.asarray(self._to_numerator @ self._expm(self._a * after) @ effect)
+    markov = [b]
+    for _ in range(len(a) - 1):
+        markov.append(a @ markov[-1])
+    return np.convolve(denominator, [float(x[0]) for x in markov])[:len(a)]
 
 
 def _without_delay(model: TransferFunction) -> tuple[TransferFunction, int]:
     """G(z) without its poles at 0, and their number."""
-    delay = len(model.denominator) - 1 - int(np.flatnonzero(model.denominator)[-1])
-    denominator = model.denominator[: len(model.denominator) - delay]
+    denominator = np.trim_zeros(model.denominator, 'b')
+    delay = len(model.denominator) - len(denominator)
     numerator = model.numerator[model.delay:]
     if len(numerator) >= len(denominator):
         raise ParameterError(
             'plant.denominator', model.denominator.tolist(),
             f'has {delay} poles at 0 that are no delay by whole samples, which truth.scale_* and '
-            'truth.extra_lag cannot alter', CURE,
+            'truth.extra_lag cannot alter', 'give truth.numerator and truth.denominator instead',
         )
     return TransferFunction(numerator.tolist(), denominator.tolist()), delay
 
 
 def _continuous_poles(model: TransferFunction) -> Roots:
     poles = model.poles
-    negative = (poles.real < 0.0) & (np.abs(poles.imag) <= NEAR * np.abs(poles))
+    negative = (poles.real < 0.0) & (np.abs(poles.imag) <= 1e-6 * np.abs(poles))
     if negative.any():
         raise ParameterError(
             'plant.denominator', model.denominator.tolist(),
             f'has the pole {float(poles[negative][0].real):.6g}: no continuous plant has poles on '
             'the negative real axis, so that truth.scale_* and truth.extra_lag cannot alter it',
-            CURE,
+            'give truth.numerator and truth.denominator instead',
         )
-    return np.where(np.abs(poles - 1.0) < NEAR, 0.0, np.log(poles))
+    # Rounding moves a double pole by 1e-8.
+    return np.where(np.abs(poles - 1.0) < 1e-6, 0.0, np.log(poles))
 
 
 def _damped(poles: Roots, factor: float) -> Roots:
-    altered: list[complex] = []
-    for pole in poles:
-        if pole.imag == 0.0:
-            altered.append(pole)
-        elif pole.imag > 0.0:
-            frequency = abs(pole)
-            ratio = -factor * pole.real / frequency
-            root = np.sqrt(complex(ratio**2 - 1.0))
-            altered += [frequency * (-ratio + root), frequency * (-ratio - root)]
+    altered = list(poles[poles.imag == 0.0])
+    for pole in poles[poles.imag > 0.0]:
+        ratio = -factor * pole.real / abs(pole)
+        root = np.sqrt(complex(ratio**2 - 1.0))
+        altered += [abs(pole) * (-ratio + root), abs(pole) * (-ratio - root)]
     return np.array(altered, dtype=np.complex128)
