@@ -93,7 +93,8 @@ def _numerator(a: Array, b: Array, denominator: Array) -> Array:
     markov = [b]
     for _ in range(len(a) - 1):
         markov.append(a @ markov[-1])
-    return np.convolve(denominator, [float(x[0]) for x in markov])[:len(a)]
+    product = np.convolve(denominator, [float(x[0]) for x in markov])
+    return np.asarray(product[:len(a)], np.float64)
 
 
 def _without_delay(model: TransferFunction) -> tuple[TransferFunction, int]:
