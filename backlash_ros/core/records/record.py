@@ -14,6 +14,11 @@ class RecordError(ValueError):
     """A record of which no sense can be made: one line says what, where and the cure."""
 
 
+def seconds(time_s: float) -> str:
+    """A time for people."""
+    return f'{time_s * 1e3:.4g} ms' if time_s < 0.1 else f'{time_s:.4g} s'
+
+
 @dataclass(frozen=True)
 class Record:
     """One motion on a uniform grid of sample_period [s], N samples.

@@ -9,46 +9,30 @@ that is hidden by its noise; else the grid is finer, with nothing between the re
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
 from backlash_ros.core.records.readings import quantum
-from backlash_ros.core.records.record import RecordError
+from backlash_ros.core.records.record import Record, RecordError, seconds
 from backlash_ros.core.records.roughness import curvature_of, noise_of, rougher
-from backlash_ros.core.records.rows import typical_step
+from backlash_ros.core.records.stamps import typical_step
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 EVEN = 0.02  # of a period that stamps of even samples may be off
-COARSE = 0.75  # of the last digit of the stamps, likewise
-OFTEN_EQUAL = 0.2  # share of equal stamps from which the mean step is the period, not the median
-NARROW = 0.25  # relative spread of the steps for which their median is the period
 BREAK = 3.0  # periods from row to row that are a gap
-LATE = 1.0  # periods: deviation of stamps that are late, beyond which rows cannot be numbered
-MOST_LOST = 0.3  # share of the numbers without a row, likewise
+MOST_LOST = 0.3  # share of the numbers without a row, beyond which rows cannot be numbered
 DECIDED = 0.05  # log of the roughness that tells late stamps from true ones
-FINER = (1, 2, 4)  # parts of a period
 HIDDEN, LEAST = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
-ROUNDING = 12.0**-0.5  # deviation of rounding to whole numbers
-NINE_TENTHS_TO_STD = 0.61  # of what 90 % of normal values stay within
 MOST_SHARED = 0.02  # share of the readings that may fall onto one instant
 LONGEST = 1_000_000  # samples of a grid
-SPARSE, LONG_BREAK = 20.0, 100.0  # samples per row, and periods of a gap that ends a stretch
-
-
-class Grid(NamedTuple):
-    """v and y of N samples. at: number of the sample of each row that is used (for commands)."""
-
-    v: Array
-    y: Array
-    period: float
-    said: str
-    commands: Array | None = None
+LONG_BREAK = 100.0  # periods of a gap that ends a stretch
 
 
 class Rows(NamedTuple):
@@ -60,139 +44,118 @@ class Rows(NamedTuple):
     own: Flags
     commands: Array | None = None
 
-    def part(self, begin: int, end: int) -> Rows:
-        """Some of them, t from 0 on."""
-        t = self.t[begin:end]
-        commands = None if self.commands is None else self.commands[begin:end]
-        return Rows(t - t[0], self.v[begin:end], self.y[begin:end], self.own[begin:end], commands)
+
+class Numbering(NamedTuple):
+    """Of rows (M,), whose stamps lie around begin + period * numbers [s], off (M,) that."""
+
+    numbers: Numbers
+    period: float
+    begin: float
+    off: Array
 
 
-def on_grid(rows: Rows, period: float | None = None) -> Grid:
+def on_grid(rows: Rows, period: float | None = None) -> Record:
     """Rows on a grid. period [s]: of the samples, None tells it from the stamps.
 
     Raises RecordError where there are too few, or they are spread over too long a time.
     """
-    told = period or _period(rows.t)
-    rows, cut = _longest_stretch(rows, told)
-    even = _even(rows.t, told)
-    if even is not None:
-        index, found = even
-        kept = period or found
-        said = f'{len(rows.t)} rows, one every {seconds(kept)}'
-        grid = _numbered_grid(rows, index, kept, said)
+    guess = period or _period(rows.t)
+    rows, cut = _longest_stretch(rows, guess)
+    steps = np.diff(rows.t) / guess
+    found = _numbering(rows.t, steps, guess)
+    used = period or found.period
+    if np.abs(found.off).max() <= max(EVEN * guess, 0.75 * _resolution(rows.t)):
+        record = _numbered_grid(rows, found.numbers, used, f'{len(rows.t)} rows, one every '
+                                                         f'{seconds(used)}')
     else:
-        jitter = _jitter(rows.t, told)
-        index, found = _numbers(rows.t, told if period is None else period, period is not None)
-        if _are_late(rows, index, found):
-            said = (
-                f'stamps are uneven by {100.0 * jitter:.2g} % of {seconds(found)}, the motion is '
-                'not: rows are numbered'
-            )
-            grid = _numbered_grid(rows, index, found, said)
+        inner = steps[steps <= BREAK]
+        jitter = 0.5 * float(np.diff(np.percentile(inner, [16.0, 84.0]))[0])
+        # A few odd ones among even stamps are told as well.
+        percent = 100.0 * (jitter if jitter > 0.005 else float(np.std(inner)))
+        if period is not None:
+            found = _line(numbered(rows.t / period), rows.t)
+        if _are_late(rows, found):
+            record = _numbered_grid(
+                rows, found.numbers, used, f'stamps are uneven by {percent:.2g} % of '
+                f'{seconds(used)}, the motion is not: rows are numbered')
         else:
-            told, begin = _along(rows.t, told, period is not None)
-            grid = _true_instants(
-                rows._replace(t=rows.t - begin), told,
-                f'stamps jitter by {100.0 * jitter:.2g} % around {seconds(told)}: v and y are '
-                'taken at them',
-            )
-    return grid._replace(said='; '.join([*cut, grid.said]))
-
-
-def seconds(time_s: float) -> str:
-    """A time for people."""
-    return f'{time_s * 1e3:.4g} ms' if time_s < 0.1 else f'{time_s:.4g} s'
+            if period is None and np.abs(found.off).max() <= 0.5 * used:
+                rows = rows._replace(t=rows.t - found.begin)
+            else:
+                used = guess
+            record = _true_instants(
+                rows, used, f'stamps jitter by {percent:.2g} % around {seconds(used)}: v and y are '
+                'taken at them')
+    return replace(record, timing=cut + record.timing)
 
 
 def _period(t: Array) -> float:
+    """Time from row to row, roughly."""
     steps = np.diff(t)
-    forward = typical_step(t)
-    steps = steps[steps <= BREAK * forward]
-    if np.mean(steps == 0.0) > OFTEN_EQUAL:
-        return float(np.mean(steps))
-    low, high = np.percentile(steps, [15.0, 85.0]).tolist()
-    found = forward if high - low <= 2.0 * NARROW * forward else float(np.mean(steps))
+    steps = steps[steps <= BREAK * typical_step(t)]
+    low, middle, high = np.percentile(steps, [15.0, 50.0, 85.0]).tolist()
+    # With many equal stamps, or uneven steps, the mean tells it.
+    found = middle if high - low < 0.5 * middle else float(np.mean(steps))
     return float(f'{found:.6g}')
 
 
-def _jitter(t: Array, period: float) -> float:
-    steps = np.diff(t) / period
-    steps = steps[steps <= BREAK]
-    low, high = np.percentile(steps, [16.0, 84.0]).tolist()
-    bulk = 0.5 * float(high - low)
-    # A few odd ones among even stamps are told as well.
-    return bulk if bulk > 0.005 else float(np.std(steps))
-
-
-def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, list[str]]:
-    """Without what lies far before and after, where the time between holds no rows."""
-    if rows.t[-1] / period < min(SPARSE * len(rows.t) + LONG_BREAK, LONGEST):
-        return rows, []
-    ends = np.flatnonzero(np.diff(rows.t) > LONG_BREAK * period) + 1
-    bounds = np.concatenate([[0], ends, [len(rows.t)]])
-    longest = int(np.argmax(np.diff(bounds)))
-    part = rows.part(int(bounds[longest]), int(bounds[longest + 1]))
-    if len(part.t) < 2 or part.t[-1] / period >= LONGEST:
+def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
+    """Without what lies far before and after, where the time between holds no rows; said so."""
+    if rows.t[-1] / period < min(20.0 * len(rows.t) + LONG_BREAK, LONGEST):
+        return rows, ''
+    parts = np.split(np.arange(len(rows.t)),
+                     np.flatnonzero(np.diff(rows.t) > LONG_BREAK * period) + 1)
+    kept = max(parts, key=len)
+    t = rows.t[kept] - rows.t[kept[0]]
+    if len(kept) < 2 or t[-1] / period >= LONGEST:
         raise RecordError(
             f'spans {rows.t[-1] / period:.3g} periods of {seconds(period)} with {len(rows.t)} '
             'rows: cut out one motion with --from and --to, or give --period'
         )
-    return part, [f'{len(ends)} long gaps: the longest stretch, {len(part.t)} rows, is used']
+    commands = None if rows.commands is None else rows.commands[kept]
+    return (
+        Rows(t, rows.v[kept], rows.y[kept], rows.own[kept], commands),
+        f'{len(parts) - 1} long gaps: the longest stretch, {len(kept)} rows, is used; ',
+    )
 
 
-def _line(index: Numbers, t: Array) -> tuple[float, float]:
-    slope, begin = np.polyfit(index, t, 1).tolist()
-    return slope, begin
-
-
-def _even(t: Array, period: float) -> tuple[Numbers, float] | None:
-    """Number of each row and the period, where stamps are even but for rounding; else None."""
-    coarse = _resolution(t)
-    steps = np.diff(t) / period
+def _numbering(t: Array, steps: Array, period: float) -> Numbering:
+    """The numbers of rows t (M,) that lie closest to a line. steps (M - 1,): in periods."""
+    coarse = _resolution(t) / period
     whole = np.round(steps)
-    if coarse > 0.2 * period:
+    if coarse > 0.2:
         # Stamps of a coarse clock may be equal; whoever reads it goes on row by row.
-        whole = np.where(steps <= coarse / period + 0.6, 1.0, np.maximum(whole, 1.0))
-    index = np.append(0, np.cumsum(whole)).astype(np.int64)
-    if index[-1] < 1 or (np.diff(index) < 1).any():
-        return None
-    slope, begin = _line(index, t)
-    off = float(np.abs(t - begin - slope * index).max())
-    if off > max(EVEN * period, COARSE * coarse):
-        return None
+        whole = np.where(steps <= coarse + 0.6, 1.0, np.maximum(whole, 1.0))
+    best = _line(_risen(np.append(0.0, np.cumsum(whole))), t)
+    # The median of uneven steps is off by more than a long record bears.
+    mean = period * float(np.mean(steps[steps < 0.5 * BREAK]))
+    for guess in (period, mean) if mean > 0.0 else (period,):
+        for index in (numbered(t / guess), _risen(np.round(t / guess))):
+            one = _line(index, t)
+            # Around the line that all of them tell, as far as they are late by less than a period.
+            for other in (one, _line(_risen(np.round((t - one.begin) / one.period)), t)):
+                if np.std(other.off) / other.period < 0.999 * np.std(best.off) / best.period:
+                    best = other
     # With no more digits than the stamps bear.
-    return index, rounded(slope, 2.0 * max(off, 1e-12 * period) / float(index[-1]))
+    deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
+    return best._replace(period=rounded(best.period, deviation))
 
 
-def _along(t: Array, period: float, keep: bool) -> tuple[float, float]:
-    """Period and begin of the grid that the instants stay closest to. keep: the period as it is."""
-    steps = np.round(np.diff(t) / period)
-    if keep or (steps < 1.0).any():
-        return period, 0.0
-    index = np.append(0, np.cumsum(steps)).astype(np.int64)
-    slope, begin = _line(index, t)
-    off = np.abs(t - begin - slope * index)
-    if float(off.max()) > 0.5 * slope:
-        return period, 0.0
-    return rounded(slope, 2.0 * float(np.std(off)) / float(index[-1])), begin
+def _line(index: Numbers, t: Array) -> Numbering:
+    period, begin = np.polyfit(index, t, 1).tolist()
+    return Numbering(index, period, begin, t - begin - period * index)
 
 
 def _resolution(t: Array) -> float:
-    """Value of the last decimal digit of the stamps t (N,)."""
-    for digits in range(0, 8):
-        scaled = t * 10.0**digits
-        if np.abs(scaled - np.round(scaled)).max() < 1e-3:
-            return float(10.0**-digits)
-    return 0.0
+    """Value of the last decimal digit of the stamps t (N,), 0 from the eighth on."""
+    digits = (10.0**-k for k in range(8))
+    return next((d for d in digits if np.abs(t / d - np.round(t / d)).max() < 1e-3), 0.0)
 
 
 def rounded(period: float, deviation: float) -> float:
     """The period with the fewest digits that is within its deviation."""
-    for digits in range(1, 9):
-        text = f'{period:.{digits}g}'
-        if abs(float(text) - period) <= deviation:
-            return float(text)
-    return period
+    texts = (float(f'{period:.{digits}g}') for digits in range(1, 9))
+    return next((value for value in texts if abs(value - period) <= deviation), period)
 
 
 def numbered(times: Array) -> Numbers:
@@ -202,7 +165,7 @@ def numbered(times: Array) -> Numbers:
     and of those that come in a heap the last one is the newest.
     """
     begin, number = float(times[0]), 0
-    passed = np.zeros(len(times), dtype=np.int64)
+    passed = np.zeros(len(times))
     for i, time in enumerate(times.tolist()):
         newest = max(int(time - begin + 1.0 - JITTER), number)
         begin = min(begin + CLOCK_SLACK * (newest - number), time - newest)
@@ -210,111 +173,73 @@ def numbered(times: Array) -> Numbers:
     return _risen(passed)
 
 
-def _risen(numbers: NDArray[Any]) -> Numbers:
+def _risen(numbers: Array) -> Numbers:
     """The numbers strictly rising from 0, the last of a heap keeping its place."""
     place = np.arange(len(numbers))
     risen = np.minimum.accumulate((numbers - place)[::-1])[::-1] + place
     return np.asarray(risen - risen[0], dtype=np.int64)
 
 
-def _numbers(t: Array, period: float, keep: bool) -> tuple[Numbers, float]:
-    """Number of each row, its stamp being late, and the period. keep: the period as it is."""
-    if keep:
-        return numbered(t / period), period
-    steps = np.diff(t)
-    best: tuple[float, Numbers, float] | None = None
-    # The median of uneven steps is off by more than a long record bears.
-    for guess in (period, float(np.mean(steps[steps < 0.5 * BREAK * period]))):
-        for index in (numbered(t / guess), _risen(np.round((t - t[0]) / guess))):
-            slope, begin = _line(index, t)
-            # Around the line that all of them tell, as far as they are late by less than a period.
-            index = _risen(np.round((t - begin) / slope))
-            slope, begin = _line(index, t)
-            left = float(np.std(t - begin - slope * index)) / slope
-            if best is None or left < best[0]:
-                best = left, index, rounded(slope, slope * left / float(index[-1]))
-    assert best is not None
-    return best[1:]
-
-
-def _are_late(rows: Rows, index: Numbers, period: float) -> bool:
+def _are_late(rows: Rows, found: Numbering) -> bool:
     """Whether the samples were even and only their stamps are late."""
-    if index[-1] + 1 > (1.0 + MOST_LOST) * len(index):
+    if found.numbers[-1] + 1 > (1.0 + MOST_LOST) * len(rows.t) or \
+            np.std(found.off) > found.period:
         return False
-    slope, begin = _line(index, rows.t)
-    if float(np.std(rows.t - begin - slope * index)) > LATE * period:
-        return False
-    even = index.astype(float)
+    even = found.numbers.astype(float)
     y = np.where(rows.own, rows.y, np.nan)
     return rougher(rows.t, even, y) + rougher(rows.t, even, rows.v) > DECIDED
 
 
-def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Grid:
+def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:
     """Each row at its number; v holds over those that are missing."""
     count = int(index[-1]) + 1
     held = np.searchsorted(index, np.arange(count), side='right') - 1
     y = np.full(count, np.nan)
     y[index[rows.own]] = rows.y[rows.own]
-    missing = count - len(index)
-    return Grid(
-        rows.v[held], y, period, said + (f', {missing} missing' if missing else ''),
-        None if rows.commands is None else rows.commands[held],
-    )
+    missing = f', {count - len(index)} missing' if count > len(index) else ''
+    commands = None if rows.commands is None else rows.commands[held]
+    return Record(rows.v[held], y, period, timing=said + missing, commands=commands)
 
 
-def _true_instants(rows: Rows, period: float, said: str) -> Grid:
+def _true_instants(rows: Rows, period: float, said: str) -> Record:
     """v averaged over each period, y where it was read."""
     t, y = rows.t[rows.own], rows.y[rows.own]
-    keep = np.append(np.diff(t) > 0.0, True)
     equal = int(np.count_nonzero(np.diff(rows.t) == 0.0))
-    t, y = t[keep], y[keep]
-    if equal:
-        said += f'; {equal} rows with equal stamps'
+    said += f'; {equal} rows with equal stamps' if equal else ''
+    kept = np.append(np.diff(t) > 0.0, True)
+    t, y = t[kept], y[kept]
     noise = noise_of(t, y)
     bend = curvature_of(t, y, noise)
     swing = float(np.ptp(np.percentile(y, [5.0, 95.0])))
-    noise = max(noise, ROUNDING * quantum(y), 0.01 * LEAST * swing)
-    hidden = max(HIDDEN * noise, LEAST * swing)
-    for parts in FINER:
+    noise = max(noise, 12.0**-0.5 * quantum(y), 0.01 * LEAST * swing)
+    for parts in (1, 2, 4):
         step = period / parts
-        index = np.round(t / step).astype(np.int64)
-        shared = float(np.mean(np.diff(index) == 0)) if len(index) > 1 else 0.0
+        index, values = np.round(t / step).astype(np.int64), y
         off = index * step - t
-        if shared <= MOST_SHARED and _moved_by(t, y, off) <= HIDDEN * noise:
-            values = y
+        shared = np.mean(np.diff(index) == 0) > MOST_SHARED if len(index) > 1 else False
+        # A standard deviation, but for steps: nine tenths of normal values stay within 1.64.
+        moved = np.percentile(np.abs(np.gradient(y, t) * off), 90.0) / 1.64 if len(t) > 1 else 0.0
+        if not shared and moved <= HIDDEN * noise:
             break
         # Along the line to the next reading on that side.
         values = np.interp(index * step, t, y)
-        spacing = np.maximum(np.gradient(t) if len(t) > 1 else step, step)
-        share = np.clip(np.abs(off) / spacing, 0.0, 0.5)
+        share = np.clip(np.abs(off) / np.maximum(np.gradient(t), step), 0.0, 0.5)
         error = bend * float(np.sqrt(np.mean((4.0 * share * (1.0 - share))**2)))
-        if error <= hidden and (shared <= MOST_SHARED or parts > 1):
+        if error <= max(HIDDEN * noise, LEAST * swing):
+            if shared and parts == 1:
+                # Every instant of the grid between two readings that are near enough.
+                index = np.arange(int(t[0] / step + 1.0 - 1e-9), int(t[-1] / step + 1e-9) + 1)
+                after = np.clip(np.searchsorted(t, index * step), 1, len(t) - 1)
+                index = index[t[after] - t[after - 1] <= 2.0 * step]
+                values = np.interp(index * step, t, y)
             break
-        if error <= hidden:
-            index, values = _bracketed(t, y, step)
-            break
-    if parts > 1:
-        said += f', on a grid of {seconds(step)}'
+    said += f', on a grid of {seconds(step)}' if parts > 1 else ''
     count = int(max(rows.t[-1] / step + 0.5, index[-1])) + 1
     full = np.full(count, np.nan)
     full[index] = values
     commands = None if rows.commands is None else averaged(rows.t, rows.commands, step, count)
-    return Grid(averaged(rows.t, rows.v, step, count), full, step, said, commands)
-
-
-def _moved_by(t: Array, y: Array, off: Array) -> float:
-    """How much y moves from its instants to others, a standard deviation but for steps."""
-    if len(t) < 2:
-        return 0.0
-    return NINE_TENTHS_TO_STD * float(np.percentile(np.abs(np.gradient(y, t) * off), 90.0))
-
-
-def _bracketed(t: Array, y: Array, step: float) -> tuple[Numbers, Array]:
-    """Every instant of the grid between two readings that are near enough, on their line."""
-    index = np.arange(int(t[0] / step + 1.0 - 1e-9), int(t[-1] / step + 1e-9) + 1)
-    after = np.clip(np.searchsorted(t, index * step), 1, len(t) - 1)
-    near = t[after] - t[after - 1] <= 2.0 * step
-    return index[near], np.interp(index[near] * step, t, y)
+    v = averaged(rows.t, rows.v, step, count)
+    return Record(v, full, step, timing=said, commands=commands)
 
 
 def averaged(t: Array, v: Array, step: float, count: int) -> Array:

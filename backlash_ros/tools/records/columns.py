@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from backlash_ros.tools.cli import InputError
 
-OPTION = '--columns'
 ROLES = ('t', 'v', 'y')
 COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
 
@@ -33,10 +32,11 @@ PATTERNS: Mapping[str, Sequence[str]] = {
 OTHERS = r'.*\b(speed|velocity|vel|load|current|torque|effort|temp(erature)?|voltage|status|' \
          r'moving|err(or)?|acceleration|acc|power|rate|direction|duration)\b.*'
 UNITS_S = {
-    'ns': 1e-9, 'nsec': 1e-9, 'nanoseconds': 1e-9, 'us': 1e-6, 'µs': 1e-6, 'μs': 1e-6, 'usec': 1e-6,
-    'microseconds': 1e-6, 'micros': 1e-6, 'ms': 1e-3, 'msec': 1e-3, 'milliseconds': 1e-3,
-    'millis': 1e-3, 's': 1.0, 'sec': 1.0, 'secs': 1.0, 'seconds': 1.0, 'min': 60.0,
-    'minutes': 60.0, 'h': 3600.0, 'hours': 3600.0,
+    unit: scale for scale, units in {
+        1e-9: 'ns nsec nanoseconds', 1e-6: 'us µs μs usec microseconds micros',
+        1e-3: 'ms msec milliseconds millis', 1.0: 's sec secs seconds', 60.0: 'min minutes',
+        3600.0: 'h hours',
+    }.items() for unit in units.split()
 }
 
 
@@ -61,31 +61,29 @@ def parse_columns(text: str) -> dict[str, str]:
     return given
 
 
-def choose_columns(
-    names: Sequence[str], given: Mapping[str, str], source: object,
-) -> Columns:
+def choose_columns(names: Sequence[str], given: Mapping[str, str], source: object) -> Columns:
     """The columns of a table with these names; given: by role, as the user says.
 
     Raises InputError that names the columns where one is missing or several may be meant.
     """
     for role, name in given.items():
         if name not in names:
-            raise InputError(f'{source}: {OPTION} {role}={name}: {columns_of(names)}')
+            raise InputError(f'{source}: --columns {role}={name}: {columns_of(names)}')
     found = dict(given)
-    for role in ROLES:
-        if role in found:
-            continue
-        fitting = _of(role, names, found)
+    for role, meant in (('t', 'the time'), ('v', 'the command'), ('y', 'the output')):
+        fitting = [found[role]] if role in found else _fitting(role, names, found)
         if len(fitting) == 1:
             found[role] = fitting[0]
         elif role != 't' or fitting:
-            raise InputError(_asked(source, role, fitting, names))
-    if COMMAND not in found and COMMAND in names and found['v'] == 'v':
-        found[COMMAND] = COMMAND
-    guessed = [role for role in ROLES if role not in given and found.get(role, role) != role]
-    said = ', '.join(f'{role} is {found[role]!r}' for role in guessed)
+            why = 'several columns may be' if fitting else 'no column is'
+            raise InputError(f'{source}: {why} {role}, {meant}: {columns_of(names)}; name them: '
+                             '--columns "t=…,v=…,y=…"')
+    if COMMAND in names and found['v'] == 'v':
+        found.setdefault(COMMAND, COMMAND)
+    said = ', '.join(f'{role} is {found[role]!r}' for role in ROLES
+                     if role not in given and found.get(role, role) != role)
     return Columns(found.get('t', ''), found['v'], found['y'], found.get(COMMAND, ''),
-                   f'columns: {said}; {OPTION} chooses others' if said else '')
+                   f'columns: {said}; --columns chooses others' if said else '')
 
 
 def columns_of(names: Sequence[str]) -> str:
@@ -101,17 +99,14 @@ def unit_of(name: str) -> float | None:
     return UNITS_S.get(word.lower())
 
 
-def _of(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[str]:
+def _fitting(role: str, names: Sequence[str], taken: Mapping[str, str]) -> list[str]:
     """Columns that may be this, of the surest pattern that fits any."""
-    free = [name for name in names if name not in taken.values()]
-    for pattern in PATTERNS[role]:
-        fitting = [
-            name for name in free if re.fullmatch(pattern, _words(name))
-            and (role == 't' or not re.fullmatch(OTHERS, _words(name)))
-        ]
-        if fitting:
-            return fitting
-    return []
+    words = {name: _words(name) for name in names if name not in taken.values()}
+    free = {name: text for name, text in words.items()
+            if role == 't' or not re.fullmatch(OTHERS, text)}
+    found = ([name for name, text in free.items() if re.fullmatch(pattern, text)]
+             for pattern in PATTERNS[role])
+    return next(filter(None, found), [])
 
 
 def _words(name: str) -> str:
@@ -119,11 +114,3 @@ def _words(name: str) -> str:
     name = re.sub(r'[\[(].*?[\])]', ' ', name)
     name = re.sub(r'(?<=[a-z])(?=[A-Z])', ' ', name)
     return ' '.join(re.findall(r'[^\W_]+', name.lower()))
-
-
-def _asked(source: object, role: str, fitting: Sequence[str], names: Sequence[str]) -> str:
-    what = {'t': 'the time', 'v': 'the command', 'y': 'the output'}[role]
-    why = f'several columns may be {role}, {what}' if fitting else f'no column is {role}, {what}'
-    return (
-        f'{source}: {why}: {columns_of(names)}; name them: {OPTION} "t=…,v=…,y=…"'
-    )

@@ -1,17 +1,21 @@
-"""A record from whatever a user has: a table, a folder of results, a bag."""
+"""A record from whatever a user has: a table, a folder of results, a bag; or the same as a run."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import record_of, record_of_samples
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
+from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.records.columns import choose_columns, unit_of
 from backlash_ros.tools.records.table import Table, read_table
-from backlash_ros.tools.runs.files import RECORD_FILE, SAMPLES_FILE
+from backlash_ros.tools.runs.files import RECORD_FILE, SAMPLE_COLUMNS, SAMPLES_FILE, Run
 
 NO_TABLES = ('.npz', '.mcap', '.db3', '.zstd', '.zst')  # files of results and bags
 NO_COLUMNS: Mapping[str, str] = {}
@@ -36,40 +40,113 @@ def read_record(
     return replace(record, source=str(path))
 
 
-def is_table(path: Path) -> bool:
-    """Whether a path is one of a table."""
-    return path.is_file() and path.suffix.lower() not in NO_TABLES
-
-
 def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str]) -> Record:
-    if is_table(path):
+    if _is_table(path):
         return _from_table(read_table(path), period, columns)
     # What reads bags takes half a second to load.
     from backlash_ros.tools.records.messages import read_bag_record
     from backlash_ros.tools.runs.read_run import find_bag, read_run
     bag = find_bag(path)
-    if bag is not None:
-        return read_bag_record(bag, period, axis, columns)
-    if path.is_dir() and not any((path / name).is_file() for name in (RECORD_FILE, SAMPLES_FILE)):
+    record = None if bag is None else read_bag_record(bag, period, axis, columns)
+    if record is not None:
+        return record
+    if bag is None and path.is_dir() and not any(
+            (path / name).is_file() for name in (RECORD_FILE, SAMPLES_FILE)):
         raise InputError(
             f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}: give one of them, or a '
             'table with t, v and y'
         )
-    run = read_run(path).record
+    source = read_run(path, axis=axis)
+    run = source.record
     if not run.samples:
         raise InputError(f'{path}: holds no sample')
-    return record_of_samples(
+    record = record_of_samples(
         run.column('t'), run.column('v'), run.column('y'), period or run.sample_period
     )
+    return replace(record, notes=source.notes)
 
 
 def _from_table(table: Table, period: float | None, given: Mapping[str, str]) -> Record:
     chosen = choose_columns(table.names, given, table.path)
     record = record_of(
-        table.times(chosen.t) if chosen.t else None,
+        table.numbers(chosen.t, times=True) if chosen.t else None,
         table.numbers(chosen.v), table.numbers(chosen.y), period,
         unit_of(chosen.t) if chosen.t else None,
         table.numbers(chosen.command) if chosen.command else None,
     )
     said = [chosen.said] if chosen.said else []
     return replace(record, notes=(*said, *table.notes, *record.notes))
+
+
+def _is_table(path: Path) -> bool:
+    return path.is_file() and path.suffix.lower() not in NO_TABLES
+
+
+def read_run_or_log(
+    path: Path, config: Path | None = None, span: Span = WHOLE_SPAN, axis: str = '',
+    columns: Mapping[str, str] = NO_COLUMNS,
+) -> tuple[Run, Sequence[Sequence[float]] | None]:
+    """A run of this package; or a log, as `read_record` takes it, as a run without estimates.
+
+    And for a log the v of every interval before each row, None for a run. config: parameters, by
+    default those beside a run. Raises InputError.
+    """
+    from backlash_ros.tools.runs.read_run import find_bag, read_run
+    no_run: InputError | None = None
+    if not _is_table(path) or _is_samples(path):
+        try:
+            return read_run(path, config, span, axis), None
+        except InputError as error:
+            if find_bag(path) is None:
+                raise
+            no_run = error
+    parameters = None if config is None else effective_parameters(config, axis=axis)
+    period = None if parameters is None else parameters.sample_period
+    try:
+        record = _of_period(path, period, span, axis, columns)
+    except InputError as error:
+        raise no_run or error from None
+    run, applied = _as_run(record)
+    return Run(run, parameters, None, (record.timing, *record.notes)), applied
+
+
+def _is_samples(path: Path) -> bool:
+    with path.open('rb') as file:
+        return file.readline().decode(errors='replace').startswith(','.join(SAMPLE_COLUMNS[:10]))
+
+
+def _of_period(
+    path: Path, period: float | None, span: Span, axis: str, columns: Mapping[str, str],
+) -> Record:
+    """The record as `identify` takes it, or else with the period [s] of the parameters."""
+    refused: InputError | None = None
+    for told in (None,) if period is None else (None, period):
+        try:
+            record = read_record(path, told, span, axis, columns)
+        except InputError as error:
+            refused = refused or error
+            continue
+        if period is None or abs(record.sample_period / period - 1.0) < 0.01:
+            return record
+    raise refused or InputError(
+        f'{path}: has a sample every {record.sample_period:.6g} s, sample_period={period:.6g} in '
+        '--config: `identify` writes a file for this log'
+    )
+
+
+def _as_run(record: Record) -> tuple[RunRecord, list[list[float]]]:
+    """The run, a row for each reading of y, and the v of every interval before each row.
+
+    y_m is y: a log names no reference, and what is learned does not depend on it.
+    """
+    known = np.flatnonzero(np.isfinite(record.y))
+    rows = np.full((len(known), len(COLUMNS)), np.nan)
+    y = record.y[known]
+    for name, values in (
+        ('t', record.sample_period * (known - known[0])), ('y_m', y), ('y', y),
+        ('v', record.v[known]),
+    ):
+        rows[:, COLUMNS.index(name)] = values
+    lost = int(known[-1] - known[0] + 1 - len(known))
+    applied = [[], *(part.tolist() for part in np.split(record.v, known)[1:-1])]
+    return RunRecord(rows, record.sample_period, lost), applied

@@ -17,8 +17,7 @@ from backlash_ros.tools.figures import (
     legend_above,
     new_figure,
 )
-
-OWN = '#777777'
+from backlash_ros.topics import BACKLASH
 
 
 def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:
@@ -26,23 +25,23 @@ def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:
     figure = new_figure(10.0)
     rooms = figure.subplots(5, 1, sharex=True, height_ratios=[1.0, 1.0, 1.0, 1.0, 0.5])
     t = replayed.column('t')
-    for axes, name in zip(rooms, ('m', 'c_r', 'c_l'), strict=False):
+    own_colour = HUES['y_m']
+    for axes, name in zip(rooms, BACKLASH, strict=False):
         own, again = recorded.column(name), replayed.column(name)
-        curve(axes, t, own, OWN, 'run', width=2.6)
-        curve(axes, t, again, HUES[name], 'replay')
         std = replayed.column(f'std_{name}')
+        if np.isfinite(own).any():
+            curve(axes, t, own, own_colour, 'run', width=2.6)
+        curve(axes, t, again, HUES[name], 'replay')
         band(axes, t, again - std, again + std, HUES[name])
-        both = np.concatenate([own, again])
-        low, high = np.nanpercentile(both, [1.0, 99.0])
+        low, high = np.nanpercentile(np.concatenate([own, again]), [1.0, 99.0])
         room = 0.2 * (high - low) or 0.1 * max(abs(high), 1e-9)
         axes.set_ylim(low - room, high + room)
         label(axes, '', f'${HATS[name]}$ [{BACKLASH_UNITS[name]}]')
     legend_above(rooms[0])
-    curve(rooms[3], t, recorded.column('innovation'), OWN, width=1.6)
-    curve(rooms[3], t, replayed.column('innovation'), HUES['e'])
-    label(rooms[3], '', 'innovation [y]')
-    for run, colour, width in ((recorded, OWN, 2.6), (replayed, HUES['e'], 1.3)):
+    for run, colour, width in ((recorded, own_colour, 2.6), (replayed, HUES['e'], 1.3)):
+        curve(rooms[3], t, run.column('innovation'), colour, width=width)
         rooms[4].step(t, run.column('status'), where='post', color=colour, linewidth=width)
+    label(rooms[3], '', 'innovation [y]')
     rooms[4].set_yticks([int(state) for state in Status], [state.word for state in Status])
     label(rooms[4], '', '', 'time t [s]')
     return figure

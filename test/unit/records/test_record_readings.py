@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backlash_ros.core.records.readings import failed, held, quantum, unwrapped
+from backlash_ros.core.records.readings import failed, own_readings, quantum, unwrapped
 from backlash_ros.core.records.record import Record
 from backlash_ros.core.records.rows_to_record import record_of
 
@@ -22,10 +22,9 @@ def repeated(times: int) -> Array:
 
 @pytest.mark.parametrize('times', [2, 3, 5, 12])
 def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
-    found = held(T, repeated(times))
-    assert found is not None
-    assert found.own.tolist() == (np.arange(len(T)) % times == 0).tolist()
-    assert found.period == pytest.approx(times * 0.005)
+    own, period = own_readings(T, repeated(times))
+    assert own.tolist() == (np.arange(len(T)) % times == 0).tolist()
+    assert period == pytest.approx(times * 0.005)
 
 
 @pytest.mark.parametrize('y', [
@@ -33,7 +32,9 @@ def test_rows_that_repeat_a_slower_sensor_are_no_readings(times: int) -> None:
     np.where(np.arange(len(T)) % 2 == 0, MOTION, np.nan),
 ], ids=['noise', 'coarse', 'square', 'stepped', 'rest', 'short', 'every second'])
 def test_what_only_looks_repeated_is_kept(y: Array) -> None:
-    assert held(T[:len(y)], y) is None
+    own, period = own_readings(T[:len(y)], y)
+    assert own.tolist() == np.isfinite(y).tolist()
+    assert period == 0.0
 
 
 @pytest.mark.parametrize('value', [0.0, -1.0, 65535.0])

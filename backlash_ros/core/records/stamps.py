@@ -1,0 +1,118 @@
+"""Stamps of a log in seconds, and its rows in the order of time, without stamps that are none."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.records.record import RecordError, seconds
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+CURE = 'choose another column for t with --columns, or leave t out and give --period S'
+WINDOW = 11  # rows: up to five stamps in a row may be wrong
+BAD_STAMP = 50.0  # periods that a stamp is away from its neighbours
+EPOCH = ((1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms'))  # stamps of this century
+UNITS_S = (1e-3, 1e-6, 1e-9, 60.0)  # that stamps may count, beside seconds
+
+
+def in_seconds(
+    t: Array | None, count: int, period: float | None, unit_s: float | None, said: list[str],
+) -> Array:
+    """Stamps [s] of `count` rows; rows are counted where there are none, or none that move.
+
+    unit_s: of the stamps, None where the log does not say it: then years since 1970 tell it, or the
+    period. What was guessed is added to said. Raises RecordError where the period is needed.
+    """
+    known = np.empty(0) if t is None else t[np.isfinite(t)]
+    if t is None or np.unique(known).size < 2:
+        what = 'there is no column for t' if t is None else 't does not move'
+        if period is None:
+            raise RecordError(f'{what}: give --period S, the time from row to row')
+        said.append(f'{what}: rows are counted')
+        return np.asarray(period * np.arange(count, dtype=float))
+    if unit_s is not None:
+        return np.asarray(t * unit_s)
+    for least, scale, unit in EPOCH:
+        if np.median(np.abs(known)) > least:
+            said.append(f't counts {unit} since 1970')
+            # Exact differences of numbers that hardly fit.
+            return np.asarray((t - known[0]) * scale)
+    step = typical_step(known if known[-1] > known[0] else known[::-1])
+    whole = bool((known == np.round(known)).all())
+    if period is None:
+        if whole and step >= 1.0:
+            said.append(
+                't, in whole numbers, is taken as seconds; if it counts something else: --period'
+            )
+        return t
+    for scale in UNITS_S:
+        if abs(step * scale / period - 1.0) < 0.3:
+            said.append(f't counts {seconds(scale)}')
+            return t * scale
+    if whole and step == 1.0:
+        said.append('t counts the samples')
+        return t * period
+    return t
+
+
+def typical_step(t: Array) -> float:
+    """Median of the steps of t (N,) that go forward; raises RecordError where there is none."""
+    steps = np.diff(t)
+    forward = steps[steps > 0.0]
+    if not len(forward):
+        raise RecordError('t does not rise: give --period S, the time from row to row')
+    return float(np.median(forward))
+
+
+def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
+    """Rows of the stamps t (N,) [s] that are kept, by time.
+
+    what: name of a row in said, to which is added what was done. Raises RecordError where the
+    stamps make no sense.
+    """
+    def count(number: int, of: str = what) -> str:
+        return f'{number} {of}{"" if number == 1 else "s"}'
+
+    rows = np.flatnonzero(np.isfinite(t))
+    if len(rows) < len(t):
+        said.append(f'{count(len(t) - len(rows))} without a time left out')
+    if len(rows) < 2:
+        raise RecordError(f'holds {count(len(rows))} with a time, which is no motion')
+    steps = np.diff(t[rows])
+    if np.count_nonzero(steps < 0.0) > np.count_nonzero(steps > 0.0):
+        rows = rows[::-1]
+        said.append(f'the newest {what} stood first: turned around')
+    bad = _far_off(t[rows])
+    if np.mean(bad) > 0.1:
+        raise RecordError(f't jumps to and fro in {bad.sum()} of {len(rows)} {what}s: {CURE}')
+    if bad.any():
+        said.append(f'{count(int(bad.sum()))} with a stamp far off left out')
+        rows = rows[~bad]
+    # A clock that began anew falls back by several periods; less is disorder.
+    parts = np.split(rows, np.flatnonzero(
+        np.diff(t[rows]) < -3.0 * typical_step(t[rows])) + 1)
+    if len(parts) > 1:
+        kept = max(parts, key=len)
+        if len(kept) < 0.2 * len(rows):
+            raise RecordError(f't falls back {len(parts) - 1} times: {CURE}')
+        said.append(
+            f't begins anew {count(len(parts) - 1, "time")}: the longest of {len(parts)} parts, '
+            f'{len(kept)} {what}s, is used'
+        )
+        rows = kept
+    moved = int(np.count_nonzero(np.diff(t[rows]) < 0.0))
+    if moved > 0.2 * len(rows):
+        raise RecordError(f't falls back in {moved} of {len(rows)} {what}s: {CURE}')
+    if moved:
+        rows = rows[np.argsort(t[rows], kind='stable')]
+        said.append(f'{count(moved)} out of order sorted by time')
+    return rows
+
+
+def _far_off(t: Array) -> NDArray[np.bool_]:
+    """Which stamps (N,) lie far from those of the rows around."""
+    size = min(WINDOW, len(t) - 1 + len(t) % 2)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(t, size // 2, 'reflect'), size)
+    return np.asarray(np.abs(t - np.median(around, axis=1)) > BAD_STAMP * typical_step(t))
