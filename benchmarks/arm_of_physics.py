@@ -36,8 +36,9 @@ from joint_trajectory import swing
 
 from backlash_ros.core.assembly import first_guess, known_before
 from backlash_ros.core.driver_check.gentle_drive import IdentificationDrive, drive_range
+from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.joint_loops import JointLoops
-from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.tools.config import load_config, read_parameter_file
 from backlash_ros.tools.figures import TIME_LABEL, curve, label
@@ -122,8 +123,8 @@ def move(p: Parameters, passes: int) -> Motion:
     reports: dict[str, deque[tuple[float, int]]] = {name: deque() for name in NAMES}
     before = known_before if p.estimates.load else first_guess
     loops = JointLoops(
-        p, v.update, lambda: now_ns, {name: before(p.of_joint(name)) for name in NAMES},
-        SampleCounter(period_s), dict(v), lambda name: emptied(reports[name]),
+        p, v.update, lambda name: Driver(lambda: now_ns, lambda: emptied(reports[name])),
+        {name: before(p.of_joint(name)) for name in NAMES}, SampleCounter(period_s), dict(v),
     )
     references, positions, gaps, poses = [], [], [], []
     for k in range(round(passes * PERIOD_S / period_s)):
@@ -132,8 +133,10 @@ def move(p: Parameters, passes: int) -> Motion:
         positions.append(arm.links)
         poses.append(arm.data.qpos.copy())
         loops.take_references(dict(zip(NAMES, references[-1], strict=True)))
-        y = dict(zip(NAMES, arm.encoders(), strict=True))
-        loops.answer(JointOutputs(y, now_ns, now_ns, now_ns, k, numbered=False))
+        loops.answer({
+            name: Output(y, now_ns, now_ns, now_ns, k, numbered=False)
+            for name, y in zip(NAMES, arm.encoders(), strict=True)
+        })
         estimates = [loop.estimate for loop in loops.by_name.values()]
         gaps.append([one.c_r - one.c_l for one in estimates])
         for loop in loops.by_name.values():

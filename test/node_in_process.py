@@ -26,7 +26,7 @@ from waiting import wait_until
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.jobs.executor import InlineExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.sample_counter import JointOutputs, Output
+from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
@@ -78,8 +78,7 @@ def hand_over(node: ControllerNode, y_m: float | None, output: Output | None) ->
     if y_m is not None:
         untyped._on_reference({'': y_m})
     if output is not None:
-        y, *rest = output
-        untyped._on_output(JointOutputs({'': y}, *rest))
+        untyped._on_output({'': output})
 
 
 def look_for_silence(node: ControllerNode) -> None:

@@ -30,7 +30,6 @@ from backlash_ros.core.driver_check.gentle_drive import Drive, GentleDrive, Rang
 from backlash_ros.core.driver_check.motion import record_of
 from backlash_ros.core.driver_check.verdict import all_fit, judge, table
 from backlash_ros.core.parameters.table import CONTROLLER
-from backlash_ros.nodes.control.last_commands import CONFIRMED_WITHIN_S
 from backlash_ros.nodes.control.rivals import Presence, identity_made_by
 from backlash_ros.nodes.driver_check.driver_graph import DriverGraph
 from backlash_ros.nodes.driver_check.options import EXECUTABLE, parameter_files, parse_options
@@ -43,7 +42,7 @@ from backlash_ros.shipped import find_config
 LOOK_S = 0.1  # between two looks at the graph
 SETTLE_S = 1.0  # after which everybody should have found everybody
 LAST_SENT = 10  # times that the last v is sent at most, until it is confirmed
-CONFIRMED_WITHIN = Duration(nanoseconds=int(CONFIRMED_WITHIN_S * 1e9))
+CONFIRMED_WITHIN = Duration(nanoseconds=100_000_000)
 REMIND_S = 3.0  # between two lines that say what is missing
 UNSEEN = 'a controller of this machine'  # that discovery has not found yet
 

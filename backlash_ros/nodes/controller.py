@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Mapping
 from concurrent.futures import Future
 from itertools import cycle
-from math import isfinite, nan
-from typing import NamedTuple
 
+from rclpy.duration import Duration
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock
 
 from backlash_ros import topics
@@ -28,7 +28,8 @@ from backlash_ros.core.jobs.worker import WorkerExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import (
-    JointOutputs,
+    UNNUMBERED,
+    Output,
     SampleCounter,
     kept_outputs,
 )
@@ -36,7 +37,6 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import CONTROLLER, JOINTS
 from backlash_ros.nodes.control.joint import Joint
-from backlash_ros.nodes.control.last_commands import LastCommandSender
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.control.services import offer_services
@@ -50,40 +50,6 @@ from backlash_ros.nodes.runtime.process import emit, run
 # driver, woken by the command, would have to wait for it otherwise.
 POST_COMMAND_SLEEP = 0.05
 PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
-
-
-class LockstepQueues(NamedTuple):
-    """Ticks of /clock [ns], references and outputs that wait for each other."""
-
-    ticks: deque[int]
-    references: deque[float]
-    outputs: deque[JointOutputs]
-
-
-class SpareTime:
-    """What the controller does between a command and the next output.
-
-    Where the next output is waiting already, there is no time for what may be put off.
-    """
-
-    def __init__(self, sample_period_s: float) -> None:
-        self._period_ns, self._sleep_s = sample_period_s * 1e9, POST_COMMAND_SLEEP * sample_period_s
-        self._budget_s = REFINE_SHARE * sample_period_s
-        self._behind = 0  # outputs in a row that were answered after the next one had come
-        self._turn = 0  # of the joint that fits next
-
-    def let_the_driver_go_on(self, received_ns: int) -> None:
-        """Sleep a little. received_ns: when the output came that was answered."""
-        behind = 0 < received_ns < time.time_ns() - self._period_ns
-        self._behind = self._behind + 1 if behind else 0
-        if not behind:
-            time.sleep(self._sleep_s)
-
-    def refine(self, loops: Sequence[ControlLoop]) -> None:
-        """Let the next loop take up and submit fits."""
-        if self._behind % PUT_OFF == 0:
-            self._turn = (self._turn + 1) % len(loops)
-            loops[self._turn].core.refine(self._budget_s)
 
 
 class ControllerNode(ManagedNode):
@@ -118,10 +84,14 @@ class ControllerNode(ManagedNode):
         self._counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
-        self._spare_time = SpareTime(p.sample_period)
-        self._pairs = LockstepQueues(deque(), deque(), deque())
+        self._behind = 0  # outputs in a row that were answered after the next one had come
+        self._turn = 0  # of the joint that fits next
+        # In lockstep: ticks of /clock [ns], references and outputs that wait for each other.
+        self._ticks: deque[int] = deque()
+        self._references: deque[float] = deque()
+        self._outputs: deque[Output] = deque()
         self._driver: Subscription | None = None  # plant_output, once it may begin
-        self._last_commands = LastCommandSender(self, self._io)
+        self._ending: Timer | None = None  # sends the commands of on_timeout
         self.joints: list[Joint] = []
         self._rivals = RivalWatch(
             self, self._io.topics.control, self._io.advertise, self._mind_rivals
@@ -140,7 +110,7 @@ class ControllerNode(ManagedNode):
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         offer_services(
             self, lambda: self.configured, self.save_estimates,
-            lambda: ', '.join(joint.saver.file for joint in self.joints),
+            lambda: ', '.join(joint.p.estimates.file for joint in self.joints),
         )
         let_parameters_change(
             self, self._check_change, self._take_up, lambda: self.loops is None
@@ -181,18 +151,20 @@ class ControllerNode(ManagedNode):
     @property
     def configured(self) -> list[ControlLoop]:
         """The loops, none while there are none."""
-        return [] if self.loops is None else list(self.loops.by_name.values())
+        return [] if self.loops is None else list(self.loops.loops)
 
     def save_estimates(self) -> list[Future[str]]:
         """Begin to save what is worth it; each result says why it failed, empty if it did not."""
         return [saved for joint in self.joints if (saved := joint.save()) is not None]
 
+    # --- the life cycle --------------------------------------------------------------------------
+
     def configure(self) -> None:
         before = {joint.name: known_before(joint.p) for joint in self.joints}
+        drivers = {joint.name: joint.driver for joint in self.joints}
         self.loops = JointLoops(
-            self.settings, self._io.publish, self._io.now_ns, before, self._counter,
-            {joint.name: joint.first_command.v_at_start(joint.p) for joint in self.joints},
-            self._io.reports_of, self._executor,
+            self.settings, self._io.publish, drivers.__getitem__, before, self._counter,
+            {joint.name: joint.v for joint in self.joints}, self._executor,
         )
         for joint in self.joints:
             joint.begin(self.loops.by_name[joint.name], before[joint.name])
@@ -205,8 +177,7 @@ class ControllerNode(ManagedNode):
             for loop in self.configured:
                 loop.renew(loop.estimate)
                 loop.heard_at = None
-            return
-        if self.settings.lockstep:  # simulated time hurts nobody
+        elif self.settings.lockstep:  # simulated time hurts nobody
             self._await_loop()
         else:
             self.call_when(
@@ -220,59 +191,22 @@ class ControllerNode(ManagedNode):
         return self._rivals.complete or self.settings.on_rival == 'warn'
 
     def _await_loop(self) -> None:
-        """Listen to plant_output as soon as everybody is there."""
-        needed = self._conditions_of_start()
-        self.call_when(
-            lambda: all(condition() for condition in needed), self._listen_to_driver,
-            f'{self._io.topics.reference} and the listeners of {self._io.topics.control}',
-        )
-
-    def deactivate(self) -> None:
-        """Send the last command as on_stop says, and save what was learned."""
-        loops, p = self.loops, self.settings
-        assert loops is not None
-        self._last_commands.end()
-        if any(loop.last is not None for loop in self.configured):
-            # Before a ramp: whoever stops this process may not wait for its end.
-            for joint in self.joints:
-                joint.save()
-            self._last_commands.send_all(
-                loops, p.on_stop, p.timeout.ramp, self._diagnose
-            )
-            for joint in self.joints:
-                joint.model.publish(loops.by_name[joint.name])
-        self._rivals.end()
-        self._diagnose()
-
-    def cleanup(self) -> None:
-        for joint in self.joints:
-            joint.end()
-        for loop in self.configured:
-            loop.close()
-        self.loops = None
-        self._diagnose()
-
-    def finish(self) -> None:
-        super().finish()
-        self._rivals.close()
-        for joint in self.joints:
-            joint.saver.close()
-            joint.sum_up()
-        self._executor.close()
-
-    def _conditions_of_start(self) -> list[Callable[[], bool]]:
-        """What has to be there before plant_output is listened to, for that starts the loop."""
-        lockstep = self.settings.lockstep
+        """Listen to plant_output, which starts the loop, as soon as everybody is there."""
+        lockstep, io = self.settings.lockstep, self._io
         wanted = max(self.settings.wait_for_subscribers, int(lockstep))
-        if not wanted:
-            return []
-        return [
-            lambda: self._io.listeners >= wanted,
+
+        def all_there() -> bool:
             # Beside the driver, those who listen want to hear everything.
-            lambda: self._steps.listeners >= wanted - 1,
-            (lambda: self.count_publishers(self._io.topics.reference) > 0) if lockstep
-            else (lambda: all(joint.reference_at is not None for joint in self.joints)),
-        ]
+            return not wanted or (
+                io.listeners >= wanted and self._steps.listeners >= wanted - 1
+                and (self.count_publishers(io.topics.reference) > 0 if lockstep
+                     else all(joint.reference_at is not None for joint in self.joints))
+            )
+
+        self.call_when(
+            all_there, self._listen_to_driver,
+            f'{io.topics.reference} and the listeners of {io.topics.control}',
+        )
 
     def _listen_to_driver(self) -> None:
         # Whoever is activated twice before everybody is there has two that wait.
@@ -281,6 +215,64 @@ class ControllerNode(ManagedNode):
             kept = kept_outputs(self.settings.sample_period)
             self._driver = self._io.listen(self._on_output, min(kept, DEPTH))
             emit('ready')
+
+    def deactivate(self) -> None:
+        """Send the last command as on_stop says, and save what was learned."""
+        loops = self.loops
+        assert loops is not None
+        if any(loop.statistics.used for loop in loops.loops):
+            # Before a ramp: whoever stops this process may not wait for its end.
+            self.save_estimates()
+            loops.end(self.settings.on_stop)
+            self._send_last(loops)
+            for joint in self.joints:
+                joint.model.publish(loops.by_name[joint.name])
+        self._rivals.end()
+        self._diagnose()
+
+    def _send_last(self, loops: JointLoops) -> None:
+        """Send the commands that end all loops; v comes to rest where it takes too long.
+
+        So it does at a SIGTERM that comes meanwhile: whoever sends it will kill the process next.
+        """
+        told, longest_s, step_s = time.monotonic(), self.settings.timeout.ramp, self._step_s
+        deadline, cut_short = told + longest_s, ''
+        while loops.send_next():
+            if not cut_short:
+                if self.urged.is_set():
+                    cut_short = 'SIGTERM came before it reached zero'
+                elif time.monotonic() + step_s > deadline:
+                    cut_short = f'it did not reach zero within timeout.ramp={longest_s:g} s'
+                if cut_short:
+                    for loop in loops.end('hold'):
+                        if loop.v != loop.core.limits.zero:
+                            self.log.warning(f'v={loop.v:.6g} is held: {cut_short}')
+                    continue
+            time.sleep(step_s) if cut_short else self.urged.wait(step_s)
+            if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
+                told = time.monotonic()
+                self._diagnose()  # so that who stands down does not take this node for gone
+        self._io.publisher.wait_for_all_acked(Duration(nanoseconds=100_000_000))
+
+    @property
+    def _step_s(self) -> float:
+        """Between two commands that end the loop."""
+        return max(self.settings.sample_period, 1e-3)
+
+    def cleanup(self) -> None:
+        for joint in self.joints:
+            joint.end()
+        self.loops = None
+        self._diagnose()
+
+    def finish(self) -> None:
+        super().finish()
+        self._rivals.close()
+        for joint in self.joints:
+            joint.close()
+        self._executor.close()
+
+    # --- at every sample -------------------------------------------------------------------------
 
     def _on_reference(self, y_m: Mapping[str, float]) -> None:
         if self.loops is None:
@@ -291,77 +283,64 @@ class ControllerNode(ManagedNode):
             if joint.name in taken:
                 joint.reference_at = now
         if self.settings.lockstep:
-            self._pairs.references.append(self.loops.by_name[''].y_m)
+            self._references.append(self.loops.by_name[''].y_m)
             self._pair()
 
     def _on_clock(self, message: Clock) -> None:
-        self._pairs.ticks.append(stamp_ns_of(message))
+        self._ticks.append(stamp_ns_of(message))
         self._pair()
 
-    def _on_output(self, outputs: JointOutputs) -> None:
+    def _on_output(self, outputs: Mapping[str, Output]) -> None:
         loops = self.loops
-        if loops is None:
-            self._io.forget_reports()
-            return
-        for loop in loops.by_name.values():
-            if loop.begins or not self.active:
-                loop.hear_reports()
-        if not self.active:
+        if loops is None or not self.active:
             return
         if self.settings.lockstep:
-            self._pairs.outputs.append(outputs)
+            self._outputs.append(outputs[''])
             self._pair()
-            return
-        waiting = self._waiting(loops, outputs)
-        if waiting >= outputs.y.keys():
-            return
-        silent = {joint for joint, loop in loops.by_name.items() if loop.silent}
-        steps = loops.answer(outputs, waiting)
-        if steps:
-            self._spare_time.let_the_driver_go_on(outputs.received_ns)
-        back = [loops.by_name[joint] for joint in silent if not loops.by_name[joint].silent]
-        if back:
-            self._last_commands.end(*back)
-        if steps:
-            self._spare_time.refine(self.configured)
-            self._follow_up(loops, steps, silent)
-
-    def _waiting(self, loops: JointLoops, outputs: JointOutputs) -> Set[str]:
-        """Joints of a message that are not answered yet: what to begin with is not known."""
-        if self.settings.io.together and any(
-            loop.silent and not isfinite(outputs.y.get(joint, nan))
-            for joint, loop in loops.by_name.items()
-        ):
-            return outputs.y.keys()
-        return {
-            joint.name for joint in self.joints
-            if (loop := loops.by_name[joint.name]).begins and not loop.standing_down
-            and joint.name in outputs.y
-            and not (self._knows_rivals() and joint.first_command.may_follow(
-                loop, outputs.of(joint.name), joint.p
-            ))
-        }
+        elif self._knows_rivals() or not any(loop.begins for loop in loops.loops):
+            steps = loops.answer(outputs)
+            if steps:
+                self._use_spare_time(loops, next(iter(outputs.values())).received_ns)
+                self._follow_up(loops, steps)
 
     def _pair(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
-        while self.loops is not None and self.active and all(self._pairs):
-            loop = self.loops.by_name['']
-            ticks, references, outputs = self._pairs
-            arrival = self.loops.counter.count(ticks.popleft())
-            step = loop.step(outputs.popleft().of(''), arrival, references.popleft())
-            self.loops.send()
-            if step is not None:
-                loop.core.refine()
-                self._follow_up(self.loops, {'': step}, silent=set())
+        loops = self.loops
+        while loops is not None and self.active \
+                and self._ticks and self._references and self._outputs:
+            # A tick is the sample: messages are not told apart by number then.
+            output = self._outputs.popleft()._replace(
+                stamp_ns=self._ticks.popleft(), sequence=UNNUMBERED
+            )
+            steps = loops.answer({'': output}, self._references.popleft())
+            if steps:
+                loops.by_name[''].core.refine()
+                self._follow_up(loops, steps)
 
-    def _follow_up(
-        self, loops: JointLoops, steps: Mapping[str, ControlStep], silent: Set[str],
-    ) -> None:
-        """Tell of the steps of a sample. silent: joints that were until then."""
+    def _use_spare_time(self, loops: JointLoops, received_ns: int) -> None:
+        """Let the driver go on, then the next loop take up and submit fits.
+
+        Where the next output is waiting already, there is no time for what may be put off.
+        received_ns: when the output came that was answered.
+        """
+        period = self.settings.sample_period
+        if 0 < received_ns < time.time_ns() - period * 1e9:
+            self._behind += 1
+        else:
+            self._behind = 0
+            time.sleep(POST_COMMAND_SLEEP * period)
+        if self._behind % PUT_OFF == 0:
+            self._turn = (self._turn + 1) % len(loops.loops)
+            loops.loops[self._turn].core.refine(REFINE_SHARE * period)
+
+    def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
+        """Tell of the steps of a sample."""
         self._steps.publish(loops.by_name, steps)
         for joint in self.joints:
-            if joint.name in steps and joint.follow(steps[joint.name], joint.name in silent):
+            if joint.name in steps and joint.follow(steps[joint.name]):
                 joint.diagnose(self._rivals, self.active)
+
+    # --- what happens besides --------------------------------------------------------------------
 
     def _check_change(self, p: Parameters) -> None:
         """Raise ParameterError for values that the running loops cannot take up."""
@@ -375,7 +354,6 @@ class ControllerNode(ManagedNode):
             joint.take_up(p.of_joint(joint.name))
         if self.loops is None and p.sample_period != before.sample_period:
             self._counter = SampleCounter(p.sample_period)
-            self._spare_time = SpareTime(p.sample_period)
         self._mind_rivals()
 
     def _mind_rivals(self) -> None:
@@ -383,7 +361,6 @@ class ControllerNode(ManagedNode):
         stand_down = self.settings.on_rival == 'stand_down' and not self._rivals.came_first
         changing = [loop for loop in self.configured if loop.standing_down != stand_down]
         if changing and stand_down:
-            self._last_commands.end()
             for loop in changing:
                 loop.stand_down()
             self._commands_of_rivals = self._io.listen_to_commands(self._hear_rival)
@@ -405,17 +382,20 @@ class ControllerNode(ManagedNode):
             return
         for joint in self.joints:
             joint.save_now_and_then()
-        overdue = [joint for joint in self.joints if joint.is_overdue()]
-        if overdue:
-            # An arm of which one joint is lost stops as one, unless told otherwise.
-            ending = [
-                joint.loop for joint in (self.joints if self.settings.io.together else overdue)
-                if joint.loop is not None and not joint.loop.silent
-            ]
-            for loop in ending:
-                loop.give_up()
-            self._last_commands.begin(loops, ending, self.settings.on_timeout)
+        if loops.give_up_silent():
+            if self._ending is None:
+                self._ending = self.create_timer(
+                    self._step_s, self._send_next, clock=self.steady_clock
+                )
+            for joint in self.joints:
+                joint.told = None
             self._diagnose()
+
+    def _send_next(self) -> None:
+        """Send the next commands of on_timeout."""
+        if self._ending is not None and not (self.loops and self.active and self.loops.send_next()):
+            self.destroy_timer(self._ending)
+            self._ending = None
 
     def _diagnose(self) -> None:
         for joint in self.joints:

@@ -14,7 +14,7 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import HeldControl
 from backlash_ros.core.loop.diagnosis import TROUBLE
-from backlash_ros.core.loop.figures import Finding, Level
+from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import PLANT

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Clock
@@ -11,7 +12,7 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.loop.reference_pace import ReferencePace
-from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import REFERENCE_NODE
 from backlash_ros.core.reference.signal import PERIODIC
@@ -157,7 +158,8 @@ class ReferenceNode(ProcessNode):
     def _on_clock(self, message: Clock) -> None:
         self._publish(round(stamp_ns_of(message) * 1e-9 / self._sample_period))
 
-    def _on_output(self, output: JointOutputs) -> None:
+    def _on_output(self, outputs: Mapping[str, Output]) -> None:
+        output = next(iter(outputs.values()))
         if self._counter.count(
             output.stamp_ns, output.sequence, output.numbered
         ).is_sample:

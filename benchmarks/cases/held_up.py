@@ -22,7 +22,7 @@ import simulated_motor
 from simulated_motor import C_L, C_R
 
 from backlash_ros.core import Estimate, Parameters, Status, build_reference
-from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 
 # How long a process that wants to run waits: share of its turns at load 1, and longest wait [s] of
@@ -65,8 +65,8 @@ class HeldUpProcesses:
         self._now = 0.0
         self._sent = 0.0  # the newest command
         self.loop = ControlLoop(
-            p, self._send, lambda: _ns(self._now), None, SampleCounter(self.period, False),
-            reports=self._new_reports,
+            p, self._send, Driver(lambda: _ns(self._now), self._new_reports), None,
+            SampleCounter(self.period, False),
         )
         self._reference = build_reference(p)
         # Of the driver: when it samples next, the number of the sample, and a command on its way.

@@ -1,20 +1,19 @@
 """The controller in the fault campaign: its loop with what the node does around it, without DDS.
 
 What ControllerNode decides by wall clock and messages is decided here by simulated time: when the
-driver is silent, when the first command may leave, how a stall is caught up with.
+driver is silent, how a stall is caught up with.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from math import isfinite
+from collections.abc import Callable
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.loop.command_history import AWAITED_REPORTS
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.sample_counter import KEPT_OUTPUTS, Output, SampleCounter
+from backlash_ros.core.loop.control_loop import Driver as Asked
+from backlash_ros.core.loop.sample_counter import SampleCounter, kept_outputs
 from backlash_ros.core.parameters import Parameters
 from fault_loop.fault_world import Driver
 
@@ -31,7 +30,6 @@ class Controller:
         self.sent, self.note = sent, note
         self.stalled_until = 0
         self.active = True
-        self._ramp: Iterator[float] = iter(())
         self.restart(inherited, None)
 
     def restart(self, inherited: Estimate | None, v: float | None) -> None:
@@ -41,33 +39,31 @@ class Controller:
         self.active = True
 
     def _configure(self, inherited: Estimate | None, v: float | None) -> None:
-        self.loop = ControlLoop(
-            self.p, self._send, lambda: self.driver.answered_ns, inherited, self._counter, v
+        driver = self.driver
+        asked = Asked(
+            lambda: driver.answered_ns, may_report=lambda: driver.reports,
+            steady_s=lambda: driver.tick * self.p.sample_period,
         )
-        self.unanswered = 0
-        self.heard = self.driver.tick
+        self.loop = ControlLoop(self.p, self._send, asked, inherited, self._counter, v)
 
     def cycle(self, clean_up: bool) -> None:
         """Deactivate, clean up and configure if wanted, and activate."""
         self.deactivate()
-        v = self.loop.v if self.loop.knows_v else None
         if clean_up:
-            self._configure(None, v)
+            self._configure(None, self.loop.v if self.loop.knows_v else None)
         else:
             self.loop.renew(self.loop.estimate)
-        self.heard, self.active = self.driver.tick, True
+            self.loop.heard_at = None
+        self.active = True
 
     def deactivate(self) -> None:
         """End with what on_stop names."""
-        self._ramp = iter(())
         self.active = False
         loop = self.loop
-        if loop.last is None or loop.standing_down:
-            return
-        for v in loop.last_commands(self.p.on_stop):
-            loop.send(v)
-            if v == loop.zero:
-                break
+        if loop.statistics.used and not loop.standing_down:
+            loop.end(self.p.on_stop)
+            while loop.send_next():
+                pass
 
     def take_up(self, p: Parameters) -> None:
         """Use other live parameters."""
@@ -84,41 +80,20 @@ class Controller:
         for v, stamp_ns in driver.applied:
             loop.take_applied(v, stamp_ns)
         driver.applied.clear()
-        outputs = driver.outputs[-KEPT_OUTPUTS:]
+        outputs = driver.outputs[-kept_outputs(self.p.sample_period):]
         driver.outputs.clear()
         if not self.active:
             return
         for i, output in enumerate(outputs):
-            self._answer(output, behind=i + 1 < len(outputs))
-        timeout = self.p.timeout.plant_output / self.p.sample_period
-        if not loop.silent and 0.0 < timeout < driver.tick - self.heard:
+            begins, core = loop.begins, loop.core
+            step = loop.answer(output)
+            if step is not None:
+                self.note(step, begins or loop.core is not core)
+                if i + 1 == len(outputs):
+                    loop.core.refine()
+        if loop.is_overdue:
             loop.give_up()
-            self._ramp = loop.last_commands(self.p.on_timeout)
-        v_next = next(self._ramp, None)
-        if v_next is not None:
-            loop.send(v_next)
-
-    def _answer(self, output: Output, behind: bool) -> None:
-        loop = self.loop
-        if isfinite(output.y):
-            self.heard = self.driver.tick
-        if loop.begins and not loop.standing_down and not self._may_begin(output):
-            return
-        begins = loop.begins
-        core = loop.core
-        step = loop.answer(output)
-        if step is None:
-            return
-        self._ramp = iter(())
-        self.note(step, begins or loop.core is not core)
-        if not behind:
-            loop.core.refine()
-
-    def _may_begin(self, output: Output) -> bool:
-        if self.loop.learn_v(output.stamp_ns):
-            return True
-        self.unanswered += 1
-        return not self.driver.reports or self.unanswered > AWAITED_REPORTS
+        loop.send_next()
 
     def _send(self, v: float) -> None:
         self.sent(v, self.loop.core.limits)

@@ -204,7 +204,7 @@ class Sequence:
     def _cycle(self, tick: int) -> None:
         self.controller.cycle(clean_up=bool(self.rng.integers(2)))
         self._freeze()
-        if self.controller.loop.last is None:
+        if not self.controller.loop.statistics.used:
             self._forget()
 
     def _change_limits(self, tick: int) -> None:

@@ -14,8 +14,9 @@ from std_msgs.msg import Float64MultiArray, Header
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import first_guess
+from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.joint_loops import JointLoops
-from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
 JOINTS = ['waist', 'elbow', 'gripper']
@@ -112,13 +113,16 @@ def expected(p: Parameters, samples: int) -> list[dict[str, float]]:
     sent: list[dict[str, float]] = []
     before = {joint: first_guess(p.of_joint(joint)) for joint in JOINTS}
     loops = JointLoops(
-        p, lambda commands: sent.append(dict(commands)), lambda: 0, before,
+        p, lambda commands: sent.append(dict(commands)), lambda joint: Driver(lambda: 0), before,
         SampleCounter(PERIOD, from_zero=False), dict(output(0)),
     )
     for k in range(samples):
         loops.take_references(reference(k))
         stamp_ns = Arm.stamp_ns(k)
-        loops.answer(JointOutputs(output(k), stamp_ns, stamp_ns, stamp_ns, k, numbered=False))
+        loops.answer({
+            joint: Output(y, stamp_ns, stamp_ns, stamp_ns, k, numbered=False)
+            for joint, y in output(k).items()
+        })
     return sent
 
 

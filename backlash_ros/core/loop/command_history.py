@@ -9,6 +9,7 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.loop.loop_statistics import Counts
 from backlash_ros.core.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -19,13 +20,8 @@ REPORTED = 0.9  # share of the samples that reports have to tell of to be believ
 # without, after which they are given up. Messages that have nothing to do with the samples fit an
 # interval every other time at most: 20 times in a row by a chance of one in a million.
 CONSISTENT = 20
-# Outputs that stay without an answer while the driver may yet report its v, and for how long.
-AWAITED_REPORTS, AWAITED_S = 20, 0.5
 # Commands and reports that may wait: more than a stall of the controller can leave behind.
 REMEMBERED = 256
-LONGEST_TRANSIT = 0.25  # of a period: what is taken into account
-TRANSIT_STEP = 1e-3  # of a period: by which its median follows with every output
-FRESH = 1.5  # periods before an output up to which a report tells the v of its interval
 
 
 class ReportUse(Enum):
@@ -45,11 +41,6 @@ def report_use(p: Parameters) -> ReportUse:
     use = ReportUse(p.estimator.use_applied_control)
     delayed = use is ReportUse.AUTO and p.control.delay_samples > 0
     return ReportUse.NEVER if delayed or p.lockstep else use
-
-
-def awaited_reports(p: Parameters) -> int:
-    """How many outputs may stay without an answer while the driver may yet report its v."""
-    return min(AWAITED_REPORTS, max(int(AWAITED_S / p.sample_period), 1))
 
 
 class ReportTrust:
@@ -73,13 +64,18 @@ class CommandHistory:
 
     The driver applies over an interval the newest v it has when the interval ends with the next
     sample. So a v that cannot have been there when that sample was taken came too late, and the one
-    before it was in use: v is as long under way as y is. Times are those of one clock [ns].
+    before it was in use: v is as long under way as y is. Times are those of one clock [ns]. counts:
+    where late commands and missing reports are counted. newest_ns: when the newest command left,
+    own or of another controller, 0 before the first one.
     """
 
-    def __init__(self, sample_period_s: float, use: ReportUse = ReportUse.ALWAYS) -> None:
+    def __init__(
+        self, sample_period_s: float, use: ReportUse = ReportUse.ALWAYS,
+        counts: Counts | None = None,
+    ) -> None:
+        self.counts = counts or Counts()
+        self.newest_ns = 0
         self._trust = ReportTrust(use)
-        self.late = 0  # commands that missed their sample
-        self.unreported = 0  # outputs without a matching report while reports are used
         self._period_ns = sample_period_s * 1e9
         self._output_ns = 0  # stamp of the newest output
         self._transit_ns = 0.0  # median time from one node to the other
@@ -92,20 +88,16 @@ class CommandHistory:
         return self._trust.trusted
 
     def note_transit(self, passed_ns: float) -> None:
-        """Note how long an output was under way."""
-        # Clocks of two hosts may differ by more than any message takes.
-        longest, step = LONGEST_TRANSIT * self._period_ns, TRANSIT_STEP * self._period_ns
+        """Note how long an output was under way: a thousandth of a period moves the median."""
+        step = 1e-3 * self._period_ns
         median = self._transit_ns + (step if passed_ns > self._transit_ns else -step)
-        self._transit_ns = min(max(median, 0.0), longest)
-
-    @property
-    def newest_ns(self) -> int:
-        """When the newest command left, 0 before the first one."""
-        return self._published[-1][0] if self._published else 0
+        # Clocks of two hosts may differ by more than any message takes.
+        self._transit_ns = min(max(median, 0.0), 0.25 * self._period_ns)
 
     def publish(self, v: float, stamp_ns: int) -> None:
         """Note a command and when it left."""
         self._published.append((stamp_ns, v))
+        self.newest_ns = stamp_ns
 
     def report(self, v: float, stamp_ns: int) -> None:
         """Note an applied v and when the driver said so, just before the output it led to."""
@@ -120,11 +112,13 @@ class CommandHistory:
         And for each the command that left next to it, where that was within a period of the time
         that decides: nobody knows how long it was under way. nan where there is none.
         """
-        # A driver that was held up reads y first, and then the commands that came meanwhile.
-        ends_ns = [min(due_ns, end_ns) - i * self._period_ns for i in range(intervals - 1, -1, -1)]
-        # What left later than that was not there.
-        latest_ns = [each - self._transit_ns for each in ends_ns]
-        self.late += self._published[-1][0] >= latest_ns[0]
+        # A driver that was held up reads y first, and then the commands that came meanwhile; what
+        # left later than messages are under way was not there.
+        end = min(due_ns, end_ns)
+        latest_ns = [
+            end - i * self._period_ns - self._transit_ns for i in range(intervals - 1, -1, -1)
+        ]
+        self.counts.late += self._published[-1][0] >= latest_ns[0]
         pairs = [self._at(each) for each in latest_ns]
         return [v for v, _ in pairs], [other for _, other in pairs]
 
@@ -135,12 +129,14 @@ class CommandHistory:
     def newest_report(self, end_ns: int) -> float:
         """The v reported for the interval that ended at end_ns, nan without one.
 
-        It tells where the commands begin, even where it is not to be learned from.
+        It tells where the commands begin, even where it is not to be learned from. A command that
+        left in that interval outdates it.
         """
-        if not self._reported:
-            return nan
-        stamp_ns, v = self._reported[-1]
-        return v if stamp_ns > end_ns - FRESH * self._period_ns else nan
+        if self._reported and end_ns > self.newest_ns + self._period_ns:
+            stamp_ns, v = self._reported[-1]
+            if stamp_ns > end_ns - 1.5 * self._period_ns:
+                return v
+        return nan
 
     def reported_over(self, intervals: int, end_ns: int, unsent: int = 0) -> list[float]:
         """Reports since the last output, one per interval; empty where they are not to be used.
@@ -161,7 +157,7 @@ class CommandHistory:
         complete = len(reports) == intervals and stamp_ns > end_ns - 0.5 * self._period_ns
         if not self._trust.note(complete):
             return []
-        self.unreported += not complete
+        self.counts.unreported += not complete
         return reports if complete else []
 
     def _at(self, time_ns: float) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from math import nan, sqrt
+from math import isfinite, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -11,17 +11,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-FEWEST = 20  # intervals
-# What the period is fitted to: the newest stamps of this time, and at most so many.
-WINDOW_S, STAMPS = 2.0, 1000
-OTHER_PACE = 0.25  # share by which typical intervals differ from the period where they are no such
-# Share of the period by which stamps may scatter: beyond, as of a driver that is held up all the
-# time, nobody can tell from them which samples were left out.
-SCATTERED = 0.2
-# Shares of the period: by which a stamp may come early, and by which its phase follows a late one.
-EARLY, SLACK = 0.3, 0.01
-# Samples for which a process that is held up is late, so that their lateness is one error.
-HELD_UP = 10.0
+STAMPS = 1000  # the newest ones, to which the period is fitted, within 2 s
+# The period that is counted with is learned anew after so many intervals. It is taken for another
+# one than that of the samples where it is off by more than this share.
+LEARN_PERIOD_AFTER, OTHER_PERIOD = 20, 0.003
 
 
 class Period(NamedTuple):
@@ -51,19 +44,36 @@ UNKNOWN_PERIOD = Period()
 
 
 class DriverPeriod:
-    """Learns the period of a driver from the stamps of its samples [ns]."""
+    """Learns the period of a driver from the stamps of its samples [ns].
+
+    period_ns: that to count with, nominal_s where no other one is certain.
+    """
 
     def __init__(self, nominal_s: float) -> None:
-        self.nominal_s = nominal_s
+        self.nominal_s, self.period_ns = nominal_s, 1e9 * nominal_s
         self._stamps_ns: deque[int] = deque(maxlen=STAMPS)
+        self._since_learned = 0  # samples
 
-    def note(self, stamp_ns: int) -> None:
-        """Take in the stamp of a sample."""
+    def follow(self, stamp_ns: int) -> None:
+        """Take in the stamp of the next sample."""
         self._stamps_ns.append(stamp_ns)
+        self._since_learned += 1
+        if self._since_learned < LEARN_PERIOD_AFTER:
+            return
+        self._since_learned = 0
+        nominal_s, found = self.nominal_s, self.newest(50)
+        if found.differs_from(nominal_s, OTHER_PERIOD):
+            self.period_ns = 1e9 * found.mean
+        elif self.period_ns != 1e9 * nominal_s and isfinite(found.mean):
+            # Once it was certain, what is likely suffices.
+            off = abs(found.mean - nominal_s) > OTHER_PERIOD * nominal_s
+            self.period_ns = 1e9 * (found.mean if off else nominal_s)
 
-    def restart(self) -> None:
-        """Forget what was before: the clock of the stamps is another one."""
+    def restart(self, stamp_ns: int) -> None:
+        """Begin anew with this sample: the clock of the stamps is another one."""
         self._stamps_ns.clear()
+        self._stamps_ns.append(stamp_ns)
+        self._since_learned, self.period_ns = 0, 1e9 * self.nominal_s
 
     def newest(self, intervals: int = STAMPS) -> Period:
         """The period over so many intervals at most: the slope of the stamps over their samples.
@@ -72,22 +82,24 @@ class DriverPeriod:
         disturb it; unknown where most intervals are no period at all, or scatter widely.
         """
         stamps = list(self._stamps_ns)[-intervals - 1:]
-        begin = len(stamps) - FEWEST - 1
+        begin = len(stamps) - 21  # 20 intervals at least
         if begin < 0:
             return UNKNOWN_PERIOD
         times = 1e-9 * np.array([float(stamp - stamps[-1]) for stamp in stamps])
-        early = np.flatnonzero(times[:begin] < -WINDOW_S)
+        early = np.flatnonzero(times[:begin] < -2.0)
         times = times[early[-1] + 1 if len(early) else 0:]
         steps = np.diff(times)
         ordered = np.sort(steps)
         quarter = len(ordered) // 4
         typical = float(ordered[quarter:-quarter].mean())
-        if not abs(typical / self.nominal_s - 1.0) < OTHER_PACE:
+        if not abs(typical / self.nominal_s - 1.0) < 0.25:
             return UNKNOWN_PERIOD
         found = _slope(np.append(0.0, np.rint(steps / self.nominal_s)).cumsum(), times)
         if found.mean > 0.0:
             found = _slope(np.array(_numbered(times.tolist(), found.mean), float), times)
-        if not (found.mean > 0.0 and found.scatter < SCATTERED * self.nominal_s):
+        # Beyond such a scatter, as of a driver that is held up all the time, nobody can tell from
+        # the stamps which samples were left out.
+        if not (found.mean > 0.0 and found.scatter < 0.2 * self.nominal_s):
             return UNKNOWN_PERIOD
         return found._replace(median=float(np.median(ordered)))
 
@@ -96,10 +108,10 @@ def _numbered(times: list[float], period_s: float) -> list[int]:
     """The number of each sample: stamps come late, by less than a period, but hardly early."""
     numbers, due = [0], times[0]
     for time in times[1:]:
-        passed = max(int((time - due) / period_s + EARLY), 0)
+        passed = max(int((time - due) / period_s + 0.3), 0)
         numbers.append(numbers[-1] + passed)
         late = time - due - passed * period_s
-        due += passed * period_s + min(late, SLACK * period_s)
+        due += passed * period_s + min(late, 0.01 * period_s)
     return numbers
 
 
@@ -110,4 +122,5 @@ def _slope(numbers: Array, times: Array) -> Period:
         return UNKNOWN_PERIOD
     slope = float(n @ t) / spread
     rest = float(np.mean((t - slope * n)**2))
-    return Period(slope, sqrt(HELD_UP * rest / spread), scatter=sqrt(rest))
+    # A process that is held up is late for some ten samples, whose lateness is one error.
+    return Period(slope, sqrt(10.0 * rest / spread), scatter=sqrt(rest))

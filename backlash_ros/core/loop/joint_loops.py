@@ -2,57 +2,64 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
+from math import isfinite
 
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.jobs.executor import Executor
-from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
 
 class JointLoops:
     """Answers a message about all joints with one of commands for all; no loop knows another.
 
-    send: takes v, by joint, to the driver. by_name: the loops, in the order of `joints`; a single
-    one may be nameless. reports: see ControlLoop, for the name of a joint.
+    send: takes v, by joint, to the driver. driver: what can be asked about that of a joint.
+    by_name: the loops, in the order of `joints`; a single one may be nameless.
     """
 
     def __init__(
         self, p: Parameters, send: Callable[[Mapping[str, float]], None],
-        now_ns: Callable[[], int], before: Mapping[str, Estimate],
+        driver: Callable[[str], Driver], before: Mapping[str, Estimate],
         counter: SampleCounter, v: Mapping[str, float | None] | None = None,
-        reports: Callable[[str], Iterable[tuple[float, int]]] = lambda joint: (),
         executor: Executor | None = None,
     ) -> None:
         self.counter, self._send = counter, send
+        self._together = p.io.together
         self._commands: dict[str, float] = {}  # that wait for the message
         self.by_name = {
             joint: ControlLoop(
-                p.of_joint(joint), partial(self._commands.__setitem__, joint), now_ns,
-                before[joint], counter, (v or {}).get(joint), partial(reports, joint), executor,
+                p.of_joint(joint), partial(self._commands.__setitem__, joint), driver(joint),
+                before[joint], counter, (v or {}).get(joint), executor,
             ) for joint in p.joint_names
         }
+        self.loops = tuple(self.by_name.values())
 
     def answer(
-        self, outputs: JointOutputs, waiting: Container[str] = (),
+        self, outputs: Mapping[str, Output], y_m: float | None = None,
     ) -> dict[str, ControlStep]:
-        """Send v(k) for y(k) of all joints that there are.
+        """Send v(k) for y(k) of all joints that there are; returns the steps that were made.
 
-        waiting: joints that are not to be answered. Returns the steps of those that were.
+        y_m: as in ControlLoop.answer.
         """
-        arrival = self.counter.count(outputs.stamp_ns, outputs.sequence, outputs.numbered)
+        first = next(iter(outputs.values()))
+        arrival = self.counter.count(first.stamp_ns, first.sequence, first.numbered)
+        if self._together and any(
+            loop.silent and not (joint in outputs and isfinite(outputs[joint].y))
+            for joint, loop in self.by_name.items()
+        ):
+            outputs = {}  # an arm of which one joint is still lost does not begin
         steps = {}
         for joint, loop in self.by_name.items():
-            if joint in outputs.y and joint not in waiting:
-                step = loop.answer(outputs.of(joint), arrival)
-                if step is not None:
-                    steps[joint] = step
-            else:
+            output = outputs.get(joint)
+            if output is None:
                 loop.skip(arrival)
-        self.send()
+            elif (step := loop.answer(output, arrival, y_m)) is not None:
+                steps[joint] = step
+        self._send_waiting()
         return steps
 
     def take_references(self, y_m: Mapping[str, float]) -> list[str]:
@@ -60,8 +67,32 @@ class JointLoops:
         return [joint for joint, value in y_m.items()
                 if self.by_name[joint].take_reference(value)]
 
-    def send(self) -> None:
-        """Send the commands that the loops have given since the last message, if any."""
+    def give_up_silent(self) -> bool:
+        """Give up drivers that are newly silent; returns whether there are any.
+
+        An arm of which one joint is lost stops as one, unless told otherwise.
+        """
+        overdue = [loop for loop in self.loops if loop.is_overdue]
+        for loop in self.loops if overdue and self._together else overdue:
+            loop.give_up()
+        return bool(overdue)
+
+    def end(self, action: str) -> list[ControlLoop]:
+        """Have send_next lead v to its end, as ControlLoop.end; returns the loops that command."""
+        ending = [
+            loop for loop in self.loops if loop.statistics.used and not loop.standing_down
+        ]
+        for loop in ending:
+            loop.end(action)
+        return ending
+
+    def send_next(self) -> bool:
+        """Send the next of these commands; returns whether there was any."""
+        sent = [loop.send_next() for loop in self.loops]
+        self._send_waiting()
+        return any(sent)
+
+    def _send_waiting(self) -> None:
         if self._commands:
             self._send(dict(self._commands))
             self._commands.clear()

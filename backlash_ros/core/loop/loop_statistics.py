@@ -4,43 +4,58 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from math import inf, nan, pi
 
 import numpy as np
 
-FEWEST, MOST = 20, 50  # intervals that the rate of y is taken of
-WINDOW_S = 3.0  # what counts as lately
-# A turn [rad], by how much a jump of y may be off it, and how much further than its usual moves.
-TURN, OFF_A_TURN, BEYOND_PACE = 2.0 * pi, 0.3, 10.0
+INTERVALS = 50  # of which the rate of y is taken, and the age of a message
+LATELY_S = 3.0
 
 
 @dataclass
-class LoopStatistics:
-    """Counters since the start.
+class Counts:
+    """Samples and messages, since a loop began or lately."""
+
+    used: int = 0  # outputs that brought a command
+    lost: int = 0  # outputs that never arrived
+    unsent: int = 0  # of these, the ones that the driver never published
+    late: int = 0  # commands that missed their sample
+    unreported: int = 0  # outputs without a matching report while reports are used
+    without_reference: int = 0  # outputs before the first y_m
+    bad_outputs: int = 0  # values of y that are no finite number
+    bad_references: int = 0  # ... and of y_m
+    bad_reports: int = 0  # ... and of applied_control
+    extra: int = 0  # outputs that were repeated, too early, old or of a second driver
+    interruptions: int = 0  # times that the driver was silent or restarted
+    limited: int = 0  # commands that met a limit
+    wraps: int = 0  # times that y jumped by 2 pi
+
+    @property
+    def dropped(self) -> int:
+        """Messages that held no finite number."""
+        return self.bad_outputs + self.bad_references + self.bad_reports
+
+    def by_name(self) -> dict[str, int]:
+        """All of them."""
+        return {each.name: getattr(self, each.name) for each in fields(Counts)}
+
+
+@dataclass
+class LoopStatistics(Counts):
+    """Counts since the loop began, and what tells how well it runs now.
 
     still_band: by how much y may differ where it stands still. latencies [s]: the newest ones, as
     topics.py defines them.
     """
 
     still_band: float = 0.0
-    used: int = 0  # outputs that brought a command
-    lost: int = 0  # outputs that never arrived
-    unsent: int = 0  # of these, the ones that the driver never published
-    dropped: int = 0  # messages that held no finite number
-    bad_outputs: int = 0  # of these, the ones of y
-    bad_references: int = 0  # and of y_m
-    extra: int = 0  # outputs that were repeated, too early, old or of a second driver
-    interruptions: int = 0  # times that the driver was silent or restarted
-    without_reference: int = 0  # outputs before the first y_m
-    limited: int = 0  # commands that met a limit
-    wraps: int = 0  # times that y jumped by 2 pi
     still: int = 0  # newest values of y in a row that are equal
-    still_swing: float = 0.0  # how far v has moved meanwhile
+    inconsistent: int = 0  # newest samples in a row that contradict the estimate
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
-    _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=MOST + 1))
-    _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=MOST))
+    _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS + 1))
+    _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
     _y: float = nan  # with which the newest row of equal values began
     _y_before: float = nan
     _pace: float = inf  # how far y moves from sample to sample, as a rule
@@ -49,20 +64,27 @@ class LoopStatistics:
     _still_low: float = inf
     _still_high: float = -inf
 
+    @property
+    def still_swing(self) -> float:
+        """How far v has moved while y stands still."""
+        return max(self._still_high - self._still_low, 0.0)
+
     def note_arrival(self, stamp_ns: int, received_ns: int) -> None:
         """Note a message of y, whatever it is worth: when it left and when it came."""
         self._stamps_ns.append(stamp_ns)
         if received_ns > 0:  # else the middleware does not tell
             self._ages_s.append((received_ns - stamp_ns) * 1e-9)
 
-    def note(self, y: float, v: float, limited: bool, latency: float) -> None:
+    def note(self, y: float, v: float, limited: bool, inconsistent: bool, latency: float) -> None:
         """Count an output and the command that it brought."""
         self.used += 1
         self.limited += limited
+        self.inconsistent = self.inconsistent + 1 if inconsistent else 0
         self.latencies.append(latency)
         self._v_low, self._v_high = min(v, self._v_low), max(v, self._v_high)
         moved = abs(y - self._y_before)
-        if abs(moved - TURN) < OFF_A_TURN and moved > BEYOND_PACE * self._pace:
+        # A jump by about a turn, and much further than y moves as a rule.
+        if abs(moved - 2.0 * pi) < 0.3 and moved > 10.0 * self._pace:
             self.wraps += 1
         elif moved == moved:
             self._pace = moved if self._pace == inf else self._pace + 0.05 * (moved - self._pace)
@@ -71,17 +93,6 @@ class LoopStatistics:
             self._y, self.still, self._still_low, self._still_high = y, 0, v, v
         self.still += 1
         self._still_low, self._still_high = min(v, self._still_low), max(v, self._still_high)
-        self.still_swing = self._still_high - self._still_low
-
-    def note_bad_output(self) -> None:
-        """Count a y that is no number."""
-        self.dropped += 1
-        self.bad_outputs += 1
-
-    def note_bad_reference(self) -> None:
-        """Count a y_m that is no number."""
-        self.dropped += 1
-        self.bad_references += 1
 
     def latencies_ms(self, *shares: float) -> list[float]:
         """Latencies that these shares of the latest commands stayed below; nan without any."""
@@ -95,7 +106,7 @@ class LoopStatistics:
         A tenth of them is shorter than low, a tenth longer than high.
         """
         intervals = sorted(later - earlier for earlier, later in pairwise(self._stamps_ns))
-        if len(intervals) < FEWEST:
+        if len(intervals) < 20:
             return nan, nan, nan
         tenth = len(intervals) // 10
         mean = sum(intervals) / len(intervals)
@@ -106,7 +117,7 @@ class LoopStatistics:
 
         Negative where the clock of the driver is ahead of the one of this machine.
         """
-        return float(np.median(self._ages_s)) if len(self._ages_s) >= FEWEST else nan
+        return float(np.median(self._ages_s)) if len(self._ages_s) >= 20 else nan
 
     def swing(self) -> float:
         """Swing of v since the last call."""
@@ -116,7 +127,7 @@ class LoopStatistics:
 
 
 class Lately:
-    """What counters have gained within the last WINDOW_S, or a little more."""
+    """What counters have gained within the last LATELY_S, or a little more."""
 
     def __init__(self) -> None:
         self._looks: deque[tuple[float, Mapping[str, int]]] = deque()
@@ -128,7 +139,7 @@ class Lately:
         """
         if self._looks and any(counts[name] < n for name, n in self._looks[-1][1].items()):
             self._looks.clear()
-        while len(self._looks) > 1 and self._looks[1][0] <= now_s - WINDOW_S:
+        while len(self._looks) > 1 and self._looks[1][0] <= now_s - LATELY_S:
             self._looks.popleft()
         before = self._looks[0][1] if self._looks else {}
         self._looks.append((now_s, counts))

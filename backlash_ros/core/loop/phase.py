@@ -3,7 +3,7 @@
 | phase | event | next phase | what is done |
 |---|---|---|---|
 | begins | answer | runs | the first command goes on from the v that acts |
-| begins | timeout | silent | the commands of on_timeout |
+| begins | timeout | silent | a new core, and the commands of on_timeout |
 | begins | rival | stands down | nothing is sent; its commands tell which v acts |
 | runs | interruption | begins | a new core: the state of the plant is unknown |
 | runs | timeout | silent | a new core, and the commands of on_timeout |
@@ -12,10 +12,12 @@
 | silent | rival | stands down | nothing is sent; its commands tell which v acts |
 | stands down | rival gone | begins | a new core, from the newest v that was heard |
 
-An event that a phase has no line for changes nothing. `begins` lasts until an output comes with a
-y and a y_m, and until it is known which v acts or nobody is going to say so. An interruption is
-an output after a silence, after a restart of the driver, or after more lost samples than can be
-stepped over; where the loop runs, a reset of the estimates or an activation is one as well.
+An event that a phase has no line for changes nothing. control_loop.ControlLoop finds what happens,
+but for rivals, which nodes/control/rivals.py watches out for. `answer`: an output has come with y
+and y_m, and it is known which v acts, or nobody is going to say so. `interruption`: an output after
+a silence, after a restart of the driver, or after more lost samples than can be stepped over; where
+the loop runs, a reset of the estimates or an activation is one as well. `timeout`: no output for
+timeout.plant_output. `rival`: another controller was first.
 """
 
 from __future__ import annotations

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from itertools import islice
-from math import isfinite
 from typing import NamedTuple
 
 from backlash_ros.core.loop.driver_period import DriverPeriod
@@ -15,29 +13,16 @@ UNNUMBERED = 2**64 - 1
 # A stamp never comes before its sample, so a missing one shows as a full period of lateness.
 # Jitter of the sender up to this share of a period is not taken for a loss.
 JITTER = 0.85
-# After so many intervals the period of the sender is learned anew, of as many as are used for that.
-# It is taken for another one than that of the samples if it is off by more than this share.
-LEARN_PERIOD_AFTER, LEARN_PERIOD_OF, OTHER_PERIOD = 20, 50, 0.003
+CLOCK_SLACK = 0.01  # share of a period by which the sender's clock may run slow per sample
+# A sender that has kept time for so many samples is held to it: what comes much earlier than the
+# next sample is due is a repetition or from someone else.
+KEEPS_TIME_AFTER = 20
 # Samples in a row that all came later than expected, after which the least lateness among them is
 # the new phase of the sender, which has paused: at its start, and when its period is known.
 PHASE_AT_START, PHASE_SAMPLES = 6, 20
-# Share of a period by which the sender's clock may run slow per sample. By how much the phase that
-# tells repetitions apart may lag: who was held up for some samples comes back to the old one.
-CLOCK_SLACK, LARGEST_LAG = 0.01, 0.5
-# A sender that has kept time for so many samples is held to it: what comes earlier than the next
-# sample is due, by more than a share of a period, is a repetition or from someone else. Before,
-# one that came early outweighs two that were due.
-KEEPS_TIME_AFTER, OUTWEIGHED = 20, 2
-EARLY = 0.3  # that share of a period
-# Samples that numbers may jump further than time has passed, and periods to wait for a message that
-# fits when they jump further still.
-NUMBER_SLACK, PATIENCE = 3, 1.5
 # Another sender, or a clock that was set back, is believed after so many messages and periods
 # without a sample in between.
 STRANGERS, SILENCE = 5, 3.0
-# A controller that was held up for so long, or for so many samples, still learns from them; after
-# a longer stall it goes on with the newest ones.
-KEPT_S, KEPT_OUTPUTS = 0.1, 20
 
 
 class Output(NamedTuple):
@@ -53,24 +38,6 @@ class Output(NamedTuple):
     received_ns: int
     sequence: int
     numbered: bool = True
-
-
-class JointOutputs(NamedTuple):
-    """y of the joints, by name, in one message; the rest as in Output. Joints may be missing."""
-
-    y: Mapping[str, float]
-    stamp_ns: int
-    sent_ns: int
-    received_ns: int
-    sequence: int
-    numbered: bool = True
-
-    def of(self, joint: str) -> Output:
-        """What it says of one of its joints."""
-        return Output(
-            self.y[joint], self.stamp_ns, self.sent_ns, self.received_ns, self.sequence,
-            self.numbered,
-        )
 
 
 class Arrival(NamedTuple):
@@ -110,13 +77,11 @@ class SampleCounter:
         self.index, self.due_ns = -1, 0.0
         self.sender = DriverPeriod(sample_period_s)
         self._from_zero = from_zero
-        self._period_ns = sample_period_s * 1e9  # of the sender, as far as it is known
         self._sequence = 0  # of the newest sample
         self._repeated = 0  # of the newest message that followed it too early to be a sample
         self._stamp_ns = 0  # of the newest sample
         self._early_ns = 0.0  # the earliest time at which the newest sample may have been due
         self._lateness_ns: deque[float] = deque(maxlen=PHASE_SAMPLES)  # against due_ns
-        self._since_learned = 0  # samples since the period was learned
         self._on_time = 0  # samples that came when they were due, less the early ones
         self._strange = 0  # messages in a row that do not follow the newest sample
 
@@ -126,18 +91,18 @@ class SampleCounter:
         """Take in a message and say what it is; `numbered` as in Output."""
         known = sequence != UNNUMBERED
         numbered = numbered and known
+        period = self.sender.period_ns
         if self.index < 0:
             if not self._from_zero:
-                self.index = round(stamp_ns / self._period_ns)
+                self.index = round(stamp_ns / period)
             else:
                 self.index = max(sequence - 1, 0) if numbered else 0
             self._begin(stamp_ns, sequence)
-            return Arrival(is_sample=True)
-        period = self._period_ns
+            return NEXT_SAMPLE
         if stamp_ns < self._stamp_ns:
             return self._stranger(stamp_ns, sequence)
-        late = (stamp_ns - self.due_ns) / period - 1.0  # may be negative
-        is_early = stamp_ns < self._early_ns + (1.0 - EARLY) * period
+        late = (stamp_ns - self.due_ns) / period - 1.0  # [periods], may be negative
+        is_early = stamp_ns < self._early_ns + 0.7 * period
         keeps_time = self._on_time >= KEEPS_TIME_AFTER
         by_time = max(int(late + 1.0 - JITTER), 0)
         skipped = 0  # numbers between this message and the newest one of its sender
@@ -153,9 +118,11 @@ class SampleCounter:
                 return begin(stamp_ns, sequence, by_time)
             if not numbered and is_early and skipped > 0:
                 return NO_SAMPLE  # of another sender
-            if numbered and keeps_time and skipped > late + 1.0 + NUMBER_SLACK:
-                # A second sender, or a flood of which the middleware has dropped a part.
-                if late < PATIENCE:
+            # Numbers may jump some samples further than time has passed.
+            if numbered and keeps_time and skipped > late + 4.0:
+                # A second sender, or a flood of which the middleware has dropped a part: for a
+                # while a message that fits is waited for.
+                if late < 1.5:
                     return NO_SAMPLE
                 skipped = by_time
         if keeps_time and is_early:
@@ -164,34 +131,20 @@ class SampleCounter:
             return NO_SAMPLE
         missing = max(by_time, skipped) if numbered else by_time
         if missing == 0 and not keeps_time:
-            self._on_time = max(self._on_time + (-OUTWEIGHED if is_early else 1), 0)
+            # One that came early outweighs two that were due.
+            self._on_time = max(self._on_time + (-2 if is_early else 1), 0)
         self._sequence = self._repeated = sequence
         self._stamp_ns, self._strange = stamp_ns, 0
         self._follow_phase(stamp_ns, missing)
-        self._learn_period(stamp_ns)
+        self.sender.follow(stamp_ns)
         self.index += 1 + missing
         if not missing:
             return NEXT_SAMPLE
-        unsent = max(missing - skipped, 0) if known else 0
-        return Arrival(is_sample=True, missing=missing, unsent=unsent)
-
-    def _learn_period(self, stamp_ns: int) -> None:
-        self.sender.note(stamp_ns)
-        self._since_learned += 1
-        if self._since_learned < LEARN_PERIOD_AFTER:
-            return
-        self._since_learned = 0
-        nominal_s, found = self.sender.nominal_s, self.sender.newest(LEARN_PERIOD_OF)
-        if found.differs_from(nominal_s, OTHER_PERIOD):
-            self._period_ns = 1e9 * found.mean
-        elif self._period_ns != 1e9 * nominal_s and isfinite(found.mean):
-            # Once it was certain, what is likely suffices.
-            off = abs(found.mean - nominal_s) > OTHER_PERIOD * nominal_s
-            self._period_ns = 1e9 * (found.mean if off else nominal_s)
+        return Arrival(True, missing, unsent=max(missing - skipped, 0) if known else 0)
 
     def _follow_phase(self, stamp_ns: int, missing: int) -> None:
         """Go on to the sample with this stamp, before which so many are missing."""
-        period, latenesses = self._period_ns, self._lateness_ns
+        period, latenesses = self.sender.period_ns, self._lateness_ns
         expected = self.due_ns + period * (1 + missing)
         late = stamp_ns - expected
         latenesses.append(late)
@@ -204,8 +157,9 @@ class SampleCounter:
             for i, each in enumerate(latenesses):
                 latenesses[i] = each - shift
         self.due_ns = expected + shift
+        # Who was held up for some samples comes back to the old phase: this one lags behind.
         early = self._early_ns + period * (1 + missing + CLOCK_SLACK)
-        self._early_ns = max(min(early, stamp_ns), self.due_ns - LARGEST_LAG * period)
+        self._early_ns = max(min(early, stamp_ns), self.due_ns - 0.5 * period)
 
     def _stranger(self, stamp_ns: int, sequence: int, missing: int = 0) -> Arrival:
         self._strange += 1
@@ -223,12 +177,13 @@ class SampleCounter:
         self.due_ns = self._early_ns = float(stamp_ns)
         self._stamp_ns = stamp_ns
         self._lateness_ns.clear()
-        self.sender.restart()
-        self.sender.note(stamp_ns)
-        self._since_learned, self._period_ns = 0, 1e9 * self.sender.nominal_s
+        self.sender.restart(stamp_ns)
         self._on_time = self._strange = 0
 
 
 def kept_outputs(sample_period: float) -> int:
-    """How many outputs wait for a controller that is held up; sample_period [s]."""
-    return round(max(KEPT_S / sample_period, KEPT_OUTPUTS))
+    """How many outputs wait for a controller that is held up; sample_period [s].
+
+    After so many samples, or so long, it still learns from all of them.
+    """
+    return round(max(0.1 / sample_period, 20))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import inf, nan
 
 from rclpy.node import Node
@@ -21,16 +21,11 @@ from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.runtime.messages import LabelledArrayPublisher, without_events
 
 WATCH_PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
-WATCH_LOOK_S = 0.5  # between two looks at who listens
-WATCH_DEPTH = 10  # messages that may wait for a subscriber
 U_INDEX = topics.SIGNAL_LABELS.index('u_hat')
-BAND = 2.0  # half width of the band around an estimate, in standard deviations
 Row = tuple[float, ...]
 # Who comes late gets the newest ones: G may never change again. More than one, so that a subscriber
 # that is held up misses none, and one of each joint.
 NEWEST = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# Deviations and noise change with every few samples, and are of use at the pace of a reader.
-MODEL_PERIOD_S = 1.0
 
 
 class WatchPublisher:
@@ -45,7 +40,7 @@ class WatchPublisher:
     def __init__(self, node: Node, joint: str = '') -> None:
         self._publishers: dict[str, Publisher] = {
             label: node.create_publisher(
-                Float64, topics.of_node(topics.watched(label, joint)), WATCH_DEPTH,
+                Float64, topics.of_node(topics.watched(label, joint)), 10,
                 event_callbacks=without_events(),
             ) for label in topics.WATCH_LABELS
         }
@@ -56,18 +51,19 @@ class WatchPublisher:
         self._v_sent = False  # with the newest sample, so that its u is that of the next one
         self._u_of_v: float | None = None  # u that belongs to the v that was sent last
 
-    def follow(self, signals: Sequence[float], estimates: Sequence[float], now_s: float) -> None:
-        """Publish what is due of a sample.
-
-        signals, estimates: its rows, in the order of their labels. now_s: on the steady clock.
-        """
-        if now_s >= self._looked_at_s + WATCH_LOOK_S:
+    def is_heard(self, now_s: float) -> bool:
+        """Whether there is any subscriber, as far as was looked lately [s, steady clock]."""
+        if now_s >= self._looked_at_s + 0.5:
             self._looked_at_s = now_s
             self._heard = [
                 label for label, publisher in self._publishers.items()
                 if publisher.get_subscription_count()
             ]
-        if not self._heard:
+        return bool(self._heard)
+
+    def follow(self, signals: Sequence[float], estimates: Sequence[float], now_s: float) -> None:
+        """Publish what is due of a sample, given by its rows in the order of their labels."""
+        if not self.is_heard(now_s):
             return
         if self._v_sent:
             self._v_sent, self._u_of_v = False, signals[U_INDEX]
@@ -76,9 +72,7 @@ class WatchPublisher:
         self._sent_at_s = max(self._sent_at_s, now_s - WATCH_PERIOD_S)
         # The comparison of times must not lose one message of each round to rounding.
         due = int((now_s - self._sent_at_s) / spacing + 1e-6)
-        if not due:
-            return
-        values = watched_values(signals, estimates)
+        values = watched_values(signals, estimates) if due else {}
         for _ in range(due):
             turn = (self._turn + 1) % len(self._heard)
             label = self._heard[turn]
@@ -98,8 +92,8 @@ def watched_values(signals: Sequence[float], estimates: Sequence[float]) -> dict
     signal = dict(zip(topics.SIGNAL_LABELS, signals, strict=True))
     estimate = dict(zip(topics.ESTIMATE_LABELS, estimates, strict=True))
     values = {'gap': estimate['c_r'] - estimate['c_l']}
-    for name in ('m', 'c_r', 'c_l'):
-        value, half = estimate[name], BAND * estimate[f'std_{name}']
+    for name in topics.BACKLASH:
+        value, half = estimate[name], 2.0 * estimate[f'std_{name}']
         values |= {name: value, f'{name}_low': value - half, f'{name}_high': value + half}
     return values | {name: value for name, value in signal.items() if name != 'sample'}
 
@@ -108,7 +102,7 @@ class StepPublisher:
     """The topics ~/signals, ~/estimates and those below ~/watch.
 
     The rows of several joints are one after the other, with the joint before each label; that of a
-    joint without a step is nan.
+    joint without a step is nan. Nothing is made that nobody listens to.
     """
 
     def __init__(self, node: Node, joints: Sequence[str]) -> None:
@@ -130,33 +124,29 @@ class StepPublisher:
         self, loops: Mapping[str, ControlLoop], steps: Mapping[str, ControlStep],
     ) -> None:
         """Tell of the steps of a sample."""
-        rows = [_rows(loop, steps.get(joint)) for joint, loop in loops.items()]
-        self._signals.publish(_joined(signals for signals, _ in rows))
-        self._estimates.publish(_joined(estimates for _, estimates in rows))
         now_s = time.monotonic()
-        for joint, (signals, estimates) in zip(loops, rows, strict=True):
-            if joint in steps:
-                self._watches[joint].follow(signals, estimates, now_s)
+        watches = [joint for joint in steps if self._watches[joint].is_heard(now_s)]
+        if self._signals.listeners or watches or self._estimates.listeners:
+            rows = {joint: _rows(loop, steps.get(joint)) for joint, loop in loops.items()}
+            self._signals.publish(sum((signals for signals, _ in rows.values()), ()))
+            self._estimates.publish(sum((estimates for _, estimates in rows.values()), ()))
+            for joint in watches:
+                self._watches[joint].follow(*rows[joint], now_s)
 
 
 def _rows(loop: ControlLoop, step: ControlStep | None) -> tuple[Row, Row]:
     """Signals and estimates of a joint."""
     if step is None:
         return (nan,) * len(topics.SIGNAL_LABELS), (nan,) * len(topics.ESTIMATE_LABELS)
-    e, sample = step.estimate, float(loop.counter.index)
-    estimator = loop.core.estimator
+    e, sample, law = step.estimate, float(loop.counter.index), loop.core.estimator
     return (
-        step.y_m, step.y, step.u_d, step.v, estimator.u_hat, estimator.innovation,
-        float(e.status), sample, loop.statistics.latencies[-1],
+        step.y_m, step.y, step.u_d, step.v, law.u_hat, law.innovation, float(e.status), sample,
+        loop.statistics.latencies[-1],
     ), (e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), nan, sample)
 
 
-def _joined(rows: Iterator[Row]) -> Row:
-    return sum(rows, ())
-
-
 class ModelPublisher:
-    """Publishes `controller/model` when G has changed, else once per MODEL_PERIOD_S of samples.
+    """Publishes `controller/model` when G has changed, else once per second of samples.
 
     Counted in samples, so that a run in lockstep is the same whenever it is made. A message is
     about one joint, whose name is part of the labels.
@@ -175,13 +165,14 @@ class ModelPublisher:
         """Publish after a sample, if it is time."""
         self._since += 1
         learned = loop.core.estimator.learned_model
-        if learned is not self._told or self._since * sample_period_s >= MODEL_PERIOD_S:
+        # Deviations and noise change with every few samples, and are of use to a reader.
+        if learned is not self._told or self._since * sample_period_s >= 1.0:
             self._told, self._since = learned, 0
             self.publish(loop)
 
     def publish(self, loop: ControlLoop) -> None:
         """Publish at once."""
-        fields = learned_model_of(loop.core.estimator, loop.told).fields()
+        fields = learned_model_of(loop.core.estimator, loop.nominal).fields()
         message = Float64MultiArray()
         message.layout.dim = [
             MultiArrayDimension(label=topics.of_joint(label, self._joint), size=len(values))

@@ -23,12 +23,6 @@ from backlash_ros.core.loop.diagnosis import UNNAMED
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
 
-LISTED = Path('/proc/net/unix')
-# What discovery mostly takes: a publisher that is found so soon after a node was made was there
-# before it. Controllers of this machine are waited for however long it takes.
-DISCOVERY_S = 0.7
-HELLO_S = 2.0  # for which a new publisher is told at every look who was activated when
-OWN_ENDPOINT_S = 10.0  # longest wait for the graph to show a publisher of this very process
 # Keys in /diagnostics by which controllers know each other.
 ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
 
@@ -60,13 +54,13 @@ class Presence:
     def others(self) -> frozenset[str]:
         """Identities of the other publishers."""
         try:
-            names = [line.rsplit(' ', 1)[-1] for line in LISTED.read_text().splitlines()]
+            listed = Path('/proc/net/unix').read_text().splitlines()
         except OSError:
             return frozenset()
-        found = {
+        names = (line.rsplit(' ', 1)[-1] for line in listed)
+        return frozenset(
             name.removeprefix(self._prefix) for name in names if name.startswith(self._prefix)
-        }
-        return frozenset(found - {self._own})
+        ) - {self._own}
 
     def close(self) -> None:
         """Let go of the name."""
@@ -79,13 +73,6 @@ class Rival(NamedTuple):
 
     name: str
     was_first: bool
-
-
-class _Claim(NamedTuple):
-    """What a controller says of itself: active since [ns], 0 if it is not, and when [s]."""
-
-    since_ns: int
-    heard_at: float
 
 
 class Rivals:
@@ -104,7 +91,8 @@ class Rivals:
         self.since_ns = 0
         self._active_at = inf
         self._first_seen: dict[str, float] = {}
-        self._claims: dict[str, _Claim] = {}
+        # What controllers say: active since [ns], 0 if they are not, and when they have said so.
+        self._claims: dict[str, tuple[int, float]] = {}
 
     def begin(self, since_ns: int, now: float) -> None:
         """The controller has become active."""
@@ -118,7 +106,7 @@ class Rivals:
         """Take in what a node says in /diagnostics."""
         identity, since = values.get(ENDPOINT, ''), values.get(SINCE, '')
         if identity and identity != self.own and since.isdecimal():
-            self._claims[identity] = _Claim(int(since), now)
+            self._claims[identity] = int(since), now
 
     def among(self, others: Mapping[str, str], now: float) -> tuple[Rival, ...]:
         """The rivals among the other publishers, given by identity with their names."""
@@ -126,21 +114,15 @@ class Rivals:
         self._claims = {each: c for each, c in self._claims.items() if each in others}
         if not self.since_ns:
             return ()
-        found = [
-            Rival(name, self._was_first(each)) for each, name in others.items()
-            if self._is_active(each, now)
-        ]
+        found = []
+        for each, name in others.items():
+            since_ns, heard_at = self._claims.get(each, (0, inf))
+            if heard_at == inf:
+                was_first = self._first_seen[each] <= max(self._active_at, self.settled_at)
+                found.append(Rival(name, was_first))
+            elif since_ns > 0 and now < heard_at + SILENT_S:
+                found.append(Rival(name, (since_ns, each) < (self.since_ns, self.own)))
         return tuple(sorted(found))
-
-    def _is_active(self, identity: str, now: float) -> bool:
-        claim = self._claims.get(identity)
-        return claim is None or (claim.since_ns > 0 and now < claim.heard_at + SILENT_S)
-
-    def _was_first(self, identity: str) -> bool:
-        claim = self._claims.get(identity)
-        if claim is not None:
-            return (claim.since_ns, identity) < (self.since_ns, self.own)
-        return self._first_seen[identity] <= max(self._active_at, self.settled_at)
 
 
 class RivalWatch:
@@ -158,11 +140,13 @@ class RivalWatch:
         self.found: tuple[Rival, ...] = ()
         self._node, self._changed = node, changed
         own = identity_made_by(node, self.topic, advertise)
-        self._rivals = Rivals(own, node.begun_at + DISCOVERY_S)
+        # What discovery mostly takes: a publisher that is found so soon after the node was made was
+        # there before it.
+        self._rivals = Rivals(own, node.begun_at + 0.7)
         self._presence = Presence(node.context.get_domain_id(), self.topic, own)
         self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
         self._others: frozenset[str] = frozenset()
-        self._hello_until = -inf
+        self._hello_until = -inf  # until then others are told at every look who was first
         self._diagnostics: Subscription | None = None  # listened to only beside others
         node.create_timer(0.2, self.look, clock=node.steady_clock)
 
@@ -173,7 +157,10 @@ class RivalWatch:
 
     @property
     def complete(self) -> bool:
-        """Whether all controllers of this machine that were there at activation are found."""
+        """Whether all controllers of this machine that were there at activation are found.
+
+        They are waited for however long it takes.
+        """
         return not self._awaited
 
     @property
@@ -205,39 +192,30 @@ class RivalWatch:
 
     def look(self) -> None:
         """Look at the graph."""
-        now, before = time.monotonic(), self.found
-        others = self._other_publishers()
+        now, before, node = time.monotonic(), self.found, self._node
+        # Counting is ten times cheaper than asking who they are.
+        infos = node.get_publishers_info_by_topic(self.topic) \
+            if node.count_publishers(self.topic) > 1 else []
+        others = {identity_of(info): name_of(info) for info in infos}
+        others.pop(self._rivals.own, None)
         if self._awaited:
             self._awaited = self._awaited & self._presence.others() - others.keys()
             # Whoever has been found while it was waited for was there before.
             self._rivals.settled_at = max(self._rivals.settled_at, now)
         if self._others != others.keys():
-            self._others, self._hello_until = frozenset(others), now + HELLO_S
-        self._listen(bool(others))
-        self.found = self._rivals.among(others, now)
-        if before and not self.found:
-            self._node.log.info(f'nobody else publishes {self.topic} any more')
-        if self.found != before or (others and now < self._hello_until):
-            self._changed()
-
-    def _other_publishers(self) -> dict[str, str]:
-        # Counting is ten times cheaper than asking who they are.
-        if self._node.count_publishers(self.topic) < 2:
-            return {}
-        infos = self._node.get_publishers_info_by_topic(self.topic)
-        return {
-            identity: name_of(info) for info in infos
-            if (identity := identity_of(info)) != self._rivals.own
-        }
-
-    def _listen(self, wanted: bool) -> None:
-        if wanted and self._diagnostics is None:
-            self._diagnostics = self._node.create_subscription(
+            self._others, self._hello_until = frozenset(others), now + 2.0
+        if others and self._diagnostics is None:
+            self._diagnostics = node.create_subscription(
                 DiagnosticArray, topics.DIAGNOSTICS, self._hear, 10
             )
-        elif not wanted and self._diagnostics is not None:
-            self._node.destroy_subscription(self._diagnostics)
+        elif not others and self._diagnostics is not None:
+            node.destroy_subscription(self._diagnostics)
             self._diagnostics = None
+        self.found = self._rivals.among(others, now)
+        if before and not self.found:
+            node.log.info(f'nobody else publishes {self.topic} any more')
+        if self.found != before or (others and now < self._hello_until):
+            self._changed()
 
     def _hear(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -248,7 +226,7 @@ class RivalWatch:
 def name_of(info: TopicEndpointInfo) -> str:
     """Full name of the node that an endpoint belongs to."""
     # Names are discovered a little later than topics, and programs without ROS have none.
-    if 'UNKNOWN' in info.node_name:
+    if not info.node_name or 'UNKNOWN' in info.node_name:
         return UNNAMED
     return f'{info.node_namespace.rstrip("/")}/{info.node_name}'
 
@@ -264,21 +242,19 @@ def identity_of(info: TopicEndpointInfo) -> str:
 
 
 def identity_made_by(
-    node: Node, topic: str, advertise: Callable[[], Publisher],
+    node: Node, topic: str, advertise: Callable[[], Publisher], within_s: float = 10.0,
 ) -> str:
     """Identity of the publisher that advertise makes; rclpy has no way to ask for it."""
-    def seen() -> list[TopicEndpointInfo]:
-        return list(node.get_publishers_info_by_topic(topic))
-
-    own_name, before = node.get_fully_qualified_name(), set(map(identity_of, seen()))
+    own_name = node.get_fully_qualified_name()
+    before = {identity_of(info) for info in node.get_publishers_info_by_topic(topic)}
     advertise()
-    deadline = time.monotonic() + OWN_ENDPOINT_S
+    deadline = time.monotonic() + within_s
     while time.monotonic() < deadline:
         # A namesake that is discovered at this very moment has no name yet.
-        for info in seen():
+        for info in node.get_publishers_info_by_topic(topic):
             if identity_of(info) not in before and name_of(info) == own_name:
                 return identity_of(info)
         time.sleep(1e-3)
     raise RuntimeError(
-        f'the graph does not show the own publisher of {topic} within {OWN_ENDPOINT_S:g} s'
+        f'the graph does not show the own publisher of {topic} within {within_s:g} s'
     )

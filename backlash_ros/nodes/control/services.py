@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future as Writing
-from typing import cast
+from typing import Any, cast
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
@@ -27,37 +27,21 @@ def offer_services(
     it; each result says why it failed, empty if it did not. files: where to, empty for nowhere.
     """
 
-    def when_configured(
-        response: SetBool.Response | Trigger.Response, action: Callable[[ControlLoop], None],
-        done: str,
+    def offer(
+        kind: type[SetBool] | type[Trigger], name: str,
+        act: Callable[[ControlLoop, bool], None], done: tuple[str, str],
     ) -> None:
-        loops = loops_of()
-        for loop in loops:
-            action(loop)
-        response.success = bool(loops)
-        response.message = done if loops else UNCONFIGURED
-        node.get_logger().info(response.message)
+        """Act upon all loops; the bool, and which text it is done with, is what was asked for."""
+        def serve(request: Any, response: Any) -> Any:
+            loops, wanted = loops_of(), getattr(request, 'data', True)
+            for loop in loops:
+                act(loop, wanted)
+            response.success = bool(loops)
+            response.message = done[wanted] if loops else UNCONFIGURED
+            node.get_logger().info(response.message)
+            return response
 
-    def freeze(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        when_configured(
-            response, lambda loop: loop.adapt(not request.data),
-            'estimates are held' if request.data else 'the controller learns',
-        )
-        return response
-
-    def enable(request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        when_configured(
-            response, lambda loop: loop.compensate(request.data),
-            'the gap is compensated' if request.data else 'the gap is not compensated',
-        )
-        return response
-
-    def reset(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        when_configured(
-            response, lambda loop: loop.reset(),
-            'the estimates are those of estimator.initial',
-        )
-        return response
+        node.create_service(kind, name, serve)
 
     async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not loops_of():
@@ -77,9 +61,12 @@ def offer_services(
             response.message = why or f'saved in {files()}'
         return response
 
-    node.create_service(SetBool, '~/freeze_adaptation', freeze)
-    node.create_service(SetBool, '~/enable_compensation', enable)
-    node.create_service(Trigger, '~/reset_estimates', reset)
+    offer(SetBool, '~/freeze_adaptation', lambda loop, frozen: loop.adapt(not frozen),
+          ('the controller learns', 'estimates are held'))
+    offer(SetBool, '~/enable_compensation', lambda loop, on: loop.compensate(on),
+          ('the gap is not compensated', 'the gap is compensated'))
+    offer(Trigger, '~/reset_estimates', lambda loop, _: loop.reset(),
+          ('', 'the estimates are those of estimator.initial'))
     # In a group of its own, so that it does not keep the others waiting.
     node.create_service(
         Trigger, '~/save_estimates', cast(Callable[..., Trigger.Response], save),

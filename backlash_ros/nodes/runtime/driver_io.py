@@ -6,6 +6,7 @@ import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from math import nan
 from typing import Any, NamedTuple
 
 from rclpy.publisher import Publisher
@@ -16,7 +17,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REMEMBERED
-from backlash_ros.core.loop.sample_counter import JointOutputs
+from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.runtime.executor import Inbox
 from backlash_ros.nodes.runtime.messages import DEPTH, message_with, number_of
@@ -131,15 +132,15 @@ class DriverIo:
         """When a message left, on the clock of the stamps."""
         return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
 
-    def listen(self, hear: Callable[[JointOutputs], None], depth: int) -> Subscription:
+    def listen(self, hear: Callable[[Mapping[str, Output]], None], depth: int) -> Subscription:
         """Call hear with every y."""
         def hear_number(message: bytes, info: dict[str, Any]) -> None:
             sent_ns = info['source_timestamp']
             stamp_ns = self.now_ns() if self.simulated_time else sent_ns
-            hear(JointOutputs(
-                {'': number_of(message)}, stamp_ns, sent_ns, info['received_timestamp'],
+            hear({'': Output(
+                number_of(message), stamp_ns, sent_ns, info['received_timestamp'],
                 info['publication_sequence_number'],
-            ))
+            )})
 
         def hear_joints(message: JointState, info: dict[str, Any]) -> None:
             values = self.values(message)
@@ -155,10 +156,11 @@ class DriverIo:
                 lambda: self._node.count_publishers(self.topics.output),
             )
             # Drivers that leave the header empty are known by the stamp of the middleware.
-            hear(JointOutputs(
-                values, stamp_ns or self.stamp_ns(info), info['source_timestamp'],
+            message_of = Output(
+                nan, stamp_ns or self.stamp_ns(info), info['source_timestamp'],
                 info['received_timestamp'], number, numbered=False,
-            ))
+            )
+            hear({joint: message_of._replace(y=y) for joint, y in values.items()})
 
         of_joints = self.topics.output_type is JointState
         return self._node.listen(
@@ -248,11 +250,6 @@ class DriverIo:
         """v and stamp [ns] of what the driver has reported of a joint since the last call."""
         return iter(()) if self._reports is None else self._reports.of(joint)
 
-    def forget_reports(self) -> None:
-        """Drop them all: they are of no use to a loop that begins later."""
-        if self._reports is not None:
-            self._reports.forget()
-
 
 class HeaderStamps:
     """Stamps in the headers of the driver's messages, as far as they tell the time.
@@ -298,12 +295,6 @@ class Reports:
         new = self._new[joint]
         while new:
             yield new.popleft()
-
-    def forget(self) -> None:
-        """Drop them all."""
-        self._look()
-        for new in self._new.values():
-            new.clear()
 
     def _look(self) -> None:
         for message, info in self._inbox.take_all():

@@ -16,8 +16,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from backlash_ros import topics
-from backlash_ros.core.loop.figures import Finding, Level
-from backlash_ros.core.loop.level_log import LevelLog
+from backlash_ros.core.loop.finding import Finding, Level, LevelLog
 
 # std_msgs/Float64 as it goes over the wire: rclpy takes and publishes these bytes as they are, in
 # half the time of a message object. Four bytes name the encoding, the second one odd where the

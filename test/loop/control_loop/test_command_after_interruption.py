@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
@@ -17,7 +17,7 @@ def first_command(heard_at: int, reported_at: int) -> float:
     now = [0]
     p = Parameters({'control.min': -10.0, 'control.max': 10.0, 'control.rate_max': 100.0 * MOVE})
     loop = ControlLoop(
-        p, sent.append, lambda: now[0] * PERIOD_NS, None,
+        p, sent.append, Driver(lambda: now[0] * PERIOD_NS), None,
         SampleCounter(0.01, from_zero=False), 0.0,
     )
 
@@ -59,7 +59,7 @@ class SilentDriver:
             'control.rate_max': 100.0 * MOVE,
         })
         self.loop = ControlLoop(
-            self._p, self.sent.append, lambda: self._k * PERIOD_NS, None,
+            self._p, self.sent.append, Driver(lambda: self._k * PERIOD_NS), None,
             SampleCounter(0.01, from_zero=False), 8.0,
         )
         self.loop.take_reference(30.0)
@@ -94,8 +94,10 @@ def test_reports_are_heard_first_where_a_gap_makes_the_loop_begin_again() -> Non
             'timeout.plant_output': 0.05, 'control.min': -10.0, 'control.max': 10.0,
             'control.rate_max': 10.0,
         }),
-        lambda v: None, lambda: stamp_ns, None, SampleCounter(0.01), 0.0,
-        reports=lambda: [(2.5, stamp_ns - 1000)] if stamp_ns == back * PERIOD_NS else [],
+        lambda v: None, Driver(
+            lambda: stamp_ns,
+            lambda: [(2.5, stamp_ns - 1000)] if stamp_ns == back * PERIOD_NS else [],
+        ), None, SampleCounter(0.01), 0.0,
     )
     loop.take_reference(0.0)
     for k in (1, 2, 3, back):

@@ -6,8 +6,9 @@ from math import inf, isnan, nan
 import numpy as np
 
 from backlash_ros.core.assembly import first_guess
+from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.joint_loops import JointLoops
-from backlash_ros.core.loop.sample_counter import JointOutputs, SampleCounter
+from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash
 
@@ -41,7 +42,9 @@ def run(spoil: Spoil, samples: int = SAMPLES) -> dict[str, list[float]]:
 
     p = parameters()
     before = {joint: first_guess(p.of_joint(joint)) for joint in JOINTS}
-    loops = JointLoops(p, send, lambda: now_ns, before, SampleCounter(PERIOD))
+    loops = JointLoops(
+        p, send, lambda joint: Driver(lambda: now_ns), before, SampleCounter(PERIOD)
+    )
     plays = {joint: Backlash(1.0, 0.03 + 0.01 * k, -0.04) for k, joint in enumerate(JOINTS)}
     y = dict.fromkeys(JOINTS, 0.0)
     v = dict.fromkeys(JOINTS, 0.0)
@@ -51,7 +54,10 @@ def run(spoil: Spoil, samples: int = SAMPLES) -> dict[str, list[float]]:
             joint: 0.5 * np.sin(0.02 * k + i) for i, joint in enumerate(JOINTS)
         })
         newest.clear()
-        loops.answer(JointOutputs(spoil(k, dict(y)), now_ns, now_ns, now_ns, k, False))
+        loops.answer({
+            joint: Output(value, now_ns, now_ns, now_ns, k, False)
+            for joint, value in spoil(k, dict(y)).items()
+        })
         for i, joint in enumerate(JOINTS):
             sent[joint].append(newest.get(joint, nan))
             v[joint] = newest.get(joint, v[joint])

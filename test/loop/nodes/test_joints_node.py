@@ -10,7 +10,7 @@ import pytest
 from node_in_process import START_NS, node_with
 from rclpy.parameter import Parameter
 
-from backlash_ros.core.loop.sample_counter import JointOutputs
+from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.tools.bringup.environment import free_domain
 
 JOINTS = ('waist', 'elbow', 'gripper')
@@ -40,9 +40,10 @@ class Arm:
         """Let it hear outputs of the next sample; returns the joints that it answers."""
         self._k += 1
         before, stamp_ns, arrived = len(self.sent), START_NS + PERIOD_NS * self._k, time.time_ns()
-        self.node._on_output(
-            JointOutputs(y, stamp_ns, arrived, arrived, self._k, numbered=False)
-        )
+        self.node._on_output({
+            joint: Output(value, stamp_ns, arrived, arrived, self._k, numbered=False)
+            for joint, value in y.items()
+        })
         return [joint for commands in self.sent[before:] for joint in commands]
 
     def commanded(self, y_m: float) -> dict[str, float]:

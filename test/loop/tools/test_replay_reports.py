@@ -9,7 +9,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
@@ -39,7 +39,7 @@ class LimitingDriver:
     def run(self) -> RunRecord:
         p, now_ns = self._p, START_NS
         plant, reference = build_plant(p), build_reference(p)
-        loop = ControlLoop(p, lambda v: None, lambda: now_ns, None, SampleCounter(0.01))
+        loop = ControlLoop(p, lambda v: None, Driver(lambda: now_ns), None, SampleCounter(0.01))
         applied = 0.0
         for k in range(SAMPLES):
             sampled_ns = START_NS + k * PERIOD_NS

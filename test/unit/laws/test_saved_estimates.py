@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import load_estimate, save_estimate, worth_saving
-from backlash_ros.core.loop.control_loop import ControlLoop
+from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -142,7 +142,7 @@ def test_whoever_builds_a_controller_begins_with_what_was_known(tmp_path: Path) 
     run = build_closed_loop(p).run(30)
     assert run.column('c_l')[0] == LEARNED.c_l
     assert replay(run, p).column('c_l')[0] == LEARNED.c_l
-    loop = ControlLoop(p, lambda v: None, lambda: 0, None, SampleCounter(0.01))
+    loop = ControlLoop(p, lambda v: None, Driver(lambda: 0), None, SampleCounter(0.01))
     assert loop.estimate.m == LEARNED.m
     loop.reset()
     assert loop.estimate.m == p.estimator.initial.m

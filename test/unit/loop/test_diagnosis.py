@@ -9,15 +9,23 @@ import pytest
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.law import LawReport
-from backlash_ros.core.loop.diagnosis import CAUSES, LONGEST_TEXT, UNNAMED, findings_of
+from backlash_ros.core.loop.diagnosis import (
+    CAUSES,
+    LONGEST_TEXT,
+    UNNAMED,
+    LoopFigures,
+    Peer,
+    TopicFigures,
+    findings_of,
+)
 from backlash_ros.core.loop.driver_period import Period
-from backlash_ros.core.loop.figures import Finding, Level, LoopFigures, Peer, TopicFigures
+from backlash_ros.core.loop.finding import Finding, Level
 
 DRIVER, OTHER = Peer('/driver', 'Float64'), Peer('/other', 'Float64')
 WELL = LoopFigures(
-    0.005, TopicFigures('plant_output', peers=(DRIVER,)),
-    TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
-    TopicFigures('control', peers=(DRIVER,)), status=Status.TRACKING,
+    sample_period=0.005, output=TopicFigures('plant_output', peers=(DRIVER,)),
+    reference=TopicFigures('reference', peers=(Peer('/reference', 'Float64'),)),
+    control=TopicFigures('control', peers=(DRIVER,)), status=Status.TRACKING,
     intervals_s=(0.005, 0.005, 0.005), used=600,
 )
 INCONSISTENT = replace(WELL, status=Status.INCONSISTENT)

@@ -13,7 +13,7 @@ def stamped(ticks: Iterable[float], period_s: float) -> DriverPeriod:
     """What is known of a driver that has sent messages at these times [periods]."""
     sender = DriverPeriod(period_s)
     for tick in ticks:
-        sender.note(1_800_000_000_000_000_000 + round(tick * period_s * 1e9))
+        sender.follow(1_800_000_000_000_000_000 + round(tick * period_s * 1e9))
     return sender
 
 

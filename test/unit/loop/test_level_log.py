@@ -1,7 +1,6 @@
 """Which diagnostics become a line of the log."""
 
-from backlash_ros.core.loop.figures import Finding, Level
-from backlash_ros.core.loop.level_log import AGAIN_S, LASTS_S, LevelLog
+from backlash_ros.core.loop.finding import AGAIN_S, LASTS_S, Finding, Level, LevelLog
 
 WELL = Finding(Level.OK, 'learned', 'learned')
 WRONG = Finding(Level.ERROR, 'model', 'the model is wrong')

@@ -15,9 +15,9 @@ def test_what_was_gained_lately_is_never_negative_after_a_new_beginning() -> Non
 
 
 def noted(values: list[float], still_band: float = 0.0) -> LoopStatistics:
-    statistics = LoopStatistics(still_band)
+    statistics = LoopStatistics(still_band=still_band)
     for k, y in enumerate(values):
-        statistics.note(y, float(k % 5), False, 0.0)
+        statistics.note(y, float(k % 5), False, False, 0.0)
     return statistics
 
 

@@ -70,7 +70,7 @@ def test_a_late_command_leaves_the_older_one_in_use_until_it_comes() -> None:
     commands.publish(2.0, START_NS + PERIOD_NS + int(1.5 * PERIOD_NS))
     # y(1) was answered one and a half periods later; y(2) and y(3) are lost, y(4) arrives.
     assert over(commands, 3, 4.0) == [1.0, 2.0, 2.0]
-    assert commands.late == 1
+    assert commands.counts.late == 1
 
 
 def test_a_command_that_came_while_the_driver_was_held_up_missed_its_sample() -> None:
@@ -136,7 +136,7 @@ def test_a_report_that_comes_after_its_output_is_not_taken_for_the_next_one() ->
     assert commands.reported_over(1, START_NS + PERIOD_NS) == []
     commands.report(10.0, START_NS + PERIOD_NS - 1000)
     assert commands.reported_over(1, START_NS + 2 * PERIOD_NS) == []
-    assert commands.unreported == 2
+    assert commands.counts.unreported == 2
 
 
 def test_the_report_of_an_interval_that_took_longer_holds_for_all_of_it() -> None:
@@ -159,7 +159,7 @@ def uses(pattern: list[bool], use: ReportUse = ReportUse.AUTO) -> tuple[list[boo
         if is_reported:
             commands.report(float(k), START_NS + k * PERIOD_NS - 1000)
         used.append(commands.reported_over(1, START_NS + k * PERIOD_NS) == [float(k)])
-    return used, commands.unreported
+    return used, commands.counts.unreported
 
 
 def test_reports_are_used_once_every_interval_has_had_one_and_until_they_stop() -> None:
