@@ -367,7 +367,12 @@ for _sequence in (list, tuple):
 
 
 def write_config(parameters: Parameters, path: Path) -> None:
-    """Write the complete set as a ROS 2 parameter file that every node accepts.
+    """Write the complete set as a ROS 2 parameter file that every node accepts."""
+    write_atomically(path, config_text(parameters))
+
+
+def config_text(parameters: Parameters) -> str:
+    """Content of that file.
 
     What is of bringup alone stands in a section of its own, and only if it is given. Empty lists,
     which ROS 2 does not have, are left out.
@@ -384,12 +389,7 @@ def write_config(parameters: Parameters, path: Path) -> None:
     document = {EVERY_NODE: {'ros__parameters': of_all}}
     if own:
         document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
-    write_atomically(path, yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000))
-
-
-def yaml_value(value: Value) -> str:
-    """A value as one line of YAML that every reader takes for the same type."""
-    return yaml.dump(value, Dumper=_Dumper, width=10000).removesuffix('...\n').strip()
+    return yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000)
 
 
 def _tree(parameters: Parameters, written: Sequence[Parameter]) -> dict[str, Any]:

@@ -5,32 +5,19 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.options import FAILED, OptionParser, positive
-from backlash_ros.tools.cli import (
-    Span,
-    add_out_option,
-    add_span_options,
-    run_tool,
-    span_of,
-)
-from backlash_ros.tools.identify.names import INTEGRATORS
+from backlash_ros.tools.cli import add_out_option, add_span_options, run_tool, span_of
 from backlash_ros.tools.records.columns import parse_columns
-
-if TYPE_CHECKING:
-    from backlash_ros.core.records.record import Record
-
-EXECUTABLE = 'identify'
 
 
 def make_parser() -> argparse.ArgumentParser:
     """The options."""
     parser = OptionParser(
-        EXECUTABLE, description=__doc__,
+        'identify', description=__doc__,
         epilog='Exit codes: 0 the backlash is known, 1 it is not, 2 bad input.',
     )
     parser.add_argument('record', type=Path, nargs='?', metavar='RECORD',
@@ -45,17 +32,19 @@ def make_parser() -> argparse.ArgumentParser:
                         help='parameter file that the result goes on from: limits, topics, axes')
     parser.add_argument('--axis', default='', metavar='NAME',
                         help='of several: the one that is meant')
-    parser.add_argument('--order', type=_range_to(6, 0), default=(0, 1, 2, 3, 4),
+    parser.add_argument('--order', type=lambda text: _numbers(text, 6), default=(0, 1, 2, 3, 4),
                         metavar='N[-N]', help='numbers of poles that are compared (default: 0-4)')
-    parser.add_argument('--delay', type=_range_to(40, 0), default=(), metavar='N[-N]',
+    parser.add_argument('--delay', type=lambda text: _numbers(text, 40), default=(),
+                        metavar='N[-N]',
                         help='delays that are compared [samples] (default: 0-3, and those up to '
                              '40 if they fit better)')
-    parser.add_argument('--integrator', choices=sorted(INTEGRATORS), default='auto',
+    parser.add_argument('--integrator', choices=('auto', 'no', 'yes'), default='auto',
                         help='whether G has a pole at 1 (default: auto)')
     parser.add_argument('--slope', type=positive, default=1.0, metavar='M',
                         help='m, a gear ratio for instance; it cannot be told from the gain of G '
                              '(default: 1)')
-    parser.add_argument('--held-out', type=_share, default=1.0 / 3.0, metavar='SHARE',
+    parser.add_argument('--held-out', type=lambda text: _share(text, 0.1, 0.6),
+                        default=1.0 / 3.0, metavar='SHARE',
                         help='share at the end of the record on which structures are compared '
                              '(default: 0.33)')
     add_span_options(parser)
@@ -66,7 +55,8 @@ def make_parser() -> argparse.ArgumentParser:
                             'control.rate_max of --config, record, bring it to rest, identify')
     drive.add_argument('--duration', type=positive, metavar='S', default=20.0,
                        help='longest motion [s] (default: 20)')
-    drive.add_argument('--precision', type=_percent, default=0.0, metavar='P%',
+    drive.add_argument('--precision', type=lambda text: _share(text, 0.0, 0.99), default=0.0,
+                       metavar='P%',
                        help='end the motion as soon as gap and G are known to this (default: 0, '
                             'the whole duration)')
     drive.add_argument('--amplitude', type=positive, metavar='V', help='keep v within ±V as well')
@@ -81,34 +71,22 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _range_to(most: int, least: int) -> Callable[[str], tuple[int, ...]]:
-    def parse(text: str) -> tuple[int, ...]:
-        first, dash, last = text.partition('-')
-        try:
-            low = int(first)
-            high = int(last) if dash else low
-        except ValueError:
-            raise argparse.ArgumentTypeError(f'{text!r} must be like {least} or {least}-4') \
-                from None
-        if not least <= low <= high <= most:
-            raise argparse.ArgumentTypeError(
-                f'{text} must lie within {least}-{most}, the smaller number first'
-            )
-        return tuple(range(low, high + 1))
-    return parse
+def _numbers(text: str, most: int) -> tuple[int, ...]:
+    first, _, last = text.partition('-')
+    if not (first.isdecimal() and (last or first).isdecimal()
+            and int(first) <= int(last or first) <= most):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} must be a number, or two like 0-{most}, the smaller one first, up to {most}')
+    return tuple(range(int(first), int(last or first) + 1))
 
 
-def _percent(text: str) -> float:
-    number = float(text.removesuffix('%')) / (100.0 if text.endswith('%') else 1.0)
-    if not 0.0 <= number < 1.0:
-        raise argparse.ArgumentTypeError(f'{text} must be like 1% or 0.01')
-    return number
-
-
-def _share(text: str) -> float:
-    number = float(text)
-    if not 0.1 <= number <= 0.6:
-        raise argparse.ArgumentTypeError(f'{text} must lie within 0.1 and 0.6')
+def _share(text: str, least: float, most: float) -> float:
+    try:
+        number = float(text.removesuffix('%')) / (100.0 if text.endswith('%') else 1.0)
+    except ValueError:
+        number = -1.0
+    if not least <= number <= most:
+        raise argparse.ArgumentTypeError(f'{text!r} must be {least:g} to {most:g}, or in %')
     return number
 
 
@@ -117,9 +95,9 @@ def main(args: Sequence[str] | None = None) -> int:
     # The matrices are small: more threads of BLAS would cost more than they bring.
     os.environ.setdefault('OMP_NUM_THREADS', '1')
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    outcome: list[bool] = []
-    code = run_tool(EXECUTABLE, lambda: outcome.append(_identify(args)))
-    return FAILED if outcome == [False] else code
+    known: list[bool] = []
+    code = run_tool('identify', lambda: known.append(_identify(args)))
+    return FAILED if known == [False] else code
 
 
 def _identify(args: Sequence[str] | None) -> bool:
@@ -128,38 +106,29 @@ def _identify(args: Sequence[str] | None) -> bool:
     arguments = list(sys.argv[1:] if args is None else args)
     # Names of topics are changed as for every node.
     of_ros = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
-    options = parser.parse_args(arguments[:of_ros])
+    options, ros_arguments = parser.parse_args(arguments[:of_ros]), arguments[of_ros:]
     if options.drive == (options.record is not None):
         parser.error('give a RECORD, or --drive')
-    if arguments[of_ros:] and not options.drive:
+    if ros_arguments and not options.drive:
         parser.error('--ros-args are for --drive')
     span = span_of(parser, options)
-    given = given_values(options.config, options.axis)
-    record = _recorded(options, span, given, arguments[of_ros:])
-    from backlash_ros.tools.identify.outcome import identified, write_outcome
-    found = identified(record, options)
-    return write_outcome(found, record, given, options)
-
-
-def _recorded(
-    options: argparse.Namespace, span: Span, given: Mapping[str, Value],
-    ros_arguments: Sequence[str],
-) -> Record:
+    given = _given_values(options.config, options.axis)
     # numpy, scipy and matplotlib are loaded once the options are known to be right.
     if options.drive:
         from backlash_ros.tools.identify.drive import drive
         if options.axis:
             ros_arguments = [*(ros_arguments or ['--ros-args']), '-r', f'__ns:=/{options.axis}']
-        return drive(options, given, ros_arguments)
-    from backlash_ros.tools.records.reading import read_record
-    period = options.period or given.get('sample_period')
-    return read_record(
-        options.record, period if isinstance(period, float) else None, span, options.axis,
-        options.columns,
-    )
+        record = drive(options, given, ros_arguments)
+    else:
+        from backlash_ros.tools.records.reading import read_record
+        period = options.period or given.get('sample_period')
+        record = read_record(options.record, period if isinstance(period, float) else None, span,
+                             options.axis, options.columns)
+    from backlash_ros.tools.identify.outcome import identified, write_outcome
+    return write_outcome(identified(record, options), record, given, options)
 
 
-def given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
+def _given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
     """What the user's file holds for the axis; nothing without a file."""
     if config is None:
         return {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,42 +19,46 @@ from backlash_ros.core.identification.identification import (
     Options,
     identifying,
 )
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.cli import BrokenOffError, format_table
 from backlash_ros.tools.identify.identified_file import (
+    alike,
     as_estimate,
     commented_yaml,
     identified_parameters,
     numbers,
 )
-from backlash_ros.tools.identify.names import ESTIMATES, INTEGRATORS, JSON, PAGE, YAML
-from backlash_ros.tools.identify.page import render
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
+YAML, JSON, PAGE, ESTIMATES = (
+    'identified.yaml', 'identified.json', 'identify.html', 'estimates.json')
+INTEGRATORS = {'auto': (False, True), 'yes': (True,), 'no': (False,)}
 
-def options_of(options: argparse.Namespace) -> Options:
-    """What is compared, from the options of the command line."""
-    return Options(
+
+def identifying_record(
+    record: Record, options: argparse.Namespace,
+) -> Generator[str, None, Identification]:
+    """Identify with what the command line says; yields what is being done."""
+    found = yield from identifying(record.v, record.y, record.sample_period, Options(
         options.order, options.delay, INTEGRATORS[options.integrator], options.slope,
         options.held_out,
-    )
+    ))
+    return found if record.commands is None else with_actuator(found, record.commands)
 
 
 def identified(record: Record, options: argparse.Namespace) -> Identification:
-    """Identify, with a bar on a terminal."""
-    work = identifying(record.v, record.y, record.sample_period, options_of(options))
+    """Identify, with a bar on a terminal; raises BrokenOffError."""
+    work = identifying_record(record, options)
     with tqdm(file=sys.stderr, disable=None, leave=False, bar_format='{desc}: {elapsed}') as bar:
         while True:
             try:
                 bar.set_description_str(next(work))
             except StopIteration as done:
                 found: Identification = done.value
-                commands = record.commands
-                return found if commands is None else with_actuator(found, commands)
+                return found
             except np.linalg.LinAlgError as error:
                 raise BrokenOffError(f'the record cannot be fitted: {error}') from error
 
@@ -64,42 +68,41 @@ def write_outcome(
     options: argparse.Namespace,
 ) -> bool:
     """Write the files, print the outcome; returns whether the backlash is known."""
-    parameters: Parameters | None = None
     out = result_directory(options.out)
+    text = None
     if found.usable:
         (out / ESTIMATES).unlink(missing_ok=True)  # of a record before, if any
         try:
             parameters = identified_parameters(found, given, out.resolve() / ESTIMATES)
+            text = commented_yaml(parameters, found, record.source, options.axis)
+            write_atomically(out / YAML, text)
+            save_estimate(out / ESTIMATES, as_estimate(found, parameters), parameters)
         except ParameterError as error:
             found = replace(found, reasons=(f'the controller does not take it: {error}',))
     write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes}, out / JSON)
     write_record(record, out / 'record.csv')
     # Matplotlib is loaded where there is something to draw.
-    from backlash_ros.tools.identify.pictures import draw
-    pictures = list(draw(found))
-    for picture in pictures:
+    from backlash_ros.tools.identify.page import render
+    from backlash_ros.tools.identify.pictures import pictures
+    drawn = list(pictures(found))
+    for picture in drawn:
         write_atomically(out / picture.name, picture.data)
-    text = None
-    if parameters is not None:
-        text = commented_yaml(parameters, found, record.source, options.axis)
-        write_atomically(out / YAML, text)
-        save_estimate(out / ESTIMATES, as_estimate(found, parameters), parameters)
-    write_atomically(out / PAGE, render(found, record.source, pictures, text))
-    _tell(found, record, out)
+    write_atomically(out / PAGE, render(found, record, drawn, text))
+    _print(found, record)
+    print(out / (YAML if found.usable else JSON))
+    print(out / PAGE)
     return found.verdict is not None and found.verdict.backlash.known
 
 
 def write_record(record: Record, path: Path) -> None:
     """Write t, v, y, and the commands where they are others, as a CSV that `identify` reads."""
-    columns = [record.v, record.y, *([] if record.commands is None else [record.commands])]
-    rows = [
-        (k * record.sample_period, *values)
-        for k, values in enumerate(np.column_stack(columns).tolist())
-    ]
-    write_table(path, (*ROLES, COMMAND)[:len(columns) + 1], rows)
+    t = record.sample_period * np.arange(len(record.v))
+    commands = [] if record.commands is None else [record.commands]
+    rows = np.column_stack([t, record.v, record.y, *commands]).tolist()
+    write_table(path, (*ROLES, COMMAND)[:3 + len(commands)], rows)
 
 
-def _tell(found: Identification, record: Record, out: Path) -> None:
+def _print(found: Identification, record: Record) -> None:
     if found.verdict is not None:
         print('\n'.join(found.verdict.lines))
     if found.details is not None:
@@ -109,9 +112,7 @@ def _tell(found: Identification, record: Record, out: Path) -> None:
         ]))
         print(f'G(z): {len(found.denominator) - 1} poles'
               + (', one of them an integrator' if found.integrator else '')
-              + f', delay {found.delay}'
-              + (f' ({found.delays[0]} to {found.delays[-1]} fit alike)'
-                 if len(found.delays) > 1 else '')
+              + f', delay {found.delay}{alike(found)}'
               + f', known to {found.response_std.max():.2g} of itself; noise of y '
               + f'{found.noise_std:.3g}')
     if found.actuator is not None:
@@ -126,5 +127,3 @@ def _tell(found: Identification, record: Record, out: Path) -> None:
         # That the backlash is not known stands in the first lines.
         if found.verdict is None or found.verdict.backlash.known:
             print(f'no {YAML}: {text}')
-    print(out / (YAML if found.usable else JSON))
-    print(out / PAGE)

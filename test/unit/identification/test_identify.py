@@ -20,8 +20,7 @@ from backlash_ros.tools.records.reading import read_record
 QUICK = ('--order', '1-2', '--delay', '0-1')
 FILES = {
     'identified.yaml', 'identified.json', 'identify.html', 'estimates.json', 'record.csv',
-    'held_out.png', 'residual.png', 'gap.png', 'orders.png', 'poles_zeros.png', 'bode.png',
-    'loop.png',
+    'held_out.png', 'loop.png', 'gap.png', 'residual.png', 'bode.png',
 }
 
 
