@@ -122,8 +122,7 @@ def simulation_speeds(values: Mapping[str, object]) -> list[str]:
 def measure_soak(duration_s: float) -> Section:
     """Samples that are lost at 1 kHz, and what the controller keeps."""
     return Section(
-        'At 1 kHz', 'Plant, reference and controller as processes in real time, beside a process '
-        'that does nothing but sleep until the next period.', CHECK_HEADER,
+        'At 1 kHz', 'Plant, reference and controller as processes in real time.', CHECK_HEADER,
         checks=soak_checks(3.0 * duration_s),
     )
 

@@ -1,9 +1,8 @@
-"""A headless Chromium, told what to do by its DevTools protocol: for pictures, tests, loads."""
+"""A headless Chromium, told what to do by its DevTools protocol."""
 
 from __future__ import annotations
 
 import asyncio
-import base64
 import os
 import shutil
 import subprocess
@@ -70,24 +69,6 @@ class Tab:
             await asyncio.wait_for(look(), patience_s)
         except asyncio.TimeoutError:
             raise TimeoutError(f'not within {patience_s:g} s: {expression}') from None
-
-    async def picture(self, width: int, height: int, scheme: str = 'light') -> bytes:
-        """The page as a PNG file. scheme: light or dark."""
-        await self.call(
-            'Emulation.setDeviceMetricsOverride', width=width, height=height,
-            deviceScaleFactor=1, mobile=False,
-        )
-        await self.call('Emulation.setEmulatedMedia', features=[
-            {'name': 'prefers-color-scheme', 'value': scheme}
-        ])
-        # Both are in force with the frame after the next one.
-        await self.call(
-            'Runtime.evaluate', awaitPromise=True, expression=(
-                'new Promise((done) => setTimeout(() => requestAnimationFrame(done), 300))'
-            )
-        )
-        answer = await self.call('Page.captureScreenshot', format='png')
-        return base64.b64decode(answer['data'])
 
 
 class Browser:

@@ -1,1 +1,0 @@
-"""Two hosts on this machine, and a cable between them."""
