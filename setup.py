@@ -17,7 +17,7 @@ setup(
     packages=find_packages(exclude=['test*']),
     package_data={
         f'{PACKAGE}.middleware': ['loopback.xml', 'network.xml'],
-        f'{PACKAGE}.nodes.live': ['page.html'],
+        f'{PACKAGE}.nodes.watching': ['page.html'],
     },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
@@ -60,8 +60,8 @@ setup(
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
             f'identify = {PACKAGE}.tools.identify.command:main',
             f'replay = {PACKAGE}.tools.replay.command:main',
-            f'monitor = {PACKAGE}.nodes.monitor.command:main',
-            f'live = {PACKAGE}.nodes.live.command:main',
+            f'monitor = {PACKAGE}.nodes.monitor:main',
+            f'live = {PACKAGE}.nodes.live:main',
         ],
     },
 )

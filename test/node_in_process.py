@@ -30,7 +30,7 @@ from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.nodes.controller import ControllerNode
-from backlash_ros.nodes.runtime.executor import make_executor
+from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.tools.bringup.environment import free_domain
 
 START_NS = 1_800_000_000_000_000_000
@@ -98,7 +98,7 @@ class Bench:
         self.sent: list[float] = []
         p = Parameters({'output_noise_std': NOISE})
         self.plant, self._reference = build_plant(p), build_reference(p)
-        self._executor = make_executor(node, lambda text: None)
+        self._executor = PromptExecutor(node)
         self._k = 0
         catch_commands(node, self.sent.append)
         self.node._io.now_ns = lambda: self._now_ns + 1_000_000

@@ -10,73 +10,56 @@ from pathlib import Path
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros import topics
-from backlash_ros.core.driver_check.findings import Message
-from backlash_ros.core.driver_check.gentle_drive import Drive, IdentificationDrive, Range
-from backlash_ros.nodes.check_driver import CheckDriverNode
+from backlash_ros.core.driver_check.gentle_drive import IdentificationDrive
+from backlash_ros.nodes.drive.motion_node import MotionNode
 from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED
 
-EXECUTABLE = 'identify'
+IDENTIFY = 'identify'
 
 
-class IdentificationDriveNode(CheckDriverNode):
-    """Waits for a driver, moves v, comes to rest; writes what it heard and sent as it goes.
+class IdentificationDriveNode(MotionNode):
+    """Writes what it hears and sends as it goes.
 
     Each line of the file is a message: topic, time stamp [ns], value.
     """
 
-    program = EXECUTABLE
-
     def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__(options)
+        super().__init__(IDENTIFY, options, IdentificationDrive)
         self._file = options.messages.open('w', encoding='ascii')
-        self._written: dict[str, int] = {}
+        self._written = {
+            topics.CONTROL: 0, topics.APPLIED_CONTROL: 0, topics.PLANT_OUTPUT: 0,
+        }
 
-    def _begin_drive(self, limits: Range) -> Drive:
-        return IdentificationDrive(
-            limits, self._period, self._options.duration, self._v_at_start()
-        )
-
-    def _look_at_graph(self) -> None:
-        super()._look_at_graph()
-        self._write()
-
-    def _write(self) -> None:
-        """Append what is new."""
-        heard = self._heard
-        for topic, messages in (
-            (topics.CONTROL, heard.controls), (topics.APPLIED_CONTROL, heard.applied),
-            (topics.PLANT_OUTPUT, heard.outputs),
+    def look(self) -> None:
+        super().look()
+        heard = self.heard
+        for topic, messages in zip(
+            self._written, (heard.controls, heard.applied, heard.outputs), strict=True
         ):
             self._file.writelines(
-                _line(topic, message) for message in messages[self._written.get(topic, 0):]
+                f'{topic},{message.stamp_ns},{message.value!r}\n'
+                for message in messages[self._written[topic]:]
             )
             self._written[topic] = len(messages)
         self._file.flush()
 
-    def _tell(self) -> None:
-        self._write()
+    def tell(self) -> None:
         self._file.close()
-        if self._range_left is not None:
-            print(f'{EXECUTABLE}: y = {self._range_left:.4g} left --output-range: drive ended',
-                  file=sys.stderr)
-        outputs = self._names[topics.PLANT_OUTPUT]
-        if self._drive is not None and self._silent_s:
-            print(f'{EXECUTABLE}: nothing was heard on {outputs} for {self._silent_s:g} s: drive '
-                  'ended', file=sys.stderr)
-        if self._drive is None:
-            why = 'nobody subscribes to ' + self._names[topics.CONTROL] if self._heard.outputs \
-                else f'nothing was heard on {outputs}'
-            print(f'{EXECUTABLE}: the actuator was not moved: {why}', file=sys.stderr)
-        self.exit_code = DONE if self._drive is not None else FAILED
+        if self.ended:
+            self.say(f'{self.ended}: drive ended')
+        if self.motion is None:
+            why = f'nobody subscribes to {self.names[topics.CONTROL]}' if self.heard.outputs \
+                else f'nothing was heard on {self.names[topics.PLANT_OUTPUT]}'
+            self.say(f'the actuator was not moved: {why}')
+        self.exit_code = FAILED if self.motion is None else DONE
 
 
-def _line(topic: str, message: Message) -> str:
-    return f'{topic},{message.stamp_ns},{message.value!r}\n'
-
-
-def _options(arguments: list[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog=EXECUTABLE)
+def main(args: list[str] | None = None) -> int:
+    """Entry point; returns the exit code. The options are those that `identify` has checked."""
+    arguments = sys.argv[1:] if args is None else args
+    parser = argparse.ArgumentParser(prog=IDENTIFY)
+    parser.set_defaults(drive=True)
     parser.add_argument('--messages', type=Path, required=True)
     parser.add_argument('--config', required=True)
     for name in ('duration', 'wait', 'rest'):
@@ -84,17 +67,9 @@ def _options(arguments: list[str]) -> argparse.Namespace:
     for name in ('amplitude', 'rate'):
         parser.add_argument(f'--{name}', type=float)
     parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf))
-    options = parser.parse_args(arguments)
-    options.drive = True
-    return options
-
-
-def main(args: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    arguments = sys.argv[1:] if args is None else args
-    options = _options(remove_ros_args(['', *arguments])[1:])
+    options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
     return run(
-        EXECUTABLE, lambda: IdentificationDriveNode(options),
+        IDENTIFY, lambda: IdentificationDriveNode(options),
         ['--ros-args', '--params-file', options.config, *ros_arguments(arguments)],
     )
 

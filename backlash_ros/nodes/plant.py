@@ -19,7 +19,7 @@ from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import PLANT
 from backlash_ros.core.scenario import build_plant
-from backlash_ros.nodes.runtime.executor import NodeExecutor
+from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import (
     DEPTH,
     DIAGNOSTICS_PERIOD_S,
@@ -31,18 +31,15 @@ from backlash_ros.nodes.runtime.messages import (
     message_with,
 )
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
-from backlash_ros.nodes.runtime.process import ProcessNode, emit, run, spin_paced
+from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
-# Share of a period after which it is too late to publish an output: it would look like the next.
-LATEST_SHARE = 0.75
-LATE_CONTROLS, MISSED_OUTPUTS = 'late controls', 'missed outputs'
-BAD_CONTROLS = 'non-finite controls dropped'
+LATE, MISSED, BAD = 'late controls', 'missed outputs', 'non-finite controls dropped'
 
 
 class PlantTopics:
-    """What the plant publishes. truth_rows: those that wait until y has left.
+    """What the plant publishes of each sample: y at once, the truth after it.
 
-    outputs: how many have left. newest: sample of the newest of these.
+    outputs: how many y have left. newest: sample of the newest of these.
     """
 
     def __init__(self, node: ProcessNode) -> None:
@@ -51,10 +48,9 @@ class PlantTopics:
         self._truth = LabelledArrayPublisher(
             node, topics.of_node(topics.TRUTH), topics.TRUTH_LABELS
         )
-        self._time = (
-            node.create_publisher(Clock, topics.CLOCK, KEPT_QOS) if node.settings.lockstep else None
-        )
-        self.truth_rows: list[tuple[float, ...]] = []
+        self._clock = node.create_publisher(Clock, topics.CLOCK, KEPT_QOS) \
+            if node.settings.lockstep else None
+        self.truth_rows: list[tuple[float, ...]] = []  # that wait until y has left
         self.outputs, self.newest = 0, -1
 
     def has_listeners(self, wanted: int) -> bool:
@@ -64,13 +60,10 @@ class PlantTopics:
             and self.applied.get_subscription_count() >= recorders \
             and self._output.get_subscription_count() >= wanted
 
-    def tick(self, now_ns: int) -> None:
-        """Tell the simulated time, in lockstep."""
-        assert self._time is not None
-        self._time.publish(clock_message(now_ns))
-
-    def publish_output(self, y: float, sample: int) -> None:
-        """Publish y of a sample."""
+    def publish_output(self, y: float, sample: int, time_s: float) -> None:
+        """Publish y of a sample, in lockstep after the simulated time."""
+        if self._clock is not None:
+            self._clock.publish(clock_message(round(time_s * 1e9)))
         self._output.publish(message_with(y))
         self.outputs, self.newest = self.outputs + 1, sample
 
@@ -101,11 +94,8 @@ class PlantNode(ProcessNode):
         self._loss_rng = np.random.default_rng([p.seed, 1])
         self._started = False
         self._held = HeldControl()  # times of arrival on the monotonic clock
-        self._heard = False  # a first v has come
-        self._expecting = False  # no v has come since the newest output
-        self._tick = 0
-        self._latest_ns = 0
-        self._counts = {LATE_CONTROLS: 0, MISSED_OUTPUTS: 0, BAD_CONTROLS: 0}
+        self._heard = self._expecting = False  # a first v; none since the newest output
+        self._counts = {LATE: 0, MISSED: 0, BAD: 0}
         self._lately = Lately()
         self._published = PlantTopics(self)
         self._diagnostics = DiagnosticsPublisher(self, 'simulated plant')
@@ -124,21 +114,16 @@ class PlantNode(ProcessNode):
             f'subscribers of {outputs}',
         )
 
-    def work(self, executor: NodeExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         while not (self._started or self.stopping):
             executor.spin_once()
         if not self.settings.lockstep:
-            spin_paced(
-                self, executor, self.settings.sample_period, self._on_tick,
-                lambda: not self._expecting,
-            )
+            self._keep_time(executor)
         super().work(executor)
 
     def finish(self) -> None:
         counts = ', '.join(f'{count} {what}' for what, count in self._counts.items() if count)
-        self.log.info(
-            f'{self._plant.sample} samples' + (f', {counts}' if counts else '')
-        )
+        self.log.info(f'{self._plant.sample} samples' + (f', {counts}' if counts else ''))
 
     def _take_up(self, before: Parameters) -> None:
         plant = build_plant(self.settings)
@@ -154,74 +139,86 @@ class PlantNode(ProcessNode):
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
         v = message.data
         if not isfinite(v):
-            self._counts[BAD_CONTROLS] += 1
+            self._counts[BAD] += 1
             return
         self._held.take(v, arrival_ns(info['received_timestamp']))
-        self._heard = True
-        if self._expecting:
-            self._expecting = False
-            if self.settings.lockstep:
-                self._advance(v)
-                self._offer()
+        expected, self._expecting, self._heard = self._expecting, False, True
+        if expected and self.settings.lockstep:
+            self._advance(v)
+            self._offer()
 
     def _offer(self) -> None:
         """Lockstep: go on to the next output that is not lost on purpose."""
-        while not self._complete and not self._publish_output():
+        while not (self._complete or self._publish_output()):
             self._advance(self._held.newest)
-        self._published.publish_truth()
-        self._report_completion()
+        self._end_sample()
 
-    def _on_tick(self, tick: int, due_ns: int) -> bool:
-        """Real time: simulate up to this tick and publish y; return whether to go on."""
-        passed = tick - self._tick
-        if self._expecting and self._heard:
-            self._counts[LATE_CONTROLS] += 1
-        self._counts[MISSED_OUTPUTS] += max(passed - 1, 0)
-        self._tick = tick
+    def _keep_time(self, executor: PromptExecutor) -> None:
+        """Real time: advance and publish y every period, at absolute deadlines.
+
+        In between messages are served, and all else after y has left.
+        """
         period_ns = self.settings.sample_period * 1e9
-        self._latest_ns = due_ns + int(LATEST_SHARE * period_ns)
+        start, tick = time.monotonic_ns(), -1
+        while not (self.stopping or self._complete):
+            remaining = start + (tick + 1) * period_ns - time.monotonic_ns()
+            if remaining <= 0:
+                # What has arrived in time counts, even if nobody has looked at it yet.
+                executor.serve_urgent(0)
+                # Where the process was held up past a deadline, the tick jumps.
+                before = max(tick, 0)
+                tick = max(tick + 1, int((time.monotonic_ns() - start) / period_ns))
+                self._on_tick(tick - before, start + int(tick * period_ns))
+                executor.look_if_due()
+            elif remaining >= 3_000_000:  # a wait of the executor costs more than less leaves
+                executor.spin_once(timeout_sec=remaining * 1e-9)
+            elif self._expecting:
+                executor.serve_urgent(int(remaining))
+            else:
+                time.sleep(remaining * 1e-9)
+
+    def _on_tick(self, passed: int, due_ns: int) -> None:
+        """Simulate the periods that have passed, the last one until due_ns, and publish y."""
+        self._counts[LATE] += self._expecting and self._heard
+        self._counts[MISSED] += max(passed - 1, 0)
+        period_ns = self.settings.sample_period * 1e9
         # Of the intervals that ended while the process was held up, some were over before v came.
         for missed in reversed(range(passed)):
             # All that has come so far came within the newest interval.
-            over_ns = due_ns - missed * period_ns if missed else inf
-            self._advance(self._held.over(over_ns))
+            self._advance(self._held.over(due_ns - missed * period_ns if missed else inf))
         if not self._complete:
-            self._publish_output()
-        self._published.publish_truth()
-        self._report_completion()
-        return not self._complete
+            # Later than this an output would look like the next one.
+            self._publish_output(latest_ns=due_ns + 0.75 * period_ns)
+        self._end_sample()
 
     def _advance(self, v: float) -> None:
         """Apply v over one sample period."""
         if self._complete:
             return
-        sample = self._plant.sample
-        u = self._plant.step(v)
-        truth = self._plant.backlash
+        plant, sample = self._plant, self._plant.sample
+        u = plant.step(v)
+        truth = plant.backlash
         self._published.truth_rows.append((u, truth.m, truth.c_r, truth.c_l, v, float(sample)))
-        self._published.applied.publish(message_with(self._plant.applied))
+        self._published.applied.publish(message_with(plant.applied))
 
-    def _publish_output(self) -> bool:
-        """Measure y and publish it unless it is lost on purpose."""
-        sample = self._plant.sample
-        y = self._plant.measure()
-        loss = self.settings.output_loss
+    def _publish_output(self, latest_ns: float = inf) -> bool:
+        """Measure y, and publish it unless it is lost on purpose or too late."""
+        sample, y, loss = self._plant.sample, self._plant.measure(), self.settings.output_loss
         if sample > 0 and loss > 0.0 and float(self._loss_rng.random()) < loss:
             return False
-        if self.settings.lockstep:
-            self._published.tick(round(sample * self.settings.sample_period * 1e9))
-        elif time.monotonic_ns() > self._latest_ns:
-            self._counts[MISSED_OUTPUTS] += 1
+        if time.monotonic_ns() > latest_ns:
+            self._counts[MISSED] += 1
             return False
         self._expecting = True
-        self._published.publish_output(y, sample)
+        self._published.publish_output(y, sample, sample * self.settings.sample_period)
         return True
 
     @property
     def _complete(self) -> bool:
         return 0 < self.settings.samples <= self._plant.sample
 
-    def _report_completion(self) -> None:
+    def _end_sample(self) -> None:
+        self._published.publish_truth()
         if self._complete:
             # What a recorder can have heard.
             emit('done', published={
@@ -232,28 +229,24 @@ class PlantNode(ProcessNode):
     def _diagnose(self) -> None:
         counts = {'samples': self._plant.sample, **self._counts}
         self._diagnostics.publish(
-            _finding(self._lately.gained(counts, time.monotonic())), counts
+            finding_of(self._lately.gained(counts, time.monotonic())), counts
         )
 
 
-def _finding(lately: dict[str, int]) -> Finding:
+def finding_of(lately: dict[str, int]) -> Finding:
     """What the counts of the last few seconds say."""
     samples = max(lately['samples'], 1)
-    late, missed = lately[LATE_CONTROLS] / samples, lately[MISSED_OUTPUTS] / samples
-    if lately[BAD_CONTROLS]:
-        text = f'{lately[BAD_CONTROLS]} {topics.CONTROL} messages lately were no finite number: ' \
-               'the old one holds'
-        return Finding(Level.WARN, 'bad controls', text)
-    if missed > TROUBLE:
-        return Finding(
-            Level.WARN, 'missed', f'{missed:.2%} of {topics.PLANT_OUTPUT} was left out: '
-            'the machine is too slow for sample_period',
-        )
-    if late > TROUBLE:
-        return Finding(
-            Level.WARN, 'late', f'{late:.2%} of {topics.CONTROL} came too late or not at all: '
-            'is the controller slow or gone?',
-        )
+    if lately[BAD]:
+        return Finding(Level.WARN, BAD, (
+            f'{lately[BAD]} {topics.CONTROL} messages lately were no finite number: the old one '
+            'holds'
+        ))
+    for count, text in (
+        (MISSED, f'{topics.PLANT_OUTPUT} was left out: the machine is too slow for sample_period'),
+        (LATE, f'{topics.CONTROL} came too late or not at all: is the controller slow or gone?'),
+    ):
+        if lately[count] > TROUBLE * samples:
+            return Finding(Level.WARN, count, f'{lately[count] / samples:.2%} of {text}')
     return Finding(Level.OK, 'running', 'running')
 
 

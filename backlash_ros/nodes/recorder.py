@@ -18,6 +18,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from rosbags.interfaces import Connection
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Float64MultiArray
@@ -30,7 +31,7 @@ from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.loop.sample_counter import UNNUMBERED
 from backlash_ros.core.parameters.table import RECORDER
 from backlash_ros.nodes.runtime.driver_io import driver_topics, output_qos
-from backlash_ros.nodes.runtime.executor import NodeExecutor
+from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import (
     DIAGNOSTICS_PERIOD_S,
     KEPT_QOS,
@@ -41,72 +42,53 @@ from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, run
 from backlash_ros.options import BAD_INPUT, FAILED
 
 RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
-FLUSH_PERIOD_S = 0.4  # what a crash or a power cut may cost, with the time that a flush takes
-# Longest time to take in what has arrived before the bag is closed: a signal ends it in a second.
-DRAIN_S = 0.3
-IDLE_SPINS = 5  # without a message, timers being served in between
 # All but those that io.style names; y comes last of all: it starts the loop.
 OF_THE_LOOP: dict[str, type[Any]] = {
     topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
     topics.MODEL: Float64MultiArray, topics.TRUTH: Float64MultiArray,
     topics.DIAGNOSTICS: DiagnosticArray,
 }
-NEEDED_PUBLISHERS = (topics.ESTIMATES, topics.SIGNALS)
 
 
 @dataclass
 class Channel:
-    """A recorded topic: what came in, and how many messages were missed on the way."""
+    """A recorded topic, with namespace and remappings in its name, and its counts of messages."""
 
-    topic: str
-    several_publishers: bool
-    name: str = ''  # with namespace and remappings, as it is recorded
-    connection: Connection | None = None
+    name: str
+    connection: Connection | None
     received: int = 0
     recorded: int = 0
     missed: int = 0
-    sequence: int = UNNUMBERED
-
-    def count(self, sequence: int) -> None:
-        """Take note of a message."""
-        self.received += 1
-        if sequence == UNNUMBERED or self.several_publishers:
-            return
-        if self.sequence != UNNUMBERED and sequence > self.sequence + 1:
-            self.missed += sequence - self.sequence - 1
-        self.sequence = sequence
+    sequence: int = UNNUMBERED  # of the newest message
 
 
 class Progress:
     """The newest rows, still serialised, and what they say of the run (of its first joint)."""
 
     def __init__(self) -> None:
-        self._estimates = b''
-        self._truth = b''
+        self._newest: dict[str, bytes] = {}
         # The truth of a sample follows its signals by one sample.
         self._signals: deque[bytes] = deque(maxlen=8)
-        self._first = b''
-        self._rows = 0
+        self._first, self._rows = b'', 0
 
     def take(self, topic: str, message: bytes) -> None:
         """Remember a row of one of the array topics."""
-        if topic == topics.ESTIMATES:
-            self._estimates = message
-        elif topic == topics.TRUTH:
-            self._truth = message
-        elif topic == topics.SIGNALS:
+        self._newest[topic] = message
+        if topic == topics.SIGNALS:
             self._first = self._first or message
             self._signals.append(message)
             self._rows += 1
 
     def report(self) -> dict[str, object]:
         """Content of a progress event, empty before the first sample."""
-        if not (self._estimates and self._signals):
+        if not (topics.ESTIMATES in self._newest and self._signals):
             return {}
-        signals = [_row(message, topics.SIGNAL_LABELS) for message in self._signals]
-        first, newest = _row(self._first, topics.SIGNAL_LABELS), signals[-1]
-        estimates = _row(self._estimates, topics.ESTIMATE_LABELS)
-        truth = _row(self._truth, topics.TRUTH_LABELS) if self._truth else {}
+        first, *signals = (
+            _row(message, topics.SIGNAL_LABELS) for message in (self._first, *self._signals)
+        )
+        newest = signals[-1]
+        estimates = _row(self._newest[topics.ESTIMATES], topics.ESTIMATE_LABELS)
+        truth = _row(self._newest.get(topics.TRUTH), topics.TRUTH_LABELS)
         same = [row for row in signals if row['sample'] == truth.get('sample')]
         return {
             'sample': int(min(newest['sample'], estimates['sample'])),
@@ -114,13 +96,15 @@ class Progress:
             **{name: estimates[name] for name in (
                 'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
             )},
-            **{f'true_{name}': truth.get(name) for name in ('m', 'c_r', 'c_l')},
+            **{f'true_{name}': truth.get(name) for name in topics.BACKLASH},
             'control_error': truth['u'] - same[0]['u_d'] if same else None,
             'lost': int(newest['sample'] - first['sample']) + 1 - self._rows,
         }
 
 
-def _row(message: bytes, labels: tuple[str, ...]) -> dict[str, float]:
+def _row(message: bytes | None, labels: tuple[str, ...]) -> dict[str, float]:
+    if message is None:
+        return {}
     return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=False))
 
 
@@ -129,89 +113,88 @@ class RecorderNode(ProcessNode):
 
     In lockstep the stamp is the simulated time. Without a bag it only tells the progress, which
     is also what it goes on with when the disk takes no more.
+
+    failure: why the recording has stopped before its time, empty if it has not.
     """
 
     def __init__(self) -> None:
         super().__init__(RECORDER)
-        p = self.settings
-        self._lockstep = p.lockstep
-        self._now_ns = 0  # simulated time
+        p, self.failure = self.settings, ''
+        self._now_ns: int | None = 0 if p.lockstep else None  # simulated time
         self._bag: Bag | None = None
         self._diagnostics: DiagnosticsPublisher | None = None
-        self.failure = ''  # why the recording has stopped before its time
-        self._channels: list[Channel] = []
+        self._channels: dict[str, Channel] = {}
         self._progress = Progress()
         if p.bag:
-            self._open_bag(p.bag, p.storage)
+            self._bag = self._open_bag(p.bag, p.storage)
             self.log.info(f'started: records to {p.bag} ({p.storage})')
         else:
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
-        needed: list[Callable[[], bool]] = []
-        self._driver = to = driver_topics(p)
-        # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
-        truth = (topics.TRUTH,) if self._lockstep else ()
-        wanted = (*NEEDED_PUBLISHERS, *truth, to.reference, to.control)
+        to = driver_topics(p)
         recorded = {
-            **OF_THE_LOOP, to.reference: to.reference_type, to.applied: to.applied_type,
-            to.control: to.control_type,
-        }
-        for topic, message_type in recorded.items():
             # A G that was learned before this recorder came belongs into the bag as well.
-            qos: QoSProfile | int = KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH
-            subscription = self._record(topic, message_type, qos)
-            if p.wait_for_publishers and topic in wanted:
-                needed.append(subscription)
-        if self._lockstep:
+            topic: self._record(topic, kind, KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH)
+            for topic, kind in {
+                **OF_THE_LOOP, to.reference: to.reference_type, to.applied: to.applied_type,
+                to.control: to.control_type,
+            }.items()
+        }
+        if p.lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, RECORDER_DEPTH)
         if ENABLED:
             self.create_timer(0.2, self._tell, clock=self.steady_clock)
+        # Lockstep promises every row: that of the first truth leaves as soon as y is subscribed to.
+        truth = (topics.TRUTH,) if p.lockstep else ()
+        wanted = (topics.ESTIMATES, topics.SIGNALS, *truth, to.reference, to.control)
         self.call_when(
-            lambda: all(heard() for heard in needed), self._start, ', '.join(wanted)
+            lambda: not p.wait_for_publishers or all(
+                recorded[topic].get_publisher_count() for topic in wanted
+            ), self._start, ', '.join(wanted),
         )
 
-    def work(self, executor: NodeExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         super().work(executor)
-        # What has arrived belongs into the bag.
-        deadline = time.monotonic() + DRAIN_S
-        idle = 0
-        while idle < IDLE_SPINS and time.monotonic() < deadline:
+        # What has arrived belongs into the bag. Five times, as timers are served in between; a
+        # signal has to end it within a second.
+        deadline, idle = time.monotonic() + 0.3, 0
+        while idle < 5 and time.monotonic() < deadline:
             received = self._received
             executor.spin_once(timeout_sec=0.0)
             idle = idle + 1 if received == self._received else 0
 
     def finish(self) -> None:
-        bag = self._bag
+        bag, channels = self._bag, self._channels.values()
         if self._with_bag(Bag.close) and bag is not None:
             self.log.info(
                 f'recorded {bag.saved} messages of {bag.saved_ns * 1e-9:.1f} s to {bag.path}'
             )
-        for channel in self._channels:
+        for channel in channels:
             if channel.missed:
                 self.log.warning(f'{channel.missed} messages of {channel.name} were missed')
         if self.failure:
-            unrecorded = self._received - sum(channel.recorded for channel in self._channels)
+            unrecorded = self._received - sum(channel.recorded for channel in channels)
             self.log.warning(f'{unrecorded} messages came after the recording had stopped')
         emit(
-            'closed', messages={channel.name: channel.recorded for channel in self._channels},
-            missed=sum(channel.missed for channel in self._channels), failure=self.failure,
+            'closed', messages={channel.name: channel.recorded for channel in channels},
+            missed=sum(channel.missed for channel in channels), failure=self.failure,
         )
 
     @property
     def _received(self) -> int:
-        return sum(channel.received for channel in self._channels)
+        return sum(channel.received for channel in self._channels.values())
 
-    def _open_bag(self, path: str, storage: str) -> None:
-        self._bag = Bag(path, storage)
-        if not self._bag.survives_a_crash:
+    def _open_bag(self, path: str, storage: str) -> Bag:
+        bag = Bag(path, storage)
+        if not bag.survives_a_crash:
             self.log.warning(
                 'the installed version of rosbags cannot be flushed: a crash of the recorder or a '
                 'power cut loses everything. Install the version that requirements/run.txt names'
             )
         self._diagnostics = DiagnosticsPublisher(self, path, logs=False)
-        self.create_timer(
-            FLUSH_PERIOD_S, lambda: self._with_bag(Bag.flush), clock=self.steady_clock
-        )
+        # A crash or a power cut costs half a second, with the time that a flush takes.
+        self.create_timer(0.4, lambda: self._with_bag(Bag.flush), clock=self.steady_clock)
         self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
+        return bag
 
     def _with_bag(self, action: Callable[[Bag], None]) -> bool:
         """Do something with the bag; returns whether there is one and it went well."""
@@ -236,34 +219,40 @@ class RecorderNode(ProcessNode):
 
     def _record(
         self, topic: str, message_type: type[Any], qos: QoSProfile | int,
-    ) -> Callable[[], bool]:
-        """Record a topic; return what says whether somebody publishes it."""
-        channel = Channel(topic, several_publishers=topic == topics.DIAGNOSTICS)
+    ) -> Subscription:
+        """Record a topic."""
         subscription = self.listen(
-            message_type, topic, partial(self._on_message, channel), qos, raw=True
+            message_type, topic, partial(self._on_message, topic), qos, raw=True
         )
-        channel.name = str(subscription.topic_name)
+        channel = self._channels[topic] = Channel(str(subscription.topic_name), None)
+        # As bags know a type: std_msgs/msg/Float64.
+        kind = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 
         def announce(bag: Bag) -> None:
-            channel.connection = bag.add_topic(channel.name, _type_name(message_type))
+            channel.connection = bag.add_topic(channel.name, kind)
 
         self._with_bag(announce)
-        self._channels.append(channel)
-        return lambda: subscription.get_publisher_count() > 0
+        return subscription
 
     def _start(self) -> None:
-        qos = output_qos(self.settings, RECORDER_DEPTH)
-        self._record(self._driver.output, self._driver.output_type, qos)
+        to = driver_topics(self.settings)
+        self._record(to.output, to.output_type, output_qos(self.settings, RECORDER_DEPTH))
         emit('ready')
 
-    def _on_message(self, channel: Channel, message: bytes, info: dict[str, Any]) -> None:
-        channel.count(info['publication_sequence_number'])
+    def _on_message(self, topic: str, message: bytes, info: dict[str, Any]) -> None:
+        channel, sequence = self._channels[topic], info['publication_sequence_number']
+        channel.received += 1
+        # Each of several publishers has numbers of its own.
+        if sequence != UNNUMBERED and topic != topics.DIAGNOSTICS:
+            if channel.sequence != UNNUMBERED:
+                channel.missed += max(sequence - channel.sequence - 1, 0)
+            channel.sequence = sequence
         connection = channel.connection
         if self._bag is not None and connection is not None:
-            stamp_ns = self._now_ns if self._lockstep else info['source_timestamp']
+            stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
             if self._with_bag(lambda bag: bag.write(connection, stamp_ns, message)):
                 channel.recorded += 1
-        self._progress.take(channel.topic, message)
+        self._progress.take(topic, message)
 
     def _on_clock(self, message: Clock) -> None:
         self._now_ns = stamp_ns_of(message)
@@ -271,34 +260,26 @@ class RecorderNode(ProcessNode):
     def _tell(self) -> None:
         content = self._progress.report()
         if content:
-            received = {channel.topic: channel.received for channel in self._channels}
+            received = {topic: channel.received for topic, channel in self._channels.items()}
             emit('progress', **content, received=received)
 
     def _diagnose(self) -> None:
         if self._diagnostics is None:
             return
         if self._bag is None:
-            text = 'recording stopped, all else goes on: see reason'
             self._diagnostics.publish(
-                Finding(Level.ERROR, 'stopped', text), {'reason': self.failure}
+                Finding(Level.ERROR, 'stopped', 'recording stopped, all else goes on: see reason'),
+                {'reason': self.failure},
             )
             return
-        folder = self._bag.path
-        self._diagnostics.publish(Finding(Level.OK, 'recording', f'recording to {folder}'), {
-            'saved messages': self._bag.saved, 'free on the disk [MB]': _free_megabytes(folder),
-        })
-
-
-def _free_megabytes(folder: Path) -> float:
-    try:
-        return shutil.disk_usage(folder).free * 1e-6
-    except OSError:  # somebody has removed the folder
-        return nan
-
-
-def _type_name(message_type: type[Any]) -> str:
-    """The name that bags know a type by, like std_msgs/msg/Float64."""
-    return f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
+        try:
+            free = shutil.disk_usage(self._bag.path).free * 1e-6
+        except OSError:  # somebody has removed the folder
+            free = nan
+        self._diagnostics.publish(
+            Finding(Level.OK, 'recording', f'recording to {self._bag.path}'),
+            {'saved messages': self._bag.saved, 'free on the disk [MB]': free},
+        )
 
 
 def main(args: list[str] | None = None) -> int:

@@ -25,7 +25,7 @@ from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
 from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.nodes.runtime.executor import make_executor
+from backlash_ros.nodes.runtime.executor import PromptExecutor
 from real_time.node_processes import (
     DEADLINE_S,
     check_running,
@@ -83,7 +83,7 @@ class Driver:
         self._node = Node('driver', context=self._context)
         # The executor of rclpy would begin to wait after the answer has come: the times would
         # be those of the driver.
-        self._executor = make_executor(self._node, print)
+        self._executor = PromptExecutor(self._node)
         self._plant, self._reference = build_plant(parameters), build_reference(parameters)
         self._period = parameters.sample_period
         self._v = self._v_before = 0.0

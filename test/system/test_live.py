@@ -12,10 +12,10 @@ from bringup_processes import Session, bringup_sessions, wait_until
 from live_pages import address_of, frames, listening_addresses
 from ros_processes import ros_world
 
-from backlash_ros.nodes.live.command import LIVE_LABELS
+from backlash_ros.nodes.live import LIVE_LABELS
 
 LOOK_S = 0.02
-MODULE = 'live.command'
+MODULE = 'live'
 BIG = 'x' * 200_000
 DEADLINE = ClientTimeout(total=30.0)
 
@@ -84,7 +84,7 @@ def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without
                 assert state['events']
 
     asyncio.run(look())
-    assert listening_addresses(run.node('live.command')) == {'127.0.0.1'}
+    assert listening_addresses(run.node('live')) == {'127.0.0.1'}
 
     async def statuses() -> list[int]:
         async with ClientSession(timeout=DEADLINE) as session:
@@ -95,7 +95,7 @@ def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without
             return found
 
     assert asyncio.run(statuses()) == [200, 403]
-    os.kill(run.node('live.command'), signal.SIGKILL)
+    os.kill(run.node('live'), signal.SIGKILL)
     said = 'live died (killed by SIGKILL), the run goes on without it'
     wait_until(lambda: said in run.stderr, said)
     lines = len(run.stderr.splitlines())

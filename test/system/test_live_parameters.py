@@ -48,7 +48,7 @@ def test_parameters_of_reference_and_plant_change_while_they_run(tmp_path: Path)
         refused = plant.change(output_noise_std='little')
         assert refused.reason == "output_noise_std='little' must be a number"
         refused = plant.change(backlash__jump=[1, 2])
-        assert refused.reason == 'backlash.jump=[1.0, 2.0] must have 3 numbers'
+        assert refused.reason == 'backlash.jump=[1, 2] must have 3 numbers'
         samples = [row.data[-1] for row in truth]
         assert samples == sorted(set(samples))
         assert reference.change(amplitude=2.0, bias=100.0, waveform='square').successful

@@ -16,9 +16,9 @@ from pathlib import Path
 from drivers.paced_driver import PacedDriver, controller_and_driver
 from ros_processes import DEADLINE_S, RosWorld, ros_world
 
-from backlash_ros.nodes.monitor.view import BAR
+from backlash_ros.nodes.watching.screen import BAR
 
-MODULE = 'monitor.command'
+MODULE = 'monitor'
 COMMAND = [sys.executable, '-m', f'backlash_ros.nodes.{MODULE}']
 ESCAPES = re.compile(r'\x1b\[[0-9;?]*[a-zA-Z]')
 HOME, LEAVE_SCREEN = '\x1b[H', '\x1b[?1049l'

@@ -1,4 +1,4 @@
-"""What the driver reports to have applied, by joint."""
+"""What the driver says and is told, by joint, in the messages that io.style names."""
 
 from __future__ import annotations
 
@@ -69,186 +69,9 @@ def driver_topics(p: Parameters) -> DriverTopics:
 
 def output_qos(p: Parameters, depth: int) -> QoSProfile:
     """How y is listened to."""
-    best_effort = p.io.best_effort
     return QoSProfile(depth=depth, reliability=(
-        ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
+        ReliabilityPolicy.BEST_EFFORT if p.io.best_effort else ReliabilityPolicy.RELIABLE
     ))
-
-
-class DriverIo:
-    """What a node says to the driver and hears from it, in the messages that io.style names.
-
-    Joints are told apart by name; the only one of a controller without `joints` is nameless, and
-    io.joint says what it is called in messages. skipped: messages in a row without a joint. seen:
-    the joints of the newest of these. simulated_time: whether stamps are those of /clock.
-    """
-
-    def __init__(self, node: ProcessNode, p: Parameters) -> None:
-        self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
-        self.stamps = HeaderStamps()
-        self._node, self._p = node, p
-        self.topics = driver_topics(p)
-        self._joint_of = {joint or p.io.joint: joint for joint in p.joint_names}
-        # On simulated time the stamps of the middleware, which are real time, say nothing.
-        self.simulated_time = bool(node.get_parameter('use_sim_time').value)
-        self._publisher: Publisher | None = None
-        self._newest: dict[str, float] = {}  # v by joint
-        self._referred = JointState()  # the newest message of references
-        self._reports: Reports | None = None
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """The joints of the node, in the order of their commands in an array."""
-        return self._p.joint_names
-
-    @property
-    def publisher(self) -> Publisher:
-        """That of v, once it is advertised."""
-        assert self._publisher is not None
-        return self._publisher
-
-    @property
-    def listeners(self) -> int:
-        """How many subscribers v has."""
-        return 0 if self._publisher is None else self._publisher.get_subscription_count()
-
-    @property
-    def is_simulated(self) -> bool:
-        """Whether y comes from the plant of this package: no other one tells the truth."""
-        return self._node.count_publishers(topics.TRUTH) > 0
-
-    @property
-    def in_joint_space(self) -> bool:
-        """Whether v is where the joint is to go, in the unit of y."""
-        return self._p.io.style == 'joint_state_topic'
-
-    def now_ns(self) -> int:
-        """Time on the clock of the stamps."""
-        # time.time_ns() is the system clock of ROS, without the detour.
-        return self._node.get_clock().now().nanoseconds if self.simulated_time \
-            else time.time_ns()
-
-    def stamp_ns(self, info: dict[str, Any]) -> int:
-        """When a message left, on the clock of the stamps."""
-        return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
-
-    def listen(self, hear: Callable[[Mapping[str, Output]], None], depth: int) -> Subscription:
-        """Call hear with every y."""
-        def hear_number(message: bytes, info: dict[str, Any]) -> None:
-            sent_ns = info['source_timestamp']
-            stamp_ns = self.now_ns() if self.simulated_time else sent_ns
-            hear({'': Output(
-                number_of(message), stamp_ns, sent_ns, info['received_timestamp'],
-                info['publication_sequence_number'],
-            )})
-
-        def hear_joints(message: JointState, info: dict[str, Any]) -> None:
-            values = self.values(message)
-            for joint in self.joint_names:
-                self.skipped[joint] = 0 if joint in values else self.skipped[joint] + 1
-            if len(values) < len(self.joint_names):
-                self.seen = ', '.join(message.name)
-            if not values:
-                return
-            stamp, number = message.header.stamp, info['publication_sequence_number']
-            stamp_ns = self.stamps.told(
-                stamp.sec * 10**9 + stamp.nanosec, number,
-                lambda: self._node.count_publishers(self.topics.output),
-            )
-            # Drivers that leave the header empty are known by the stamp of the middleware.
-            message_of = Output(
-                nan, stamp_ns or self.stamp_ns(info), info['source_timestamp'],
-                info['received_timestamp'], number, numbered=False,
-            )
-            hear({joint: message_of._replace(y=y) for joint, y in values.items()})
-
-        of_joints = self.topics.output_type is JointState
-        return self._node.listen(
-            self.topics.output_type, self.topics.output, hear_joints if of_joints else hear_number,
-            output_qos(self._p, depth), raw=not of_joints,
-        )
-
-    def listen_to_references(
-        self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int,
-    ) -> Subscription:
-        """Call hear with every y_m."""
-        def hear_values(message: Float64 | JointState) -> None:
-            if isinstance(message, JointState):
-                self._referred = message
-            hear(self.values(message))
-
-        return self._node.create_subscription(
-            self.topics.reference_type, self.topics.reference, hear_values, qos
-        )
-
-    def values(self, message: Float64 | Float64MultiArray | JointState) -> dict[str, float]:
-        """What a message says about the joints of this node, by their names."""
-        if isinstance(message, Float64):
-            return {'': message.data}
-        if isinstance(message, Float64MultiArray):
-            fits = len(message.data) == len(self.joint_names)
-            return dict(zip(self.joint_names, message.data, strict=True)) if fits else {}
-        values = getattr(message, self._p.io.field)
-        if '' in self._joint_of:
-            return {'': values[0]} if len(values) == 1 else {}
-        return {
-            self._joint_of[name]: value
-            for name, value in zip(message.name, values, strict=False) if name in self._joint_of
-        }
-
-    def advertise(self) -> Publisher:
-        """Make the publisher of v."""
-        to = self.topics
-        publisher: Publisher = self._node.create_publisher(to.control_type, to.control, DEPTH)
-        self._publisher = publisher
-        return publisher
-
-    def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
-        """Call hear with every v that anybody sends to the driver."""
-        return self._node.create_subscription(
-            self.topics.control_type, self.topics.control,
-            lambda message: hear(self.values(message)), 1,
-        )
-
-    def publish(self, commands: Mapping[str, float]) -> None:
-        """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""
-        assert self._publisher is not None
-        if self.topics.control_type is Float64:
-            self._publisher.publish(message_with(commands['']))
-        elif self.topics.control_type is JointState:
-            self._publisher.publish(self._joint_state(commands))
-        else:
-            self._newest.update(commands)
-            if len(self._newest) == len(self.joint_names):
-                data = array('d', map(self._newest.__getitem__, self.joint_names))
-                self._publisher.publish(Float64MultiArray(data=data))
-
-    def _joint_state(self, commands: Mapping[str, float]) -> JointState:
-        """v, and what the newest reference says of the joints besides."""
-        names = [joint or self._p.io.joint for joint in commands]
-        message = JointState(name=names)
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        row = {name: i for i, name in enumerate(self._referred.name)}
-        for field in ('position', 'velocity', 'effort'):
-            passed = getattr(self._referred, field)
-            if field == self._p.io.field:
-                setattr(message, field, list(commands.values()))
-            elif all(row.get(name, len(passed)) < len(passed) for name in names):
-                setattr(message, field, [passed[row[name]] for name in names])
-        return message
-
-    @property
-    def has_reports(self) -> bool:
-        """Whether the driver reports what it has applied."""
-        return self._reports is not None and self._reports.publishers > 0
-
-    def listen_to_reports(self) -> None:
-        """Keep what the driver reports until somebody asks for it."""
-        self._reports = Reports(self._node, self)
-
-    def reports_of(self, joint: str) -> Iterator[tuple[float, int]]:
-        """v and stamp [ns] of what the driver has reported of a joint since the last call."""
-        return iter(()) if self._reports is None else self._reports.of(joint)
 
 
 class HeaderStamps:
@@ -274,30 +97,181 @@ class HeaderStamps:
         return 0 if self.repeated else stamp_ns
 
 
-class Reports:
-    """What the driver reports to have applied, by joint, since somebody has looked."""
+class DriverIo:
+    """What a node says to the driver and hears from it.
 
-    def __init__(self, node: ProcessNode, io: DriverIo) -> None:
-        self._io = io
-        self._inbox = Inbox(node, io.topics.applied_type, io.topics.applied, REMEMBERED)
-        self._new: dict[str, deque[tuple[float, int]]] = {
-            joint: deque(maxlen=REMEMBERED) for joint in io.joint_names
+    Joints are told apart by name; the only one of a controller without `joints` is nameless, and
+    io.joint says what it is called in messages.
+
+    skipped: messages in a row without a joint. seen: the joints of the newest of these.
+    simulated_time: whether stamps are those of /clock. publisher: of v, once it is advertised.
+    """
+
+    publisher: Publisher
+
+    def __init__(self, node: ProcessNode, p: Parameters) -> None:
+        self.topics = driver_topics(p)
+        self.skipped, self.seen = dict.fromkeys(p.joint_names, 0), ''
+        self.stamps = HeaderStamps()
+        # On simulated time the stamps of the middleware, which are real time, say nothing.
+        self.simulated_time = bool(node.get_parameter('use_sim_time').value)
+        self._node, self._p = node, p
+        self._newest: dict[str, float] = {}  # v by joint
+        self._referred = JointState()  # the newest message of references
+        self._reports: Inbox | None = None
+        self._reported: dict[str, deque[tuple[float, int]]] = {
+            joint: deque(maxlen=REMEMBERED) for joint in p.joint_names
         }
 
     @property
-    def publishers(self) -> int:
-        """How many there are."""
-        return self._inbox.publishers
+    def joint_names(self) -> tuple[str, ...]:
+        """The joints of the node, in the order of their commands in an array."""
+        return self._p.joint_names
 
-    def of(self, joint: str) -> Iterator[tuple[float, int]]:
-        """Those of a joint."""
-        self._look()
-        new = self._new[joint]
-        while new:
-            yield new.popleft()
+    @property
+    def listeners(self) -> int:
+        """How many subscribers v has."""
+        return self.publisher.get_subscription_count()
 
-    def _look(self) -> None:
-        for message, info in self._inbox.take_all():
-            stamp_ns = self._io.stamp_ns(info)
-            for joint, v in self._io.values(message).items():
-                self._new[joint].append((v, stamp_ns))
+    @property
+    def is_simulated(self) -> bool:
+        """Whether y comes from the plant of this package: no other one tells the truth."""
+        return self._node.count_publishers(topics.TRUTH) > 0
+
+    @property
+    def in_joint_space(self) -> bool:
+        """Whether v is where the joint is to go, in the unit of y."""
+        return self._p.io.style == 'joint_state_topic'
+
+    def now_ns(self) -> int:
+        """Time on the clock of the stamps."""
+        # time.time_ns() is the system clock of ROS, without the detour.
+        return self._node.get_clock().now().nanoseconds if self.simulated_time \
+            else time.time_ns()
+
+    def stamp_ns(self, info: dict[str, Any]) -> int:
+        """When a message left, on the clock of the stamps."""
+        return self.now_ns() if self.simulated_time else int(info['source_timestamp'])
+
+    def listen(
+        self, hear: Callable[[Mapping[str, Output]], None], depth: int, polled: bool = False,
+    ) -> Subscription:
+        """Call hear with every y. polled: when serve_polled is called."""
+        def hear_number(message: bytes, info: dict[str, Any]) -> None:
+            hear({'': Output(
+                number_of(message), self.stamp_ns(info), info['source_timestamp'],
+                info['received_timestamp'], info['publication_sequence_number'],
+            )})
+
+        def hear_joints(message: JointState, info: dict[str, Any]) -> None:
+            values = self.values(message)
+            for joint in self.joint_names:
+                self.skipped[joint] = 0 if joint in values else self.skipped[joint] + 1
+            if len(values) < len(self.joint_names):
+                self.seen = ', '.join(message.name)
+            if not values:
+                return
+            stamp, number = message.header.stamp, info['publication_sequence_number']
+            stamp_ns = self.stamps.told(
+                stamp.sec * 10**9 + stamp.nanosec, number,
+                lambda: self._node.count_publishers(self.topics.output),
+            )
+            # Drivers that leave the header empty are known by the stamp of the middleware.
+            of_all = Output(
+                nan, stamp_ns or self.stamp_ns(info), info['source_timestamp'],
+                info['received_timestamp'], number, numbered=False,
+            )
+            hear({joint: of_all._replace(y=y) for joint, y in values.items()})
+
+        of_joints = self.topics.output_type is JointState
+        return self._node.listen(
+            self.topics.output_type, self.topics.output, hear_joints if of_joints else hear_number,
+            output_qos(self._p, depth), raw=not of_joints, polled=polled,
+        )
+
+    def listen_to_references(
+        self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int,
+    ) -> Subscription:
+        """Call hear with every y_m."""
+        def hear_values(message: Float64 | JointState) -> None:
+            if isinstance(message, JointState):
+                self._referred = message
+            hear(self.values(message))
+
+        return self._node.create_subscription(
+            self.topics.reference_type, self.topics.reference, hear_values, qos
+        )
+
+    def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
+        """Call hear with every v that anybody sends to the driver."""
+        return self._node.create_subscription(
+            self.topics.control_type, self.topics.control,
+            lambda message: hear(self.values(message)), 1,
+        )
+
+    def values(self, message: Float64 | Float64MultiArray | JointState) -> dict[str, float]:
+        """What a message says about the joints of this node, by their names."""
+        names = self.joint_names
+        if isinstance(message, Float64):
+            return {'': message.data}
+        if isinstance(message, Float64MultiArray):
+            fits = len(message.data) == len(names)
+            return dict(zip(names, message.data, strict=True)) if fits else {}
+        values, own = getattr(message, self._p.io.field), self._p.io.joint
+        if names == ('',) and not own:
+            return {'': values[0]} if len(values) == 1 else {}
+        found = dict(zip(message.name, values, strict=False))
+        return {joint: found[joint or own] for joint in names if (joint or own) in found}
+
+    def advertise(self) -> Publisher:
+        """Make the publisher of v."""
+        self.publisher = self._node.create_publisher(
+            self.topics.control_type, self.topics.control, DEPTH
+        )
+        return self.publisher
+
+    def publish(self, commands: Mapping[str, float]) -> None:
+        """Send v, by joint, to the driver; an array as soon as there is a v of every joint."""
+        if self.topics.control_type is Float64:
+            self.publisher.publish(message_with(commands['']))
+        elif self.topics.control_type is JointState:
+            self.publisher.publish(self._joint_state(commands))
+        else:
+            self._newest.update(commands)
+            if len(self._newest) == len(self.joint_names):
+                data = array('d', map(self._newest.__getitem__, self.joint_names))
+                self.publisher.publish(Float64MultiArray(data=data))
+
+    def _joint_state(self, commands: Mapping[str, float]) -> JointState:
+        """v, and what the newest reference says of the joints besides."""
+        names = [joint or self._p.io.joint for joint in commands]
+        message = JointState(name=names)
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        row = {name: i for i, name in enumerate(self._referred.name)}
+        for field in ('position', 'velocity', 'effort'):
+            passed = getattr(self._referred, field)
+            if field == self._p.io.field:
+                setattr(message, field, list(commands.values()))
+            elif all(row.get(name, len(passed)) < len(passed) for name in names):
+                setattr(message, field, [passed[row[name]] for name in names])
+        return message
+
+    def listen_to_reports(self) -> None:
+        """Keep what the driver reports to have applied until somebody asks for it."""
+        self._reports = Inbox(
+            self._node, self.topics.applied_type, self.topics.applied, REMEMBERED
+        )
+
+    @property
+    def has_reports(self) -> bool:
+        """Whether the driver reports what it has applied."""
+        return self._reports is not None and self._reports.publishers > 0
+
+    def reports_of(self, joint: str) -> Iterator[tuple[float, int]]:
+        """v and stamp [ns] of what the driver has reported of a joint since the last call."""
+        for message, info in self._reports.take_all() if self._reports is not None else ():
+            stamp_ns = self.stamp_ns(info)
+            for each, v in self.values(message).items():
+                self._reported[each].append((v, stamp_ns))
+        while self._reported[joint]:
+            yield self._reported[joint].popleft()

@@ -11,8 +11,6 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.nodes.runtime.process import ProcessNode
 
-SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
-
 
 class ManagedNode(LifecycleNodeMixin, ProcessNode):
     """A node with the life cycle of ROS 2; what a state means, its subclasses say.
@@ -47,29 +45,29 @@ class ManagedNode(LifecycleNodeMixin, ProcessNode):
         untyped.trigger_activate()
 
     def finish(self) -> None:
-        if self.active:
-            self.active = False
-            self.deactivate()
+        self._end_work()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self._tried(self.configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         result = self._tried(self.activate)
-        self.active = result == SUCCESS
+        self.active = result == TransitionCallbackReturn.SUCCESS
         return result
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self.active = False
-        return self._tried(self.deactivate)
+        return self._tried(self._end_work)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self._tried(self.cleanup)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._tried(self._end_work)
+
+    def _end_work(self) -> None:
         if self.active:
-            return self.on_deactivate(state)
-        return SUCCESS
+            self.active = False
+            self.deactivate()
 
     def _tried(self, action: Callable[[], None]) -> TransitionCallbackReturn:
         # rclpy itself would swallow the exception without a word.
@@ -77,8 +75,8 @@ class ManagedNode(LifecycleNodeMixin, ProcessNode):
             action()
         except ParameterError as error:
             self.log.error(str(error))
-            return FAILURE
-        return SUCCESS
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
 
     def _refuse_what_does_not_fit(self) -> None:
         """Answer a transition that the present state does not have, instead of ending of it."""

@@ -21,20 +21,18 @@ from backlash_ros.core.loop.finding import Finding, Level, LevelLog
 # std_msgs/Float64 as it goes over the wire: rclpy takes and publishes these bytes as they are, in
 # half the time of a message object. Four bytes name the encoding, the second one odd where the
 # lowest byte comes first, then comes the number (CDR: DDS Interoperability Wire Protocol, 10.2).
-LITTLE_ENDIAN = b'\x00\x01\x00\x00'
-_LITTLE, _BIG = Struct('<4xd'), Struct('>4xd')
-_WHOLE = Struct('<4sd')
+FLOAT64_LITTLE, FLOAT64_BIG = Struct('<4sd'), Struct('>4sd')
 
 
 def number_of(message: bytes) -> float:
     """The number in a message."""
-    number: float = (_LITTLE if message[1] & 1 else _BIG).unpack_from(message)[0]
+    number: float = (FLOAT64_LITTLE if message[1] & 1 else FLOAT64_BIG).unpack_from(message)[1]
     return number
 
 
 def message_with(number: float) -> bytes:
     """A message with this number."""
-    return _WHOLE.pack(LITTLE_ENDIAN, number)
+    return FLOAT64_LITTLE.pack(b'\x00\x01\x00\x00', number)
 
 
 # Deep enough that a recorder which is held up for a second misses nothing.
@@ -68,11 +66,10 @@ class LabelledArrayPublisher:
 
     def publish(self, row: Sequence[float]) -> None:
         """Publish one value per label, if anybody listens."""
-        if not self.listeners:
-            return
-        # An array is taken as it is; a list would be checked element by element.
-        self._message.data = array('d', row)
-        self._publisher.publish(self._message)
+        if self.listeners:
+            # An array is taken as it is; a list would be checked element by element.
+            self._message.data = array('d', row)
+            self._publisher.publish(self._message)
 
 
 class DiagnosticsPublisher:
@@ -83,16 +80,14 @@ class DiagnosticsPublisher:
     """
 
     def __init__(self, node: Node, hardware_id: str, logs: bool = True, part: str = '') -> None:
-        self._node, self._part = node, part
+        self._node, self._logs, self._part = node, logs, part
         self._publisher = node.create_publisher(
             DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=without_events()
         )
-        name = node.get_fully_qualified_name().strip('/')
-        self._status = DiagnosticStatus(
-            name=f'{name}: {part}' if part else name, hardware_id=hardware_id
-        )
+        name = node.get_fully_qualified_name().strip('/') + (f': {part}' if part else '')
+        self._status = DiagnosticStatus(name=name, hardware_id=hardware_id)
         self._message = DiagnosticArray(status=[self._status])
-        self._log = LevelLog(self._write) if logs else None
+        self._log = LevelLog(self._write)
 
     def publish(
         self, finding: Finding, values: Mapping[str, object], logs: bool = True,
@@ -108,13 +103,13 @@ class DiagnosticsPublisher:
         ]
         self._message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(self._message)
-        if self._log is not None and logs:
+        if self._logs and logs:
             self._log.take(finding, time.monotonic())
 
     def _write(self, level: Level, text: str) -> None:
-        # rclpy remembers a severity for each place in the code.
         log = Node.get_logger(self._node)
         text = f'{self._part}: {text}' if self._part else text
+        # rclpy remembers a severity for each place in the code.
         if level == Level.OK:
             log.info(text)
         elif level == Level.WARN:

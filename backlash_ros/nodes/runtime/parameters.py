@@ -25,15 +25,36 @@ from backlash_ros.core.parameters.parameter import Parameter, Value
 from backlash_ros.core.parameters.parameter_set import entry_of
 from backlash_ros.core.parameters.table import CONTROLLER, NODES, PARAMETERS
 
-# Declared by rclpy itself in every node.
-ROS_OWN = {'use_sim_time', 'start_type_description_service'}
-PARAMS_FILE = '--params-file'
-
 
 class ParameterNode(Node):
     """A node with a complete, checked set of parameters."""
 
     settings: Parameters
+
+    def set_parameters_atomically(
+        self, parameter_list: list[RosParameter],
+    ) -> SetParametersResult:
+        """Set what differs from the present values, in the declared types.
+
+        Command-line tools send 1e-6 as a text and [1, 2] as integers, and load whole files in which
+        most values are the present ones, also of parameters that cannot change.
+        """
+        changes = []
+        try:
+            for change in parameter_list:
+                name, entry = change.name, entry_of(change.name)
+                present = self.get_parameter(name).value if self.has_parameter(name) else None
+                if entry is None or present is None:
+                    if present is None or change.value != present:
+                        changes.append(change)
+                elif (value := check_value(entry, _given_value(change))) \
+                        != check_value(entry, present):
+                    changes.append(_ros_parameter(name, value, entry))
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        if not changes:
+            return SetParametersResult(successful=True)
+        return super().set_parameters_atomically(changes)
 
 
 def declare_parameters(
@@ -44,11 +65,13 @@ def declare_parameters(
     reconfigurable: whether all but the fixed ones may change while the node is unconfigured.
     Raises ParameterError for what rclpy would ignore (a given name that nobody declares) or refuse.
     """
-    # rclpy has no other way to ask for all names that were given.
-    given = node.handle.get_parameters(RosParameter)
-    parameters = Parameters({
-        name: _given_value(parameter) for name, parameter in given.items() if name not in ROS_OWN
-    })
+    # rclpy has no other way to ask for all names that were given; two are declared by itself.
+    given = {
+        name: _given_value(parameter)
+        for name, parameter in node.handle.get_parameters(RosParameter).items()
+        if name not in ('use_sim_time', 'start_type_description_service')
+    }
+    parameters = Parameters(given)
     values = {p.name: parameters[p.name] for p in PARAMETERS if executable in p.used_by}
     if executable == CONTROLLER:
         # Of a joint's own parameters those that were given: all of them would be hundreds.
@@ -56,59 +79,21 @@ def declare_parameters(
             name: parameters.of_joint(joint)[own] for name in given
             for joint, _, own in [name.partition('.')] if joint in parameters.joint_names
         }
-    node.declare_parameters('', [
-        (name, _declarable(name, value), ParameterDescriptor()) for name, value in values.items()
-    ], ignore_override=True)
-    # With one value missing rclpy tells none of those that it is asked for.
-    node.set_parameters([_ros_parameter(name, ()) for name, v in values.items() if v == ()])
-    for name in values:
-        node.set_descriptor(name, describe(_entry(name), name, reconfigurable))
+    for name, value in values.items():
+        entry = entry_of(name)
+        assert entry is not None
+        present = _ros_parameter(name, value, entry)
+        # The type of an empty list is declared by another one, and with a value missing rclpy would
+        # tell none of those that it is asked for.
+        of_the_type = [''] if entry.names else [0.0]
+        node.declare_parameter(
+            name, of_the_type if value == () else present.value, ParameterDescriptor(),
+            ignore_override=True,
+        )
+        if value == ():
+            node.set_parameters([present])
+        node.set_descriptor(name, _description(entry, name, reconfigurable))
     return parameters
-
-
-def changed_values(node: Node, requested: Sequence[RosParameter]) -> list[RosParameter]:
-    """Those of the requested values that differ from the present ones, in their declared types.
-
-    Command-line tools send 1e-6 as a text and [1, 2] as integers, and load whole files in which
-    most values are the present ones. Raises ParameterError, which names the parameter.
-    """
-    changes = []
-    for change in requested:
-        present = node.get_parameter(change.name).value if node.has_parameter(change.name) else None
-        parameter = entry_of(change.name)
-        if parameter is None or present is None:
-            if present is None or change.value != present:
-                changes.append(change)
-            continue
-        value = check_value(parameter, _given_value(change))
-        if value != check_value(parameter, present):
-            changes.append(_ros_parameter(change.name, value))
-    return changes
-
-
-def describe(
-    parameter: Parameter, name: str, reconfigurable: bool = False,
-) -> ParameterDescriptor:
-    """What tools like rqt and `ros2 param describe` show."""
-    changes = parameter.live or (reconfigurable and not parameter.fixed)
-    unit = f' [{parameter.unit}]' if parameter.unit else ''
-    descriptor = ParameterDescriptor(
-        name=name, type=_ros_parameter(name, parameter.default).type_.value,
-        description=parameter.description + unit,
-        additional_constraints='one of ' + ', '.join(parameter.choices) if parameter.choices
-        else parameter.rules,
-        read_only=not changes,
-    )
-    if isfinite(parameter.low) and isfinite(parameter.high):
-        if isinstance(parameter.default, float):
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=parameter.low, to_value=parameter.high, step=0.0)
-            ]
-        elif isinstance(parameter.default, int):
-            descriptor.integer_range = [IntegerRange(
-                from_value=int(parameter.low), to_value=int(parameter.high), step=1
-            )]
-    return descriptor
 
 
 def let_parameters_change(
@@ -148,38 +133,43 @@ def let_parameters_change(
     node.add_post_set_parameters_callback(post_set)
 
 
+def _description(entry: Parameter, name: str, reconfigurable: bool) -> ParameterDescriptor:
+    """What tools like rqt and `ros2 param describe` show."""
+    descriptor = ParameterDescriptor(
+        name=name, type=_ros_parameter(name, entry.default, entry).type_.value,
+        description=entry.description + (f' [{entry.unit}]' if entry.unit else ''),
+        additional_constraints='one of ' + ', '.join(entry.choices) if entry.choices
+        else entry.rules,
+        read_only=not (entry.live or (reconfigurable and not entry.fixed)),
+    )
+    low, high = entry.low, entry.high
+    if isfinite(low) and isfinite(high):
+        if isinstance(entry.default, float):
+            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+        elif isinstance(entry.default, int):
+            descriptor.integer_range = [
+                IntegerRange(from_value=int(low), to_value=int(high), step=1)
+            ]
+    return descriptor
+
+
 def _given_value(parameter: RosParameter) -> object:
     """The value that somebody has given; rcl reads an empty list as no value at all."""
     if parameter.value is not None:
         return parameter.value
-    declared = entry_of(parameter.name)
-    if declared is not None and (declared.names or declared.default == ()):
+    entry = entry_of(parameter.name)
+    if entry is not None and (entry.names or entry.default == ()):
         return ()
     raise ParameterError(
         parameter.name, UNTOLD, 'has no value', 'give it one or leave it out'
     )
 
 
-def _entry(name: str) -> Parameter:
-    entry = entry_of(name)
-    assert entry is not None
-    return entry
-
-
-def _declarable(name: str, value: Value) -> object:
-    """The value, or one in place of an empty list, whose type rclpy could not tell."""
-    if value == ():
-        return [''] if _entry(name).names else [0.0]
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _ros_parameter(name: str, value: Value) -> RosParameter:
+def _ros_parameter(name: str, value: Value, entry: Parameter) -> RosParameter:
     if value == ():
         kind = RosParameter.Type
-        return RosParameter(
-            name, kind.STRING_ARRAY if _entry(name).names else kind.DOUBLE_ARRAY, []
-        )
-    return RosParameter(name, value=_declarable(name, value))
+        return RosParameter(name, kind.STRING_ARRAY if entry.names else kind.DOUBLE_ARRAY, [])
+    return RosParameter(name, value=list(value) if isinstance(value, tuple) else value)
 
 
 def complaints(arguments: Sequence[str], executable: str, full_name: str) -> list[str]:
@@ -189,44 +179,39 @@ def complaints(arguments: Sequence[str], executable: str, full_name: str) -> lis
 
     arguments: of the command line. full_name: of the node, with its namespace.
     """
-    files = [value for option, value in pairwise(arguments)
-             if option == PARAMS_FILE]
     found = []
-    for file in files:
-        sections = list(_section_names(_content(file)))
-        found += [
-            f'{file}: section {name} is not for {full_name}, its values are not used: '
-            f'write {cure}' for name, cure in unused(sections, executable, full_name)
-        ]
+    for option, file in pairwise(arguments):
+        if option == '--params-file':
+            import yaml  # most nodes start without a file
+
+            # ROS 2 itself has refused what cannot be read.
+            content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
+            found += [
+                f'{file}: section {name} is not for {full_name}, its values are not used: '
+                f'write /**/{full_name.rpartition("/")[2]}'
+                for name in unused(list(_section_names(content)), executable, full_name)
+            ]
     return found
 
 
-def unused(
-    sections: Sequence[str], executable: str, full_name: str,
-) -> Iterator[tuple[str, str]]:
-    """Sections that do not reach the node though they seem to be meant for it, and what would.
+def unused(sections: Sequence[str], executable: str, full_name: str) -> Iterator[str]:
+    """Sections that do not reach the node though they seem to be meant for it.
 
     A section of the node's name in another namespace is none of its business where the file has
     one for its own namespace too, or where both have a namespace: it may be that of another axis.
     """
     *namespace, own = full_name.strip('/').split('/')
-    meant = [name for name in sections if _last(name) in (own, executable)]
-    reached = any(_reaches(name, full_name) for name in meant)
-    for name in sections:
-        last = _last(name)
-        if name in meant and not reached:
-            inside = len(name.strip('/').split('/')) > 1
-            if not (inside and namespace) or last != own:
-                yield name, f'/**/{own}'
-        elif last not in NODES and '*' not in last:
-            # A misspelt name rather than somebody else's node.
-            near = difflib.get_close_matches(last, [executable], n=1, cutoff=0.8)
-            if near:
-                yield name, f'/**/{own}'
-
-
-def _last(section: str) -> str:
-    return section.strip('/').split('/')[-1]
+    last = {section: section.rpartition('/')[2] for section in sections}
+    meant = [section for section in sections if last[section] in (own, executable)]
+    reached = any(_reaches(section, full_name) for section in meant)
+    for section in sections:
+        if section in meant and not reached:
+            of_another_axis = namespace and section.strip('/') != own == last[section]
+            if not of_another_axis:
+                yield section
+        elif last[section] not in NODES and '*' not in last[section] \
+                and difflib.get_close_matches(last[section], [executable], cutoff=0.8):
+            yield section  # a misspelt name rather than somebody else's node
 
 
 def _reaches(section: str, full_name: str) -> bool:
@@ -236,20 +221,10 @@ def _reaches(section: str, full_name: str) -> bool:
     return re.fullmatch(''.join(parts), full_name) is not None
 
 
-def _section_names(content: Mapping[Any, Any], prefix: str = '') -> Iterator[str]:
-    for key, value in content.items():
+def _section_names(content: Any, prefix: str = '') -> Iterator[str]:
+    for key, value in content.items() if isinstance(content, Mapping) else ():
         name = f'{prefix}/{str(key).strip("/")}'
-        if not isinstance(value, Mapping):
-            continue
-        if 'ros__parameters' in value:
+        if isinstance(value, Mapping) and 'ros__parameters' in value:
             yield name
         else:
             yield from _section_names(value, name)
-
-
-def _content(file: str) -> Mapping[Any, Any]:
-    import yaml  # most nodes start without a file
-
-    # ROS 2 itself has refused what cannot be read.
-    content = yaml.safe_load(Path(file).read_text(encoding='utf-8'))
-    return content if isinstance(content, Mapping) else {}

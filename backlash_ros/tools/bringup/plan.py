@@ -212,7 +212,7 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
         first = plan.axes[0]
         shown = [f'/{axis.name}' if axis.name else '/controller' for axis in plan.axes]
         stages[-1].append(ProcessPlan(
-            'live', (*_module('live.command'), '--port', str(plan.live_port), *shown),
+            'live', (*_module('live'), '--port', str(plan.live_port), *shown),
             first.logs / 'live.log', child_environment(first.logs, domain), first.name,
             spectator=True,
         ))

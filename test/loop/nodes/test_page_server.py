@@ -7,7 +7,7 @@ from math import nan
 from aiohttp import ClientSession, ClientTimeout
 from live_pages import frames
 
-from backlash_ros.nodes.live.page_server import CurvePoints, History, PageServer, bound_socket
+from backlash_ros.nodes.watching.page_server import CurvePoints, History, PageServer, bound_socket
 
 LOOK_S = 0.02
 BIG = 'x' * 200_000

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Callable, Iterator
-from importlib.metadata import PackageNotFoundError
 from typing import Any
 
 import pytest
@@ -15,19 +14,18 @@ from ros_processes import wait_until
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from backlash_ros.nodes.runtime import executor as prompt_executor
-from backlash_ros.nodes.runtime.executor import Inbox, NodeExecutor, PromptExecutor, make_executor
+from backlash_ros.nodes.runtime.executor import Inbox, PromptExecutor
 from backlash_ros.tools.bringup.environment import free_domain
 
 
 class Loop:
     """A node that talks to itself."""
 
-    def __init__(self, domain: int, executor: type[NodeExecutor]) -> None:
+    def __init__(self, domain: int) -> None:
         self.context = Context()
         rclpy.init(args=[], context=self.context, domain_id=domain)
         self.node = Node('loop', context=self.context)
-        self.executor = executor(self.node)
+        self.executor = PromptExecutor(self.node)
         self.publisher = self.node.create_publisher(Float64, 'number', 10)
 
     def spin_until(self, condition: Callable[[], object], what: str) -> None:
@@ -46,46 +44,12 @@ class Loop:
         rclpy.shutdown(context=self.context)
 
 
-@pytest.fixture(params=[PromptExecutor, NodeExecutor])
-def loop(request: pytest.FixtureRequest) -> Iterator[Loop]:
-    """With the executor for the known versions of rclpy, and with the one for all others."""
-    with free_domain() as domain:
-        loop = Loop(domain, request.param)
-        yield loop
-        loop.close()
-
-
 @pytest.fixture
-def fast_loop() -> Iterator[Loop]:
+def loop() -> Iterator[Loop]:
     with free_domain() as domain:
-        loop = Loop(domain, PromptExecutor)
+        loop = Loop(domain)
         yield loop
         loop.close()
-
-
-def test_installed_rclpy_is_one_that_the_fast_executor_is_known_to_work_with(fast_loop):
-    warnings: list[str] = []
-    executor = make_executor(fast_loop.node, warnings.append)
-    executor.shutdown()
-    assert type(executor) is PromptExecutor
-    assert warnings == []
-
-
-@pytest.mark.parametrize('other', ['9.1.2', '7.0.4', None])
-def test_another_rclpy_serves_by_itself_and_one_warning_says_so(fast_loop, monkeypatch, other):
-    def version(name: str) -> str:
-        assert name == 'rclpy'
-        if other is None:
-            raise PackageNotFoundError
-        return other
-
-    monkeypatch.setattr(prompt_executor, 'version', version)
-    warnings: list[str] = []
-    executor = make_executor(fast_loop.node, warnings.append)
-    executor.shutdown()
-    assert type(executor) is NodeExecutor
-    (warning,) = warnings
-    assert f'rclpy {other or "of unknown version"} is not one' in warning
 
 
 def test_every_message_is_served_in_order_with_its_number_where_that_is_wanted(loop):

@@ -67,7 +67,7 @@ def called(libraries: Path, folder: Path, *arguments: str) -> subprocess.Complet
 def test_what_needs_no_ros_works_and_the_rest_says_so_in_one_line(libraries, tmp_path):
     for module in (
         'nodes.controller', 'nodes.plant', 'nodes.reference', 'nodes.recorder',
-        'nodes.check_driver', 'nodes.monitor.command', 'nodes.live.command', 'tools.bringup',
+        'nodes.check_driver', 'nodes.monitor', 'nodes.live', 'tools.bringup',
     ):
         done = called(libraries, tmp_path, '-m', f'{PACKAGE}.{module}')
         assert done.returncode == 1

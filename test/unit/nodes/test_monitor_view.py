@@ -1,13 +1,16 @@
 """What `monitor` shows of a controller, without ROS and without a terminal."""
 
+import re
+from collections.abc import Mapping
 from io import StringIO
 from math import inf, nan
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rich.console import Console
 
-from backlash_ros.nodes.monitor.followed import ControllerState
-from backlash_ros.nodes.monitor.view import axis_end, bar, screen
+from backlash_ros.nodes.watching.followed import ControllerState
+from backlash_ros.nodes.watching.screen import axis_end, bar, screen
 
 VALUES = {
     'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',
@@ -18,11 +21,20 @@ VALUES = {
 LONG = 'plant_output moves against v: reverse it, or the sign of plant.numerator, and so on ' * 2
 
 
+def say(
+    state: ControllerState, message: str, now_s: float = 100.0, level: int = 0,
+    values: Mapping[str, str] = VALUES,
+) -> None:
+    state.hear(DiagnosticStatus(level=bytes([level]), message=message, values=[
+        KeyValue(key=key, value=value) for key, value in values.items()
+    ]), now_s)
+
+
 def controller(
     name: str = '/controller', message: str = 'learned', level: int = 0,
 ) -> ControllerState:
     state = ControllerState(name)
-    state.take_diagnostics(level, message, VALUES, 100.0, '12:00:00')
+    say(state, message, level=level)
     return state
 
 
@@ -55,9 +67,10 @@ def test_state_estimates_and_figures_are_shown() -> None:
     for piece in (
         '/controller', 'tracking', '1.3 ± 0.2', '3 ± 0.4', '-3 ', '4.25 gaps', '99.97 Hz',
         'latency 0.912 ms, p99 9.63 ms', 'samples 1234', 'lost 5', 'late 6', 'learning',
-        'not compensating', '12:00:00 learned', 'q quit',
+        'not compensating', 'q quit',
     ):
         assert piece in text, piece
+    assert re.search(r'\d\d:\d\d:\d\d learned', text)
     assert 'Tab' not in text
 
 
@@ -66,7 +79,7 @@ def test_any_number_of_controllers_fits_into_a_terminal(count: int) -> None:
     states = [controller(f'/axis_{i}/controller', LONG, level=2) for i in range(count)]
     for state in states:
         for i in range(30):
-            state.note('12:00:01', f'event {"x" * i}')
+            state.note(f'event {"x" * i}')
     for selected in (0, count - 1):
         lines = shown(states, selected=selected, notice=LONG[:100])
         assert len(lines) <= 24
@@ -78,8 +91,8 @@ def test_any_number_of_controllers_fits_into_a_terminal(count: int) -> None:
 
 def test_a_text_in_which_only_figures_change_is_one_event() -> None:
     state = controller(message='9.38 % was lost')
-    state.take_diagnostics(1, '8.1 % was lost', VALUES, 101.0, '12:00:01')
-    state.take_diagnostics(0, 'learned', VALUES, 102.0, '12:00:02')
+    say(state, '8.1 % was lost', 101.0, level=1)
+    say(state, 'learned', 102.0)
     assert [text for _, text in state.events] == ['9.38 % was lost', 'learned']
     assert state.message == 'learned'
 
@@ -93,6 +106,6 @@ def test_who_says_nothing_any_more_is_silent() -> None:
 
 def test_an_inactive_controller_is_told_by_its_message() -> None:
     state = ControllerState('/controller')
-    state.take_diagnostics(0, 'unconfigured', {}, 100.0, '12:00:00')
+    say(state, 'unconfigured', values={})
     assert state.word(100.0) == 'unconfigured'
     assert any('unconfigured' in line for line in shown([state]))

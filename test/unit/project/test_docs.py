@@ -19,7 +19,7 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import BY_NAME
-from backlash_ros.nodes.driver_check.options import parse_options
+from backlash_ros.nodes.check_driver import parse_options
 from backlash_ros.tools import batch
 from backlash_ros.tools import compare as compare
 from backlash_ros.tools import report as report

@@ -15,7 +15,10 @@ from collections.abc import Sequence
 
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.nodes.live.page_server import (
+from backlash_ros.nodes.runtime.executor import PromptExecutor
+from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
+from backlash_ros.nodes.watching.followed import ControllerState, FollowedControllers, give_way
+from backlash_ros.nodes.watching.page_server import (
     HOST,
     CurvePoints,
     History,
@@ -23,9 +26,6 @@ from backlash_ros.nodes.live.page_server import (
     bound_socket,
     rounded,
 )
-from backlash_ros.nodes.monitor.followed import ControllerState, FollowedControllers, give_way
-from backlash_ros.nodes.runtime.executor import NodeExecutor
-from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
 from backlash_ros.options import LARGEST_PORT, OptionParser
 from backlash_ros.topics import BACKLASH
 
@@ -54,11 +54,11 @@ class LiveNode(ProcessNode):
         self._history = History(round(SHOWN_S / FRAME_PERIOD_S))
         self._states = ''  # of all controllers, as JSON
 
-    def work(self, executor: NodeExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         """Serve the page until a signal ends it."""
         asyncio.run(self._serve(executor))
 
-    async def _serve(self, executor: NodeExecutor) -> None:
+    async def _serve(self, executor: PromptExecutor) -> None:
         server = PageServer(self._socket, self._frame)
         self._look()
         await server.start()
@@ -82,14 +82,13 @@ class LiveNode(ProcessNode):
     def _look(self) -> None:
         """Take in what has come since the last look."""
         self._followed.take_diagnostics()
+        by_name, now_s = self._followed.by_name, time.monotonic()
         self._history.add({
-            name: self._points.setdefault(name, CurvePoints(self._start_ns)).take(followed.take())
-            for name, followed in self._followed.by_name.items()
+            name: self._points.setdefault(name, CurvePoints(self._start_ns)).take(state.watch())
+            for name, state in by_name.items()
         })
-        now_s = time.monotonic()
-        states = sorted(self._followed.states, key=lambda state: state.name)
         self._states = json.dumps(
-            [content_of(state, now_s) for state in states],
+            [content_of(by_name[name], now_s) for name in sorted(by_name)],
             separators=(',', ':'), allow_nan=False,
         )
 
@@ -106,21 +105,17 @@ class LiveNode(ProcessNode):
 
 def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
     """What the page says of a controller in words and numbers. now_s: on the steady clock."""
-    number = state.number
     return {
         'name': state.name, 'word': state.word(now_s), 'message': state.message,
         # Nobody knows how somebody is who says nothing any more.
-        'level': 2 if state.silent_s(now_s) else min(state.level, 2),
-        'estimates': {
-            name: [rounded(value), rounded(half)]
-            for name, (value, half) in state.estimates.items()
-        },
-        'excitation': rounded(number('excitation: swing of v / gap')),
-        'rate': rounded(number('rate [Hz]')),
-        'latency': [rounded(number(f'latency {which} [ms]')) for which in ('p50', 'p99')],
+        'level': 2 if state.silent_s(now_s) else state.level,
+        'estimates': {name: [*map(rounded, pair)] for name, pair in state.estimates.items()},
+        'excitation': rounded(state.excitation),
+        'rate': rounded(state.number('rate [Hz]')),
+        'latency': [rounded(state.number(f'latency {which} [ms]')) for which in ('p50', 'p99')],
         'counts': {name: state.values.get(name, '') for name in ('samples', 'lost', 'late')},
         'learning': state.is_on('learning'), 'compensating': state.is_on('compensating'),
-        'events': [list(event) for event in state.events],
+        'events': [*map(list, state.events)],
     }
 
 
@@ -128,8 +123,7 @@ def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     parser = OptionParser(
-        LIVE, description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        LIVE, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog='From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )
     parser.add_argument('name', nargs='*', metavar='NAME',
@@ -145,9 +139,7 @@ def main(args: list[str] | None = None) -> int:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
     give_way()
     with bound:
-        return run(
-            LIVE, lambda: LiveNode(options.name, bound), ros_arguments(arguments)
-        )
+        return run(LIVE, lambda: LiveNode(options.name, bound), ros_arguments(arguments))
 
 
 if __name__ == '__main__':

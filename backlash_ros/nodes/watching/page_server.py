@@ -13,13 +13,9 @@ from pathlib import Path
 from aiohttp import web
 from aiohttp.typedefs import Handler
 
-V, U = 'v', 'u_hat'
-LOOP = 'loop'
-
-Curves = dict[str, list[float | None]]
-LIVE_PAGE = Path(__file__).with_name('page.html')
 HOST = '127.0.0.1'
 MOST_READERS = 16  # pages that are open at once
+Curves = dict[str, list[float | None]]
 
 
 def rounded(value: float) -> float | None:
@@ -28,17 +24,14 @@ def rounded(value: float) -> float | None:
 
 
 class CurvePoints:
-    """Sorts the messages of one controller into points.
-
-    start_ns: the time that counts as 0.
-    """
+    """Sorts the messages of one controller into points. start_ns: the time that counts as 0."""
 
     def __init__(self, start_ns: int) -> None:
         self._start_ns = start_ns
         self._v: deque[tuple[int, float]] = deque(maxlen=100)  # of which u has not come
 
     def take(self, messages: Iterable[tuple[str, int, float]]) -> Curves:
-        """By label t [s] and value in turns, and v and u of points of their loop in turns.
+        """By label t [s] and value in turns, and for 'loop' v and u in turns.
 
         messages: label, time of arrival [ns], value.
         """
@@ -47,9 +40,9 @@ class CurvePoints:
         for label, at_ns, value in messages:
             t = round(1e-9 * (at_ns - self._start_ns), 3)
             curves.setdefault(label, []).extend((t, rounded(value)))
-            if label == V:
+            if label == 'v':
                 self._v.append((at_ns, value))
-            elif label == U:
+            elif label == 'u_hat':
                 reconstructed.append((at_ns, value))
         for at_ns, u in reconstructed:
             # u is sent with the v that it came from, after it: see WatchPublisher.
@@ -57,7 +50,7 @@ class CurvePoints:
             while self._v and self._v[0][0] <= at_ns:
                 _, v = self._v.popleft()
             if v is not None:
-                curves.setdefault(LOOP, []).extend((rounded(v), rounded(u)))
+                curves.setdefault('loop', []).extend((rounded(v), rounded(u)))
         return curves
 
 
@@ -108,8 +101,8 @@ async def for_this_machine(request: web.Request, handler: Handler) -> web.Stream
 class PageServer:
     """Sends every reader what is new, at the pace that it takes it.
 
-    Nothing is queued for a reader: it has its place in the history, and when it has taken one
-    frame it gets the next with all that has been added, as far back as the history goes.
+    Nothing is queued for a reader: when it has taken one frame it gets the next with all that has
+    been added, as far back as the history goes.
 
     frame: what a reader gets that has everything before a portion, and the number of the portion
     that it needs next.
@@ -142,8 +135,9 @@ class PageServer:
         await self._runner.cleanup()
 
     async def _page(self, request: web.Request) -> web.StreamResponse:
+        page = Path(__file__).with_name('page.html')
         return web.Response(
-            text=LIVE_PAGE.read_text(encoding='utf-8'), content_type='text/html',
+            text=page.read_text(encoding='utf-8'), content_type='text/html',
             headers={'Cache-Control': 'no-store'},
         )
 

@@ -1,4 +1,4 @@
-"""Controllers that are there: found by what they publish, their state, their newest messages."""
+"""Controllers that run: found by what they publish, their state, their newest messages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
@@ -20,8 +20,6 @@ from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.topics import BACKLASH
 
-DIGITS = re.compile(r'[\d.]+')  # a text in which a figure has changed tells nothing new
-VIEWER_NICENESS = 10  # of a process that only shows: the loop comes first
 # By which a controller is known, or a joint of it.
 WATCHED = re.compile(rf'(?P<node>.*)/watch/((?P<joint>[^/]+)/)?{BACKLASH[0]}')
 
@@ -32,11 +30,13 @@ class ControllerState:
 
     values: of /diagnostics, as they stand there. estimates: value and half width of its band of
     two deviations (nan where there are none). scales: the largest magnitudes that were shown.
-    events: time of day and text, the newest one last.
+    events: time of day and text, the newest one last. inboxes: of messages below
+    `controller/watch`, by label.
     """
 
     node: str
     joint: str = ''
+    inboxes: Mapping[str, Inbox] = field(default_factory=dict)
     level: int = 0
     message: str = ''
     heard_at_s: float = -inf  # on the steady clock
@@ -52,28 +52,34 @@ class ControllerState:
         """As /diagnostics calls it."""
         return f'{self.node}: {self.joint}' if self.joint else self.node
 
-    def take_diagnostics(
-        self, level: int, message: str, values: Mapping[str, str], now_s: float, clock: str,
-    ) -> None:
-        """Take in a status; a text that has changed is an event. clock: the time of day."""
-        if DIGITS.sub('', message) != DIGITS.sub('', self.message):
-            self.note(clock, message)
-        self.level, self.message, self.heard_at_s = level, message, now_s
-        self.values = dict(values)
+    def hear(self, status: DiagnosticStatus, now_s: float) -> None:
+        """Take in what /diagnostics says of it; a text that has changed is an event."""
+        # A text in which a figure has changed tells nothing new.
+        before, after = (re.sub(r'[\d.]+', '', text) for text in (self.message, status.message))
+        if after != before:
+            self.note(status.message)
+        self.level, self.message = min(ord(status.level), 2), status.message
+        self.heard_at_s = now_s
+        self.values = {pair.key: pair.value for pair in status.values}
         for name in BACKLASH:
-            self.take_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
+            self._set_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
 
-    def take_estimate(self, name: str, value: float, half_width: float | None = None) -> None:
-        """Take in m, c_r or c_l; half_width: of its band, None where that is as before."""
-        if half_width is None:
-            _, half_width = self.estimates[name]
+    def watch(self) -> Iterator[tuple[str, int, float]]:
+        """What has come: label, time of arrival [ns], value; m, c_r and c_l are taken in."""
+        for label, inbox in self.inboxes.items():
+            for message, info in inbox.take_all():
+                if label in BACKLASH:
+                    self._set_estimate(label, message.data, self.estimates[label][1])
+                yield label, info['received_timestamp'], message.data
+
+    def _set_estimate(self, name: str, value: float, half_width: float) -> None:
         self.estimates[name] = (value, half_width)
         if isfinite(value):
             self.scales[name] = max(self.scales[name], abs(value))
 
-    def note(self, clock: str, text: str) -> None:
-        """Remember what has happened."""
-        self.events.append((clock, text))
+    def note(self, text: str) -> None:
+        """Remember what has happened now."""
+        self.events.append((time.strftime('%H:%M:%S'), text))
 
     def number(self, key: str) -> float:
         """A value of the diagnostics, nan where it is missing or no number."""
@@ -81,6 +87,11 @@ class ControllerState:
             return float(self.values.get(key, ''))
         except ValueError:
             return nan
+
+    @property
+    def excitation(self) -> float:
+        """Swing of v over the gap."""
+        return self.number('excitation: swing of v / gap')
 
     def is_on(self, key: str) -> bool:
         """A switch in the diagnostics."""
@@ -101,46 +112,12 @@ class ControllerState:
         return self.values.get('state') or self.message.partition(':')[0]
 
 
-def give_way() -> None:
-    """Let the loop come first; before a thread is started, which inherits it."""
-    os.nice(VIEWER_NICENESS)
-    # Niceness counts only among the processes of one session, see autogroup in sched(7). In this
-    # class whoever wakes up does not interrupt one that runs, whatever session that is of.
-    if hasattr(os, 'SCHED_BATCH'):
-        with suppress(OSError):  # some containers do not allow it
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-
-
-class Followed:
-    """State of one controller, or of one joint of it, and its messages below `controller/watch`.
-
-    labels: which of these, m, c_r and c_l among them. depth: how many of each may wait.
-    """
-
-    def __init__(
-        self, node: ProcessNode, controller: str, joint: str, labels: Sequence[str], depth: int,
-    ) -> None:
-        self.state = ControllerState(controller, joint)
-        self._inboxes = {
-            label: Inbox(
-                node, Float64, controller + topics.of_node(topics.watched(label, joint))[1:], depth
-            ) for label in labels
-        }
-
-    def take(self) -> Iterator[tuple[str, int, float]]:
-        """What has come: label, time of arrival [ns], value; m, c_r and c_l go to the state."""
-        for label, inbox in self._inboxes.items():
-            for message, info in inbox.take_all():
-                if label in BACKLASH:
-                    self.state.take_estimate(label, message.data)
-                yield label, info['received_timestamp'], message.data
-
-
 class FollowedControllers:
     """Every controller of the domain, or those of some namespaces, by name.
 
-    wanted: names of controllers or namespaces, none for all. labels, depth: see Followed.
-    Messages are taken when somebody looks: nothing wakes up for each of them.
+    wanted: names of controllers or namespaces, none for all. labels: which of the messages below
+    `controller/watch` to take, and depth: how many of each may wait. Messages are taken when
+    somebody looks: nothing wakes up for each of them.
     """
 
     def __init__(
@@ -148,16 +125,11 @@ class FollowedControllers:
     ) -> None:
         self._node, self._labels, self._depth = node, labels, depth
         self._wanted = ['/' + name.strip('/') for name in wanted]
-        self.by_name: dict[str, Followed] = {}
+        self.by_name: dict[str, ControllerState] = {}
         # Those of all nodes of the domain: some robots have many.
         self._diagnostics = Inbox(node, DiagnosticArray, topics.DIAGNOSTICS, depth=100)
         node.create_timer(1.0, self._look, clock=node.steady_clock)
         self._look()
-
-    @property
-    def states(self) -> list[ControllerState]:
-        """What is known of each."""
-        return [followed.state for followed in self.by_name.values()]
 
     @property
     def awaited(self) -> str:
@@ -173,25 +145,23 @@ class FollowedControllers:
         """Take in what has been said of the controllers."""
         for message, _ in self._diagnostics.take_all():
             for status in message.status:
-                followed = self.by_name.get(f'/{status.name}')
-                if followed is not None:
-                    followed.state.take_diagnostics(
-                        ord(status.level), status.message,
-                        {pair.key: pair.value for pair in status.values},
-                        time.monotonic(), time_of_day(),
-                    )
+                if state := self.by_name.get(f'/{status.name}'):
+                    state.hear(status, time.monotonic())
 
     def _look(self) -> None:
         """Whoever publishes what a controller publishes is one."""
         for topic, _ in sorted(self._node.get_topic_names_and_types()):
             found = WATCHED.fullmatch(topic)
-            if found and self._is_wanted(found['node']):
-                controller, joint = found['node'], found['joint'] or ''
-                name = f'{controller}: {joint}' if joint else controller
-                if name not in self.by_name:
-                    self.by_name[name] = Followed(
-                        self._node, controller, joint, self._labels, self._depth
-                    )
+            if found is None or not self._is_wanted(found['node']):
+                continue
+            state = ControllerState(found['node'], found['joint'] or '')
+            if state.name not in self.by_name:
+                folder = topic.removesuffix(BACKLASH[0])
+                state.inboxes = {
+                    label: Inbox(self._node, Float64, folder + label, self._depth)
+                    for label in self._labels
+                }
+                self.by_name[state.name] = state
 
     def _is_wanted(self, name: str) -> bool:
         return not self._wanted or any(
@@ -199,6 +169,11 @@ class FollowedControllers:
         )
 
 
-def time_of_day() -> str:
-    """Hours, minutes and seconds, for events."""
-    return time.strftime('%H:%M:%S')
+def give_way() -> None:
+    """Let the loop come first; before a thread is started, which inherits it."""
+    os.nice(10)
+    # Niceness counts only among the processes of one session, see autogroup in sched(7). In this
+    # class whoever wakes up does not interrupt one that runs, whatever session that is of.
+    if hasattr(os, 'SCHED_BATCH'):
+        with suppress(OSError):  # some containers do not allow it
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

@@ -15,74 +15,47 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Any, TextIO
+from typing import Any, NamedTuple
 
 from rclpy.client import Client
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 from rich import live as rich_live
 from rich.console import Console
 from std_srvs.srv import SetBool, Trigger
 
-from backlash_ros.nodes.monitor.followed import (
-    ControllerState,
-    FollowedControllers,
-    give_way,
-    time_of_day,
-)
-from backlash_ros.nodes.monitor.view import ASCII_BAR, BAR, plain_line, screen
+from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
+from backlash_ros.nodes.watching.followed import ControllerState, FollowedControllers, give_way
+from backlash_ros.nodes.watching.screen import ASCII_BAR, BAR, plain_line, screen
 from backlash_ros.options import DONE, OptionParser
 from backlash_ros.topics import BACKLASH
 
-# Arrows and function keys come as sequences of which a part looks like other keys.
-KEY_SEQUENCE = re.compile(r'\x1b(\[|O)[0-9;]*.?')
 MONITOR = 'monitor'
-SCREEN_PERIOD_S = 0.2  # of the screen
-LINE_S = 1.0  # between two plain lines
-SERVICE_TIMEOUT_S = 5.0  # longest wait for a service
+SCREEN_PERIOD_S = 0.2
+ANSWER_S = 5.0  # longest wait for a service
 NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
-# What a key calls, and the switch of the diagnostics that it turns over.
+
+
+class Action(NamedTuple):
+    """What a key calls, and the switch of the diagnostics that it turns over, empty for none."""
+
+    service: str
+    switch: str = ''
+
+
 ACTIONS = {
-    'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
-    'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
+    'f': Action('freeze_adaptation', 'learning'), 'r': Action('reset_estimates'),
+    'c': Action('enable_compensation', 'compensating'), 's': Action('save_estimates'),
 }
 
 
-@contextmanager
-def pressed_keys(stream: TextIO) -> Iterator[Callable[[], str]]:
-    """A function that returns what was pressed since its last call; nothing but on a terminal.
-
-    Ctrl-C still is a signal. The terminal is left as it was found.
-    """
-    if not stream.isatty():
-        yield lambda: ''
-        return
-    descriptor = stream.fileno()
-    before = termios.tcgetattr(descriptor)
-
-    def read() -> str:
-        if not select.select([descriptor], [], [], 0.0)[0]:
-            return ''
-        return KEY_SEQUENCE.sub('', os.read(descriptor, 100).decode(errors='ignore'))
-
-    try:
-        tty.setcbreak(descriptor)
-        yield read
-    finally:
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
-
-
-@dataclass
-class Asked:
+class Asked(NamedTuple):
     """A call of a service. until_s: when the wait for it ends. then: the switches afterwards."""
 
     answer: Future
     until_s: float
     state: ControllerState
-    service: str
     then: dict[str, str]
 
 
@@ -95,13 +68,13 @@ class MonitorNode(ProcessNode):
     def __init__(self, wanted: Sequence[str]) -> None:
         super().__init__(MONITOR)
         self._followed = FollowedControllers(self, wanted, BACKLASH, depth=1)
-        self._service_clients: dict[str, dict[str, Client]] = {}  # of controllers, by service
+        self._callers: dict[str, Client] = {}  # by the name of the service
         self._selected = 0
         self._notice, self._notice_ends_s = '', 0.0
         self._confirmed_until_s = 0.0  # a second r resets
         self._pending: list[Asked] = []
 
-    def work(self, executor: SingleThreadedExecutor) -> None:
+    def work(self, executor: PromptExecutor) -> None:
         """Show controllers until a key or a signal ends it."""
         # Whatever a terminal cannot show must not end this.
         if hasattr(sys.stdout, 'reconfigure'):
@@ -111,14 +84,18 @@ class MonitorNode(ProcessNode):
             if console.is_terminal and not console.is_dumb_terminal:
                 self._show(executor, console)
             else:
-                self._print_lines(executor, sys.stdout)
+                self._print_lines(executor)
             return
         # Python would complain of the broken pipe once more when it flushes at its end.
         sys.stdout = open('/dev/null', 'w')  # noqa: SIM115
 
-    def _show(self, executor: SingleThreadedExecutor, console: Console) -> None:
+    @property
+    def _states(self) -> list[ControllerState]:
+        return list(self._followed.by_name.values())
+
+    def _show(self, executor: PromptExecutor, console: Console) -> None:
         blocks = BAR if console.encoding.startswith('utf') else ASCII_BAR
-        with pressed_keys(sys.stdin) as keys, rich_live.Live(
+        with pressed_keys() as keys, rich_live.Live(
             console=console, screen=True, auto_refresh=False, redirect_stdout=False,
             redirect_stderr=False,
         ) as live:
@@ -129,61 +106,48 @@ class MonitorNode(ProcessNode):
                 for key in pressed:
                     self._on_key(key)
                 self._look_for_answers()
-                if pressed or time.monotonic() >= due_s:
-                    due_s = time.monotonic() + SCREEN_PERIOD_S
+                now_s = time.monotonic()
+                if pressed or now_s >= due_s:
+                    due_s = now_s + SCREEN_PERIOD_S
                     self._refresh()
+                    notice = self._notice if now_s < self._notice_ends_s \
+                        else '' if self._states else self._followed.awaited
                     live.update(screen(
-                        self._followed.states, self._selected, self._text_below(), time.monotonic(),
-                        console.width, console.height, blocks,
+                        self._states, self._selected, notice, now_s, console.width, console.height,
+                        blocks,
                     ), refresh=True)
 
-    def _print_lines(self, executor: SingleThreadedExecutor, stream: TextIO) -> None:
-        due_s = time.monotonic() + LINE_S
+    def _print_lines(self, executor: PromptExecutor) -> None:
+        due_s = time.monotonic() + 1.0
         while not self.stopping:
             executor.spin_once(timeout_sec=SCREEN_PERIOD_S)
             if time.monotonic() >= due_s:
-                due_s += LINE_S
+                due_s += 1.0
                 self._refresh()
-                for state in self._followed.states:
-                    print(plain_line(state, time.monotonic()), file=stream)
-                if not self._followed.states:
-                    print(self._followed.awaited, file=stream)
-                stream.flush()
+                lines = [plain_line(state, time.monotonic()) for state in self._states]
+                print('\n'.join(lines) or self._followed.awaited, flush=True)
 
     def _refresh(self) -> None:
         self._followed.take_diagnostics()
-        for followed in self._followed.by_name.values():
-            # Here already: it takes a moment until a client has found its service.
-            self._clients_of(followed.state.node)
-            for _ in followed.take():
+        for state in self._states:
+            for service, switch in ACTIONS.values():
+                # Here already: it takes a moment until a client has found its service.
+                name = f'{state.node}/{service}'
+                if name not in self._callers:
+                    self._callers[name] = self.create_client(SetBool if switch else Trigger, name)
+            for _ in state.watch():
                 pass  # the state has it
-
-    def _clients_of(self, name: str) -> dict[str, Client]:
-        """Clients of the services of a controller, by the last part of their names."""
-        if name not in self._service_clients:
-            self._service_clients[name] = {
-                service: self.create_client(kind, f'{name}/{service}') for service, kind in (
-                    ('freeze_adaptation', SetBool), ('enable_compensation', SetBool),
-                    ('reset_estimates', Trigger), ('save_estimates', Trigger),
-                )
-            }
-        return self._service_clients[name]
-
-    def _text_below(self) -> str:
-        if time.monotonic() < self._notice_ends_s:
-            return self._notice
-        return '' if self._followed.states else self._followed.awaited
 
     def _on_key(self, key: str) -> None:
         if key == 'q':
             self.exit_code, self.stopping = DONE, True
-        elif key == '\t' and self._followed.states:
-            self._selected = (self._selected + 1) % len(self._followed.states)
+        elif key == '\t' and self._states:
+            self._selected = (self._selected + 1) % len(self._states)
             self._confirmed_until_s = 0.0
-        elif key in ACTIONS and self._followed.states:
-            self._act(key, self._followed.states[self._selected])
+        elif key in ACTIONS and self._states:
+            self._call(key, self._states[self._selected])
 
-    def _act(self, key: str, state: ControllerState) -> None:
+    def _call(self, key: str, state: ControllerState) -> None:
         """Call the service behind a key."""
         service, switch = ACTIONS[key]
         if key == 'r' and time.monotonic() > self._confirmed_until_s:
@@ -191,9 +155,9 @@ class MonitorNode(ProcessNode):
             self._say(f'press r once more to reset the estimates of {state.name}')
             return
         self._confirmed_until_s = 0.0
-        client = self._clients_of(state.node)[service]
-        if not client.service_is_ready():
-            self._say(f'{state.node}/{service} is not there')
+        name = f'{state.node}/{service}'
+        if not self._callers[name].service_is_ready():
+            self._say(f'{name} is not there')
             return
         request: Any = Trigger.Request()
         then: dict[str, str] = {}
@@ -202,9 +166,9 @@ class MonitorNode(ProcessNode):
             then = {switch: str(on)}
             request = SetBool.Request(data=on if service == 'enable_compensation' else not on)
         self._pending.append(Asked(
-            client.call_async(request), time.monotonic() + SERVICE_TIMEOUT_S, state, service, then
+            self._callers[name].call_async(request), time.monotonic() + ANSWER_S, state, then
         ))
-        self._say(f'{state.node}/{service} ...')
+        self._say(f'{name} ...')
 
     def _look_for_answers(self) -> None:
         for asked in list(self._pending):
@@ -215,23 +179,48 @@ class MonitorNode(ProcessNode):
                     # The next diagnostics may be a second away.
                     asked.state.values |= asked.then
             elif time.monotonic() > asked.until_s:
-                text = f'no answer from {asked.service} within {SERVICE_TIMEOUT_S:g} s'
+                text = f'no answer within {ANSWER_S:g} s'
             else:
                 continue
             self._pending.remove(asked)
-            asked.state.note(time_of_day(), text)
+            asked.state.note(text)
             self._say(f'{asked.state.name}: {text}')
 
     def _say(self, text: str) -> None:
         self._notice, self._notice_ends_s = text, time.monotonic() + NOTICE_S
 
 
+@contextmanager
+def pressed_keys() -> Iterator[Callable[[], str]]:
+    """A function that returns what was pressed since its last call; nothing but on a terminal.
+
+    Ctrl-C still is a signal. The terminal is left as it was found.
+    """
+    if not sys.stdin.isatty():
+        yield lambda: ''
+        return
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+
+    def read() -> str:
+        if not select.select([descriptor], [], [], 0.0)[0]:
+            return ''
+        text = os.read(descriptor, 100).decode(errors='ignore')
+        # Arrows and function keys come as sequences of which a part looks like other keys.
+        return re.sub(r'\x1b(\[|O)[0-9;]*.?', '', text)
+
+    try:
+        tty.setcbreak(descriptor)
+        yield read
+    finally:
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
     parser = OptionParser(
-        MONITOR, description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        MONITOR, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter,
         epilog='keys: f freezes or goes on learning, c compensates or not, r (twice) resets the '
                'estimates,\n      s saves them, Tab takes the next controller, q ends.',
     )

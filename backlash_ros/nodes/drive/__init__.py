@@ -1,0 +1,1 @@
+"""What `check_driver` and `identify --drive` share: a driver is heard, v moved to and fro."""

@@ -1,0 +1,203 @@
+"""Node that stands in for the controller: it hears a driver, and moves v gently if told to."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from math import inf
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
+from std_msgs.msg import Float64
+
+from backlash_ros import topics
+from backlash_ros.core.assembly import build_controller, build_limits
+from backlash_ros.core.control.limits import plausible
+from backlash_ros.core.driver_check.findings import Heard, Message
+from backlash_ros.core.driver_check.gentle_drive import Drive, Range, drive_range
+from backlash_ros.core.parameters.table import CONTROLLER
+from backlash_ros.nodes.control.rivals import Presence, identity_made_by
+from backlash_ros.nodes.drive.driver_graph import DriverGraph
+from backlash_ros.nodes.runtime.executor import PromptExecutor
+from backlash_ros.nodes.runtime.messages import DEPTH
+from backlash_ros.nodes.runtime.process import ProcessNode
+from backlash_ros.options import BAD_INPUT, FAILED
+
+LOOK_S = 0.1  # between two looks at the graph
+SETTLE_S = 1.0  # after which everybody should have found everybody
+# What a motion is: limits, sample period [s], duration [s], v at its begin.
+MakeMotion = Callable[[Range, float, float, float], Drive]
+
+
+class MotionNode(ProcessNode):
+    """Hears a driver and, with --drive, answers every plant_output with a control.
+
+    v is brought to rest at the end, whatever ends the motion. The parameters are those of the
+    controller.
+
+    heard: all messages. motion: v on its way, None before the first one. ended: why the motion
+    ended before its time, empty if it did not. names: full names of the topics.
+    """
+
+    def __init__(self, program: str, options: argparse.Namespace, motion: MakeMotion) -> None:
+        super().__init__(program, parameters_of=CONTROLLER)
+        p = self.settings
+        build_controller(p)
+        self.options = options
+        if options.drive:
+            limits = drive_range(p, options.amplitude, options.rate)
+            self._begin = partial(motion, limits, p.sample_period, options.duration)
+        self.heard = Heard()
+        self.motion: Drive | None = None
+        self.ended, self.exit_code = '', FAILED
+        self.names = {
+            topic: self.resolve_topic_name(topic)
+            for topic in (topics.PLANT_OUTPUT, topics.CONTROL, topics.APPLIED_CONTROL)
+        }
+        self.graph = DriverGraph(self, self.names)
+        self._driving, self._rivals = False, ''
+
+    def tell(self) -> None:
+        """Say what came of it, and set the exit code."""
+
+    def work(self, executor: PromptExecutor) -> None:
+        """Wait for the driver, listen, come to rest, tell."""
+        if self._await_driver(executor):
+            try:
+                self._follow(executor)
+            finally:
+                self._come_to_rest()
+        if self._rivals:
+            self.say(
+                f'{self.names[topics.CONTROL]} is published by {self._rivals}: '
+                'stop that first, or leave --drive out'
+            )
+            self.exit_code = BAD_INPUT
+        else:
+            self.tell()
+
+    def look(self) -> None:
+        """Called every LOOK_S while the node listens."""
+        if self.options.drive:
+            # Once heard, a rival counts, even if it leaves.
+            self._rivals = self._rivals or self.graph.rivals()
+        self.graph.look()
+
+    def say(self, text: str) -> None:
+        """Tell the user in a line of stderr."""
+        print(f'{self.get_name()}: {text}', file=sys.stderr)
+
+    def _await_driver(self, executor: PromptExecutor) -> bool:
+        now = time.monotonic()
+        deadline, remind = now + self.options.wait, now + 3.0
+        while not self.stopping and not self.graph.publishers(topics.PLANT_OUTPUT):
+            now = time.monotonic()
+            if now > min(deadline, remind):
+                self.graph.say_what_is_missing()
+                remind += 3.0
+            if now > deadline:
+                return False
+            executor.spin_once(timeout_sec=LOOK_S)
+        return not self.stopping
+
+    def _follow(self, executor: PromptExecutor) -> None:
+        """Listen for the duration, and drive."""
+        self._hear(topics.APPLIED_CONTROL, self.heard.applied.append)
+        if self.options.drive:
+            control = self.names[topics.CONTROL]
+            self._presence = Presence(
+                self.context.get_domain_id(), control,
+                identity_made_by(self, control, self._advertise),
+            )
+        else:
+            self._hear(topics.CONTROL, self.heard.controls.append)
+        self._hear(topics.PLANT_OUTPUT, self._on_output)
+        begin = looked = time.monotonic()
+        end = begin + self.options.duration + (SETTLE_S if self.options.drive else 0.0)
+        p = self.settings
+        patience = max(p.timeout.plant_output, 10.0 * p.sample_period)
+        outputs, newest = 0, inf  # y heard so far, and when that was seen
+        while not (self.stopping or self.ended or self._rivals) and time.monotonic() < end:
+            executor.spin_once(timeout_sec=LOOK_S)
+            now = time.monotonic()
+            if len(self.heard.outputs) > outputs:
+                outputs, newest = len(self.heard.outputs), now
+            if now > looked + LOOK_S:
+                looked = now
+                self.look()
+                if self.options.drive and now > begin + SETTLE_S:
+                    if self._presence.others():
+                        self._rivals = self._rivals or 'a controller of this machine'
+                    self._driving = self._control.get_subscription_count() > 0
+            if self._driving and now > newest + patience:
+                self.ended = \
+                    f'nothing was heard on {self.names[topics.PLANT_OUTPUT]} for {patience:g} s'
+        self.look()
+        self.heard.end_ns = time.time_ns()
+
+    def _advertise(self) -> Publisher:
+        self._control: Publisher = self.create_publisher(Float64, topics.CONTROL, DEPTH)
+        return self._control
+
+    def _hear(self, topic: str, take: Callable[[Message], None]) -> None:
+        """Subscribe the way that hears whoever publishes, whatever the QoS."""
+        def on_message(message: Float64, info: dict[str, Any]) -> None:
+            take(Message(
+                message.data, info['source_timestamp'], info['received_timestamp'],
+                info['publication_sequence_number'],
+            ))
+
+        self.listen(Float64, topic, on_message, self.graph.profile(topic))
+
+    def _on_output(self, output: Message) -> None:
+        self.heard.outputs.append(output)
+        if not self._driving or self._rivals or self.ended:
+            return
+        low, high = self.options.output_range
+        if plausible(output.value) and not low <= output.value <= high:
+            self.ended = f'y = {output.value:.4g} left --output-range'
+            return
+        if self.motion is None:
+            self.motion = self._begin(self._v_at_start())
+        v, now = self.motion.step(), time.time_ns()
+        self._control.publish(Float64(data=v))
+        self.heard.controls.append(Message(v, now, now, 0))
+
+    def _v_at_start(self) -> float:
+        """The v that acts before the motion, 0 where nobody says it."""
+        initial = self.settings.control.initial
+        known = initial if plausible(initial) else None
+        reported = [message.value for message in self.heard.applied[-1:]]
+        if reported and plausible(reported[0]):
+            return build_limits(self.settings).go_on_from(reported[0], known)
+        if known is None:
+            self.say(
+                'nobody says which v acts now, so the drive goes on from 0: '
+                f'publish {topics.APPLIED_CONTROL}, or set control.initial'
+            )
+        return known or 0.0
+
+    def _come_to_rest(self) -> None:
+        motion, before = self.motion, self.signals
+        if motion is None:
+            return
+        deadline = time.monotonic() + self.options.rest
+        while not motion.step_to_rest():
+            self._control.publish(Float64(data=motion.v))
+            time.sleep(self.settings.sample_period)
+            late = time.monotonic() > deadline
+            if late or self.signals > before:
+                why = f'not at rest within --rest={self.options.rest:g} s' if late \
+                    else 'another signal came'
+                self.say(f'v is held at {motion.v:.6g}: {why}')
+                break
+        # A busy machine may lose a message, and this one is to be heard before the node leaves.
+        for _ in range(10):
+            self._control.publish(Float64(data=motion.v))
+            if self._control.wait_for_all_acked(Duration(seconds=0.1)):
+                return
+        self.say(f'the driver has not confirmed the last v={motion.v:.6g}')

@@ -1,1 +1,0 @@
-"""Parts of check_driver: its options, and what discovery tells of a driver."""

@@ -1,1 +1,0 @@
-"""`live`: running controllers on a page in the browser."""

@@ -1,1 +1,0 @@
-"""`monitor`: running controllers in a terminal."""

@@ -1,0 +1,1 @@
+"""What `monitor` and `live` share: running controllers, and how they are shown."""
