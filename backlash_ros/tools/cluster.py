@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import CancelledError
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
-
-from tqdm import tqdm
 
 from backlash_ros.tools.batch import Job, Outcome, run_job
 from backlash_ros.tools.cli import BrokenOffError, InputError
@@ -19,8 +17,10 @@ if TYPE_CHECKING:
 CLUSTER_ANSWER_S = 10.0  # for the scheduler to answer, and for a first worker to be there
 
 
-def run_on_cluster(jobs: Sequence[Job], address: str, label: str = '') -> list[Outcome]:
-    """Outcomes in the order of the jobs, the same as those of batch.run_jobs.
+def run_on_cluster(
+    jobs: Sequence[Job], address: str,
+) -> Generator[tuple[int, Outcome], None, None]:
+    """Number and outcome of each job, as they come.
 
     A run whose worker is lost is given to another one. address: of the scheduler, as tcp://HOST:PORT.
     Raises InputError where there is no such cluster, or one with other libraries; BrokenOffError
@@ -42,21 +42,19 @@ def run_on_cluster(jobs: Sequence[Job], address: str, label: str = '') -> list[O
             f'--cluster {address}: no scheduler answers ({reason}): start one with '
             '`dask scheduler --host HOST`, and workers with `dask worker tcp://HOST:8786`'
         ) from None
-    # disable=None: no bar where stderr is not a terminal.
-    with client, tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
+    with client:
         _check_workers(client, address)
         try:
             # Not pure: runs of the same parameters are runs all the same.
             futures = client.map(run_job, jobs, pure=False)
-            outcomes = {}
+            numbers = {future.key: i for i, future in enumerate(futures)}
             for future, outcome in as_completed(futures, loop=client.loop, with_results=True):
-                outcomes[future.key] = outcome
-                bar.update()
-            return [outcomes[future.key] for future in futures]
-        except (KilledWorker, CancelledError) as error:
-            why = 'a run has ended several workers: is there enough memory?' \
-                if isinstance(error, KilledWorker) else \
-                'the scheduler has ended: start it and simulate again'
+                yield numbers[future.key], outcome
+        except KilledWorker:
+            why = 'a run has ended several workers: is there enough memory?'
+            raise BrokenOffError(f'--cluster {address}: {why}') from None
+        except CancelledError:
+            why = 'the scheduler has ended: start it and simulate again'
             raise BrokenOffError(f'--cluster {address}: {why}') from None
 
 
