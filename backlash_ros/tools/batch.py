@@ -1,18 +1,20 @@
-"""Many simulated runs: seeds and sweeps as jobs, in parallel processes, and their statistics."""
+"""Many simulated runs: seeds and sweeps as jobs, here or on a cluster, and their statistics."""
 
 from __future__ import annotations
 
 import itertools
+import logging
 import multiprocessing
 import os
 import signal
 import threading
 from collections.abc import Generator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
+from importlib.metadata import version
 from math import inf, nan
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -29,6 +31,10 @@ from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
 
+if TYPE_CHECKING:
+    from distributed import Client
+
+CLUSTER_ANSWER_S = 10.0  # for a scheduler to answer, and for a first worker to be there
 # What an outcome has of m, c_r and c_l: the beginning of a column, and the group in a summary.
 OUTCOME_GROUPS = {
     '': 'final', 'std_': 'final_std', 'true_': 'truth', 'settling_': 'settling_time_s',
@@ -151,8 +157,7 @@ def run_jobs(
         workers = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
             os.cpu_count() or 1)
     if cluster is not None:
-        from backlash_ros.tools.cluster import run_on_cluster
-        finished = run_on_cluster(jobs, cluster)
+        finished = _on_cluster(jobs, cluster)
     elif min(workers, len(jobs)) > 1:
         finished = _in_processes(jobs, min(workers, len(jobs)))
     else:
@@ -200,6 +205,75 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _on_cluster(jobs: Sequence[Job], address: str) -> Generator[tuple[int, Outcome], None, None]:
+    """Number and outcome of each job, as they come.
+
+    A run whose worker is lost is given to another one. address: of the scheduler, as tcp://HOST:PORT.
+    Raises InputError where there is no such cluster, or one with other libraries; BrokenOffError
+    where it ends before the runs do, or a run has ended several workers.
+    """
+    try:
+        from distributed import Client, KilledWorker
+        from distributed import as_completed as completed
+    except ImportError:
+        raise InputError(
+            "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
+        ) from None
+    # The error below says in one line what the user needs to know.
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f'--cluster {address}: no scheduler answers ({reason}): start one with '
+            '`dask scheduler --host HOST`, and workers with `dask worker tcp://HOST:8786`'
+        ) from None
+    with client:
+        _check_workers(client, address)
+        try:
+            # Not pure: runs of the same parameters are runs all the same.
+            futures = client.map(run_job, jobs, pure=False)
+            numbers = {future.key: i for i, future in enumerate(futures)}
+            for future, outcome in completed(futures, loop=client.loop, with_results=True):
+                yield numbers[future.key], outcome
+        except KilledWorker:
+            why = 'a run has ended several workers: is there enough memory?'
+            raise BrokenOffError(f'--cluster {address}: {why}') from None
+        except CancelledError:
+            why = 'the scheduler has ended: start it and simulate again'
+            raise BrokenOffError(f'--cluster {address}: {why}') from None
+
+
+def _check_workers(client: Client, address: str) -> None:
+    """Raise InputError unless there are workers, with the libraries of this process."""
+    from distributed import TimeoutError as NoWorkerError
+    here = libraries()
+    try:
+        client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
+        there: dict[str, Any] = client.run(libraries)
+    except NoWorkerError:
+        raise InputError(
+            f'--cluster {address}: no worker within {CLUSTER_ANSWER_S:g} s: start some with '
+            f'`dask worker {address}`'
+        ) from None
+    except ImportError as error:
+        raise InputError(
+            f'--cluster {address}: a worker says {error}: install the same backlash_ros there'
+        ) from None
+    for worker, found in there.items():
+        if found != here:
+            raise InputError(
+                f'--cluster {address}: {worker} has {found}, here is {here}: install the same '
+                'versions, else the last digits differ'
+            )
+
+
+def libraries() -> dict[str, str]:
+    """Versions of the libraries on which the last bit of a result may depend."""
+    return {name: version(name) for name in ('numpy', 'scipy')}
 
 
 def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:

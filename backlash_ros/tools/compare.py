@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
@@ -26,7 +25,7 @@ from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
 from backlash_ros.tools.config import effective_parameters
-from backlash_ros.tools.runs.figure_data import control_error, moving_rms
+from backlash_ros.tools.runs.figure_data import ErrorCurves, control_error, moving_rms
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
 
@@ -55,15 +54,12 @@ class Result(NamedTuple):
 
     merits: what stands in the table behind the name, None where it does not apply: control error
     [unit of u], relative tracking error, the part of it that the backlash costs, way of v [unit of
-    v], crossings of the gap per reversal. t, control, tracking: moving RMS of its errors, shape
-    (N,), tracking None where y is not meant to follow y_m. note: why the run broke off.
+    v], crossings of the gap per reversal. note: why the run broke off.
     """
 
     contender: Contender
     merits: tuple[float | None, ...] = ()
-    t: NDArray[np.float64] = np.empty(0)
-    control: NDArray[np.float64] = np.empty(0)
-    tracking: NDArray[np.float64] | None = None
+    curves: ErrorCurves | None = None
     note: str = ''
 
     @property
@@ -144,7 +140,7 @@ def _measure(contender: Contender, scenario: Parameters, samples: int) -> Result
     return Result(contender, (
         control_error_rms(run), error, penalty, total_variation(run.column('v')[t >= since]),
         gap_crossings_per_reversal(run, since),
-    ), t, moving_rms(control_error(run), window), tracking)
+    ), ErrorCurves(contender.name, t, moving_rms(control_error(run), window), tracking))
 
 
 def comparison_document(scenario: Parameters, results: Sequence[Result], figure: str) -> str:
@@ -194,8 +190,8 @@ def _compare(args: Sequence[str] | None) -> None:
     out = result_directory(options.out)
     figure, document = 'images/comparison.png', out / 'comparison.md'
     (out / figure).parent.mkdir(parents=True, exist_ok=True)
-    whole = [result for result in results if not result.note]
-    write_atomically(out / figure, png(draw_comparison(whole, COMPARISON_WINDOW_S)))
+    curves = [result.curves for result in results if result.curves is not None]
+    write_atomically(out / figure, png(draw_comparison(curves, COMPARISON_WINDOW_S)))
     write_atomically(document, comparison_document(scenario, results, figure))
     print(f'document: {document}')
 

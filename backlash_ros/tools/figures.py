@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -19,16 +19,13 @@ from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.runs.figure_data import (
+    ErrorCurves,
     FollowedReference,
     LawTrace,
     Part,
     estimated_loop,
 )
 from backlash_ros.topics import BACKLASH
-
-if TYPE_CHECKING:
-    from backlash_ros.tools.batch import Sweep
-    from backlash_ros.tools.compare import Result
 
 Array = NDArray[np.float64]
 
@@ -342,15 +339,16 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     return figure
 
 
-def draw_sweep(sweep: Sweep, lines: Mapping[str, Sequence[Sequence[float]]], others: str) -> Figure:
+def draw_sweep(
+    swept: str, values: Sequence[Any], lines: Mapping[str, Sequence[Sequence[float]]], others: str,
+) -> Figure:
     """Relative RMSE of m, c_r, c_l [%] and the settling time of the slowest of them [s].
 
-    sweep: what the horizontal axis shows. lines: by the values of the other parameters, shape
-    (values, 4). others: the names of these.
+    swept, values: the parameter of the horizontal axis. lines: by the values of the other
+    parameters, shape (values, 4). others: the names of these.
     """
     figure = new_figure(7.4)
     panels = figure.subplots(2, 2).ravel().tolist()
-    swept, values = sweep
     numeric = all(isinstance(value, (int, float)) for value in values)
     places = np.array(values if numeric else range(len(values)), dtype=float)
     for i, (name, rows) in enumerate(lines.items()):
@@ -376,20 +374,19 @@ def draw_sweep(sweep: Sweep, lines: Mapping[str, Sequence[Sequence[float]]], oth
     return figure
 
 
-def draw_comparison(results: Sequence[Result], window_s: float) -> Figure:
+def draw_comparison(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
     """Size of the control error (Figure 5 of the paper, extended) and of the tracking error.
 
     window_s: over which the RMS was taken [s].
     """
     control, tracking = [], []
-    for i, result in enumerate(results):
-        name = result.contender.name
+    for i, (name, t, of_control, of_tracking) in enumerate(loops):
         # The curve of the loop without backlash comes to lie on that of the one that has learned.
         width = 3.4 if name == 'moving_horizon, tracking' else 1.7
         look = CYCLE[i % len(CYCLE)], name, DASHES[i % len(DASHES)], width
-        control.append(Line(result.t, result.control, *look))
-        if result.tracking is not None:
-            tracking.append(Line(result.t, result.tracking, *look))
+        control.append(Line(t, of_control, *look))
+        if of_tracking is not None:
+            tracking.append(Line(t, of_tracking, *look))
     rows = {
         f'RMS of $u - u_d$ over {window_s:g} s\n[unit of u]': control,
         f'RMS of $y - y_m$ over {window_s:g} s\n[unit of y]': tracking,

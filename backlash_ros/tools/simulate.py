@@ -113,7 +113,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
         for change, (_, points) in zip(changes, rows, strict=True):
             others = map(batch.value_text, list(change.values())[1:])
             lines.setdefault(', '.join(others), []).append(points)
-        figure = draw_sweep(sweeps[0], lines, ', '.join(swept[1:]))
+        figure = draw_sweep(*sweeps[0], lines, ', '.join(swept[1:]))
         write_atomically(directory / 'sweep.png', png(figure))
         print(f'figure: {directory / "sweep.png"}')
     else:

@@ -45,6 +45,18 @@ class LawTrace(NamedTuple):
     note: str = ''
 
 
+class ErrorCurves(NamedTuple):
+    """Moving RMS of the control error and of the tracking error of a loop, shape (N,) each.
+
+    tracking: None where y is not meant to follow y_m.
+    """
+
+    name: str
+    t: Array
+    control: Array
+    tracking: Array | None
+
+
 class FollowedReference(NamedTuple):
     """values: the reference at each sample, shape (N,), delay [s] late.
 
