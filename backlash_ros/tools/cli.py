@@ -6,15 +6,17 @@ import argparse
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from types import FrameType
-from typing import Any, NamedTuple
+from types import FrameType, TracebackType
+from typing import Any
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
+DEFAULT_DURATION_S = 10.0  # of a run
 NOTHING = '–'  # in a table, where there is no number
 
 
@@ -26,7 +28,8 @@ class BrokenOffError(RuntimeError):
     """A run could not go on, although everything given was valid: one line says why."""
 
 
-class Span(NamedTuple):
+@dataclass(frozen=True)
+class Span:
     """A part of a run, in seconds from its first sample: from_s <= t < to_s."""
 
     from_s: float = 0.0
@@ -66,7 +69,8 @@ def add_duration_option(parser: argparse.ArgumentParser, further: str = '') -> N
     """Add --duration, for `number_of_samples`; further: a sentence on other values."""
     parser.add_argument(
         '--duration', type=float, metavar='SECONDS',
-        help=f'length of a run (default: the parameter samples, or 10 s){further}',
+        help=f'length of a run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s)'
+             + further,
     )
 
 
@@ -92,7 +96,8 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     """
     if duration is None and parameters.samples > 0:
         return parameters.samples
-    duration = 10.0 if duration is None else duration
+    if duration is None:
+        duration = DEFAULT_DURATION_S
     if not 0.0 < duration < inf:
         raise InputError(f'--duration={duration!r} must be finite and > 0')
     period = parameters.sample_period
@@ -113,17 +118,20 @@ def run_tool(name: str, tool: Callable[[], None]) -> int:
     handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         tool()
-        return DONE
     except (ParameterError, InputError) as error:
-        message, code = str(error), BAD_INPUT
+        return _fail(name, str(error), BAD_INPUT)
     except SystemExit as ended:
         return int(ended.code or DONE)  # the parser of the options has said why
     except KeyboardInterrupt:
-        message, code = 'interrupted', FAILED
+        return _fail(name, 'interrupted', FAILED)
     except (BrokenOffError, OSError) as error:
-        message, code = str(error), FAILED
+        return _fail(name, str(error), FAILED)
     finally:
         signal.signal(signal.SIGTERM, handler)
+    return DONE
+
+
+def _fail(name: str, message: str, code: int) -> int:
     print(f'{name}: {message}', file=sys.stderr)
     return code
 
@@ -138,9 +146,12 @@ def print_warnings(name: str, parameters: Parameters) -> None:
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns aligned: the first to the left, all others to the right."""
-    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
     return '\n'.join(
-        '  '.join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
+        '  '.join(
+            cell.rjust(width) if i else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
         for row in (header, *rows)
     )
 
@@ -167,9 +178,16 @@ class StopRequests:
                 self._before[caught] = signal.signal(caught, self._note)
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
         for caught, handler in self._before.items():
             signal.signal(caught, handler)
+
+    def insist(self) -> bool:
+        """Whether there was a second request."""
+        return self.count > 1
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.count += 1

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
@@ -28,7 +27,14 @@ from backlash_ros.tools.cli import (
 )
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.page import Picture, facts, page, table
-from backlash_ros.tools.runs import figure_data
+from backlash_ros.tools.records.columns import parse_columns
+from backlash_ros.tools.records.reading import read_run_or_log
+from backlash_ros.tools.runs.figure_data import (
+    compare_laws,
+    compared_samples,
+    followed_reference,
+    interesting_parts,
+)
 from backlash_ros.tools.runs.files import (
     CONFIG_FILE,
     SUMMARY_FILE,
@@ -37,7 +43,6 @@ from backlash_ros.tools.runs.files import (
     write_run,
     write_summary,
 )
-from backlash_ros.tools.runs.read_run import read_run
 from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
 from backlash_ros.topics import BACKLASH
 
@@ -60,82 +65,88 @@ def write_report(run: Run, out: Path) -> dict[str, Any]:
     if run.parameters is not None:
         write_config(run.parameters, out / CONFIG_FILE)
         folded = ('Parameters of this run', (out / CONFIG_FILE).read_text(encoding='utf-8'))
-    pictures = [
-        Picture(name, heading, caption, figures.png(figure))
-        for name, heading, caption, figure in _figures(run.record, run.parameters, summary)
-    ]
+    pictures = list(draw(run.record, run.parameters, summary))
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)
     notes = [f'{note[0].upper()}{note[1:]}.' for note in run.notes]
+    tables = _backlash_table(summary) + _facts(summary)
     write_atomically(out / REPORT_PAGE, page(
-        'Adaptive backlash inverse control', headline(summary), notes, [_tables(summary)],
-        pictures, folded,
-    ))
+        'Adaptive backlash inverse control', headline(summary), notes, [tables], pictures, folded))
     return summary
 
 
-def _figures(
+def draw(
     run: RunRecord, parameters: Parameters | None, summary: Mapping[str, Any],
-) -> Iterator[tuple[str, str, str, Figure]]:
-    """File, heading, caption (HTML) and figure of all that this run allows, in their order."""
-    start, end = parts = figure_data.interesting_parts(run, parameters)
+) -> Iterator[Picture]:
+    """Every figure that this run allows, in the order of the page."""
+    if not np.isfinite(run.column('m')).any():
+        yield Picture(
+            'log.png', 'v and y', 'What the log holds, as it was read. With play, y over v is a '
+            'loop with level stretches, as wide as the gap, where v turns.',
+            figures.png(figures.draw_log(run)),
+        )
+        return
+    start, end = parts = interesting_parts(run, parameters)
     if run.has_truth:
-        yield (
+        yield Picture(
             'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
             'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
             'the time from which the error stays within 1 %.',
-            figures.draw_parameter_errors(run, start, summary['settling_time_s']),
+            figures.png(figures.draw_parameter_errors(run, start, summary['settling_time_s'])),
         )
-    yield (
+    yield Picture(
         'estimates.png', 'Estimates over time',
         'What the controller has learned from v and y alone; a band shows how sure it is where '
-        'the law knows.', figures.draw_estimates(run),
+        'the law knows.', figures.png(figures.draw_estimates(run)),
     )
     if np.isfinite(run.column('u')).any():
-        error = figure_data.control_error(run)
-        yield (
+        yield Picture(
             'control_error.png', 'Control error of this run',
             'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
-            figures.draw_closer(run, error, '$u - u_d$ [unit of u]', parts),
+            figures.png(figures.draw_control_error(run, parts)),
         )
     elif np.isfinite(run.column('innovation')).any():
-        yield (
+        yield Picture(
             'innovation.png', 'Innovation',
             'y minus its prediction. White and small: the model explains the plant.',
-            figures.draw_closer(run, run.column('innovation'), r'$y - \hat{y}$ [unit of y]', parts),
+            figures.png(figures.draw_innovation(run, parts)),
         )
     if run.has_truth and parameters is not None:
-        duration = figure_data.compared_samples(run) * run.sample_period
-        yield (
+        duration = compared_samples(run) * run.sample_period
+        yield Picture(
             'laws.png', 'Control error of the laws (Figure 5 of the paper)',
             'This run beside the other laws, simulated with the same parameters, over the first '
             f'{duration:.6g} s. Each has its own scale; the last panel has all on one.',
-            figures.draw_laws(figure_data.compare_laws(run, parameters), start),
+            figures.png(figures.draw_laws(compare_laws(run, parameters), start)),
         )
-    yield (
+    yield Picture(
         'hysteresis.png', 'Backlash: the v–u loop',
         'u follows the right line going up, the left line going down, and is held between them. '
         'Where a dashed line lies on the wide one, the estimate is right.' if run.has_truth else
         'The loop as the last estimates see it: u itself was not measured.',
-        figures.draw_hysteresis(run, end),
+        figures.png(figures.draw_hysteresis(run, end)),
     )
-    reference = figure_data.followed_reference(run, parameters)
-    yield (
+    reference = followed_reference(run, parameters)
+    yield Picture(
         'output.png', 'Reference and output',
         'y follows y<sub>m</sub>.' if reference.followed else
         'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
         'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-        figures.draw_output(run, end, reference),
+        figures.png(figures.draw_output(run, end, reference)),
     )
-    yield (
+    yield Picture(
         'input.png', 'Desired input and control',
         'v jumps by the width of the gap whenever u<sub>d</sub> turns.',
-        figures.draw_input(run, parts),
+        figures.png(figures.draw_input(run, parts)),
     )
 
 
 def headline(summary: Mapping[str, Any]) -> str:
     """The outcome in one sentence of HTML."""
+    if summary['final']['m'] is None or not np.isfinite(summary['final']['m']):
+        return 'A log of v and y, which no controller has estimated anything from: ' \
+               '<code>identify</code> tells its backlash, <code>replay</code> what a controller ' \
+               'would have learned.'
     law = summary['estimator']
     who = f'The law <b>{escape(law)}</b>' if law else 'The controller'
     if summary['truth']['m'] is None:
@@ -150,24 +161,25 @@ def headline(summary: Mapping[str, Any]) -> str:
     )
 
 
-def _tables(summary: Mapping[str, Any]) -> str:
-    """The backlash that was learned, and what else is known of the run."""
+def _backlash_table(summary: Mapping[str, Any]) -> str:
     rows = [
         (symbol, *estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
         for name, symbol in HTML_SYMBOLS.items()
     ]
     rows.append(('f', number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
+    return table(('', *ESTIMATE_HEADER, 'unit'), rows)
+
+
+def _facts(summary: Mapping[str, Any]) -> str:
     latency = summary['loop_latency_ms'] or {'p50': None, 'p99': None}
     duration = (summary['samples'] + summary['lost_samples']) * summary['sample_period']
     unexplained = summary['unexplained']
-    first = summary['began_with']
-    began = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
-    return table(('', *ESTIMATE_HEADER, 'unit'), rows) + facts([
+    return facts([
         ('samples', f'{summary["samples"]} in {duration:.6g} s'),
         ('lost samples', str(summary['lost_samples'])),
         ('sample period', f'{summary["sample_period"]:.6g} s'),
         ('structure', escape(summary['structure'] or NOTHING)),
-        ('began with', f'{began}: {escape(first["from"])}' if first['from'] else began),
+        ('began with', _beginning(summary['began_with'])),
         ('control error RMS, last second', number(summary['control_error_rms'], 4, '[unit of u]')),
         ('tracking error RMS, last half',
          number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)),
@@ -182,12 +194,25 @@ def _tables(summary: Mapping[str, Any]) -> str:
     ])
 
 
+def _beginning(first: Mapping[str, Any]) -> str:
+    values = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
+    return f'{values}: {escape(first["from"])}' if first['from'] else values
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `report`."""
+    return run_tool('report', lambda: _report(args))
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The options of `report`."""
     parser = OptionParser('report', description=__doc__)
     parser.add_argument(
-        'path', type=Path, help='a bag or its .mcap file, a folder of results, or samples.csv'
+        'path', type=Path, help='a bag or its .mcap file, a folder of results, samples.csv, or a '
+                                'log as identify reads it'
     )
+    parser.add_argument('--columns', type=parse_columns, default={}, metavar='t=…,v=…,y=…',
+                        help='which columns of a log these are (default: told by their names)')
     parser.add_argument(
         '--config', type=Path, metavar='FILE',
         help='parameters of the run (default: parameters.yaml beside it)',
@@ -202,17 +227,13 @@ def make_parser() -> argparse.ArgumentParser:
 def _report(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
-    run = read_run(options.path.resolve(), options.config, span_of(parser, options), options.axis)
+    run, _ = read_run_or_log(options.path.resolve(), options.config, span_of(parser, options),
+                             options.axis, options.columns)
     if run.record.samples == 0:
         raise InputError(f'{options.path}: holds no sample')
     out = result_directory(options.out)
     write_report(run, out)
     print(out / REPORT_PAGE)
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `report`."""
-    return run_tool('report', lambda: _report(args))
 
 
 if __name__ == '__main__':

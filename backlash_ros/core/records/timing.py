@@ -9,7 +9,7 @@ that is hidden by its noise; else the grid is finer, with nothing between the re
 
 from __future__ import annotations
 
-from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -64,29 +64,25 @@ def on_grid(rows: Rows, period: float | None = None) -> Record:
     steps = np.diff(rows.t) / guess
     found = _numbering(rows.t, steps, guess)
     used = period or found.period
-    if np.abs(found.off).max() <= max(EVEN * guess, 0.75 * _resolution(rows.t)):
-        record = _numbered_grid(rows, found.numbers, used, f'{len(rows.t)} rows, one every '
-                                                         f'{seconds(used)}')
+    if np.abs(found.off).max() <= EVEN * guess and abs(found.period / used - 1.0) <= EVEN:
+        said = f'{len(rows.t)} rows, one every {seconds(used)}'
+        return _numbered_grid(rows, found.numbers, used, cut + said)
+    inner = steps[steps <= BREAK]
+    jitter = 0.5 * float(np.diff(np.percentile(inner, [16.0, 84.0]))[0])
+    # A few odd ones among even stamps are told as well.
+    percent = f'{100.0 * (jitter if jitter > 0.005 else float(np.std(inner))):.2g} %'
+    if period is not None:
+        found = _line(numbered(rows.t / period), rows.t)
+    if _are_late(rows, found):
+        said = f'stamps are uneven by {percent} of {seconds(used)}, the motion is not: rows are ' \
+               'numbered'
+        return _numbered_grid(rows, found.numbers, used, cut + said)
+    if period is None and np.abs(found.off).max() <= 0.5 * used:
+        rows = rows._replace(t=rows.t - found.begin)
     else:
-        inner = steps[steps <= BREAK]
-        jitter = 0.5 * float(np.diff(np.percentile(inner, [16.0, 84.0]))[0])
-        # A few odd ones among even stamps are told as well.
-        percent = 100.0 * (jitter if jitter > 0.005 else float(np.std(inner)))
-        if period is not None:
-            found = _line(numbered(rows.t / period), rows.t)
-        if _are_late(rows, found):
-            record = _numbered_grid(
-                rows, found.numbers, used, f'stamps are uneven by {percent:.2g} % of '
-                f'{seconds(used)}, the motion is not: rows are numbered')
-        else:
-            if period is None and np.abs(found.off).max() <= 0.5 * used:
-                rows = rows._replace(t=rows.t - found.begin)
-            else:
-                used = guess
-            record = _true_instants(
-                rows, used, f'stamps jitter by {percent:.2g} % around {seconds(used)}: v and y are '
-                'taken at them')
-    return replace(record, timing=cut + record.timing)
+        used = guess
+    said = f'stamps jitter by {percent} around {seconds(used)}: v and y are taken at them'
+    return _true_instants(rows, used, cut + said)
 
 
 def _period(t: Array) -> float:
@@ -101,55 +97,43 @@ def _period(t: Array) -> float:
 
 def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
     """Without what lies far before and after, where the time between holds no rows; said so."""
-    if rows.t[-1] / period < min(20.0 * len(rows.t) + LONG_BREAK, LONGEST):
+    t, span = rows.t, rows.t[-1] / period
+    if span < min(20.0 * len(t) + LONG_BREAK, LONGEST):
         return rows, ''
-    parts = np.split(np.arange(len(rows.t)),
-                     np.flatnonzero(np.diff(rows.t) > LONG_BREAK * period) + 1)
-    kept = max(parts, key=len)
-    t = rows.t[kept] - rows.t[kept[0]]
-    if len(kept) < 2 or t[-1] / period >= LONGEST:
+    ends = [0, *(np.flatnonzero(np.diff(t) > LONG_BREAK * period) + 1).tolist(), len(t)]
+    begin, end = max(pairwise(ends), key=lambda part: part[1] - part[0])
+    if end - begin < 2 or t[end - 1] - t[begin] >= LONGEST * period:
         raise RecordError(
-            f'spans {rows.t[-1] / period:.3g} periods of {seconds(period)} with {len(rows.t)} '
-            'rows: cut out one motion with --from and --to, or give --period'
+            f'spans {span:.3g} periods of {seconds(period)} with {len(t)} rows: cut out one motion '
+            'with --from and --to, or give --period'
         )
-    commands = None if rows.commands is None else rows.commands[kept]
-    return (
-        Rows(t, rows.v[kept], rows.y[kept], rows.own[kept], commands),
-        f'{len(parts) - 1} long gaps: the longest stretch, {len(kept)} rows, is used; ',
-    )
+    commands = None if rows.commands is None else rows.commands[begin:end]
+    kept = Rows(t[begin:end] - t[begin], rows.v[begin:end], rows.y[begin:end], rows.own[begin:end],
+                commands)
+    return kept, f'{len(ends) - 2} long gaps: the longest stretch, {end - begin} rows, is used; '
 
 
 def _numbering(t: Array, steps: Array, period: float) -> Numbering:
     """The numbers of rows t (M,) that lie closest to a line. steps (M - 1,): in periods."""
-    coarse = _resolution(t) / period
-    whole = np.round(steps)
-    if coarse > 0.2:
-        # Stamps of a coarse clock may be equal; whoever reads it goes on row by row.
-        whole = np.where(steps <= coarse + 0.6, 1.0, np.maximum(whole, 1.0))
-    best = _line(_risen(np.append(0.0, np.cumsum(whole))), t)
     # The median of uneven steps is off by more than a long record bears.
-    mean = period * float(np.mean(steps[steps < 0.5 * BREAK]))
-    for guess in (period, mean) if mean > 0.0 else (period,):
-        for index in (numbered(t / guess), _risen(np.round(t / guess))):
-            one = _line(index, t)
-            # Around the line that all of them tell, as far as they are late by less than a period.
-            for other in (one, _line(_risen(np.round((t - one.begin) / one.period)), t)):
-                if np.std(other.off) / other.period < 0.999 * np.std(best.off) / best.period:
-                    best = other
+    mean = period * float(np.mean(steps[steps < 0.5 * BREAK])) or period
+    found = []
+    for index in (
+        _risen(np.append(0.0, np.cumsum(np.round(steps)))), numbered(t / period),
+        numbered(t / mean), _risen(np.round(t / period)), _risen(np.round(t / mean)),
+    ):
+        found.append(_line(index, t))
+        # Around the line that all of them tell, as far as they are late by less than a period.
+        found.append(_line(_risen(np.round((t - found[-1].begin) / found[-1].period)), t))
+    best = min(found, key=lambda one: round(float(np.std(one.off)) / one.period, 9))
     # With no more digits than the stamps bear.
     deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
     return best._replace(period=rounded(best.period, deviation))
 
 
-def _line(index: Numbers, t: Array) -> Numbering:
-    period, begin = np.polyfit(index, t, 1).tolist()
-    return Numbering(index, period, begin, t - begin - period * index)
-
-
-def _resolution(t: Array) -> float:
-    """Value of the last decimal digit of the stamps t (N,), 0 from the eighth on."""
-    digits = (10.0**-k for k in range(8))
-    return next((d for d in digits if np.abs(t / d - np.round(t / d)).max() < 1e-3), 0.0)
+def _line(numbers: Numbers, t: Array) -> Numbering:
+    period, begin = np.polyfit(numbers, t, 1).tolist()
+    return Numbering(numbers, period, begin, t - begin - period * numbers)
 
 
 def rounded(period: float, deviation: float) -> float:

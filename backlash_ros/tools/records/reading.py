@@ -119,19 +119,14 @@ def _of_period(
     path: Path, period: float | None, span: Span, axis: str, columns: Mapping[str, str],
 ) -> Record:
     """The record as `identify` takes it, or else with the period [s] of the parameters."""
-    refused: InputError | None = None
-    for told in (None,) if period is None else (None, period):
-        try:
-            record = read_record(path, told, span, axis, columns)
-        except InputError as error:
-            refused = refused or error
-            continue
+    try:
+        record = read_record(path, None, span, axis, columns)
         if period is None or abs(record.sample_period / period - 1.0) < 0.01:
             return record
-    raise refused or InputError(
-        f'{path}: has a sample every {record.sample_period:.6g} s, sample_period={period:.6g} in '
-        '--config: `identify` writes a file for this log'
-    )
+    except InputError:
+        if period is None:
+            raise
+    return read_record(path, period, span, axis, columns)
 
 
 def _as_run(record: Record) -> tuple[RunRecord, list[list[float]]]:

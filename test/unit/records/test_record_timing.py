@@ -103,6 +103,26 @@ def test_stamps_that_count_samples_or_milliseconds_are_told_by_the_period() -> N
     assert '--period' in log(even(), stamps=np.arange(0.0, COUNT)).timing
 
 
+def test_a_longer_period_than_that_of_the_stamps_is_kept_with_the_time() -> None:
+    record = log(even(), period=2.0 * PERIOD_S)
+    assert record.sample_period == 2.0 * PERIOD_S
+    assert len(record.v) == pytest.approx(COUNT / 2, abs=1)
+    assert off(record) < 1.3e-3
+
+
+def test_equal_stamps_of_a_coarse_clock_keep_the_mean_period() -> None:
+    for rows in (2, 3, 8):
+        stamps = even()[rows * (np.arange(COUNT) // rows)]
+        assert log(even(), stamps=stamps).sample_period == pytest.approx(PERIOD_S, rel=0.01)
+
+
+def test_missing_rows_of_even_stamps_are_counted() -> None:
+    kept = np.random.default_rng(1).random(COUNT) > 0.2
+    record = log(even()[kept])
+    assert record.sample_period == PERIOD_S
+    assert record.lost == len(record.y) - np.count_nonzero(kept)
+
+
 @pytest.mark.parametrize('stamps', [None, np.zeros(COUNT), np.full(COUNT, np.nan)])
 def test_without_a_time_rows_are_counted_with_the_period_alone(stamps: Array | None) -> None:
     v, y = command(even()), position(even())
