@@ -170,7 +170,7 @@ class ControllerNode(ManagedNode):
             joint.begin(self.loops.by_name[joint.name], before[joint.name])
 
     def activate(self) -> None:
-        self._rivals.begin()
+        self._rivals.begin(active=True)
         if self._driver is not None:
             # v goes on from the last command, but what the plant did meanwhile is unknown, and
             # that nobody was listened to is no silence of the driver.
@@ -188,7 +188,7 @@ class ControllerNode(ManagedNode):
 
     def _knows_rivals(self) -> bool:
         """Whether no controller of this machine has still to be found that may be in charge."""
-        return self._rivals.complete or self.settings.on_rival == 'warn'
+        return not self._rivals.awaited or self.settings.on_rival == 'warn'
 
     def _await_loop(self) -> None:
         """Listen to plant_output, which starts the loop, as soon as everybody is there."""
@@ -227,7 +227,7 @@ class ControllerNode(ManagedNode):
             self._send_last(loops)
             for joint in self.joints:
                 joint.model.publish(loops.by_name[joint.name])
-        self._rivals.end()
+        self._rivals.begin(active=False)
         self._diagnose()
 
     def _send_last(self, loops: JointLoops) -> None:
@@ -267,7 +267,7 @@ class ControllerNode(ManagedNode):
 
     def finish(self) -> None:
         super().finish()
-        self._rivals.close()
+        self._rivals.presence.close()  # nobody has to wait for this node any more
         for joint in self.joints:
             joint.close()
         self._executor.close()
@@ -358,7 +358,8 @@ class ControllerNode(ManagedNode):
 
     def _mind_rivals(self) -> None:
         """Stand down or command again, as on_rival says, and tell of it."""
-        stand_down = self.settings.on_rival == 'stand_down' and not self._rivals.came_first
+        stand_down = self.settings.on_rival == 'stand_down' \
+            and any(rival.was_first for rival in self._rivals.found)
         changing = [loop for loop in self.configured if loop.standing_down != stand_down]
         if changing and stand_down:
             for loop in changing:

@@ -88,7 +88,7 @@ class ReferenceNode(ProcessNode):
         p, now = self.settings, time.monotonic()
         counter = SampleCounter(p.sample_period)
         pace = ReferencePace(
-            p.sample_period, begins_with_output=p.wait_for_subscribers > 0, now_s=now,
+            p.sample_period, waits=p.wait_for_subscribers > 0, now_s=now,
             own_clock=not self._io.simulated_time,
         )
 
@@ -113,7 +113,7 @@ class ReferenceNode(ProcessNode):
                     # Fast DDS may miss a process of another machine for good that starts at the
                     # same moment.
                     if loop_runs_at is not None and now > loop_runs_at + UNHEARD_S:
-                        pace.wait_no_longer()
+                        pace.waits = False
                         self.log.warning(
                             f'{self._io.topics.output} is not heard here, but by the controller: '
                             'y_m goes by the own clock; start the driver some seconds before'

@@ -64,9 +64,11 @@ class CommandHistory:
 
     The driver applies over an interval the newest v it has when the interval ends with the next
     sample. So a v that cannot have been there when that sample was taken came too late, and the one
-    before it was in use: v is as long under way as y is. Times are those of one clock [ns]. counts:
-    where late commands and missing reports are counted. newest_ns: when the newest command left,
-    own or of another controller, 0 before the first one.
+    before it was in use: v is as long under way as y is. Times are those of one clock [ns].
+
+    counts: where late commands and missing reports are counted. trust: whether reports go before
+    own commands. newest_ns: when the newest command left, own or of another controller. output_ns:
+    stamp of the newest output that was used; reports up to the first one belong to nothing.
     """
 
     def __init__(
@@ -75,17 +77,12 @@ class CommandHistory:
     ) -> None:
         self.counts = counts or Counts()
         self.newest_ns = 0
-        self._trust = ReportTrust(use)
+        self.trust = ReportTrust(use)
         self._period_ns = sample_period_s * 1e9
-        self._output_ns = 0  # stamp of the newest output
+        self.output_ns = 0
         self._transit_ns = 0.0  # median time from one node to the other
         self._published: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
         self._reported: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
-
-    @property
-    def uses_reports(self) -> bool:
-        """Whether reports go before the own commands at present."""
-        return self._trust.trusted
 
     def note_transit(self, passed_ns: float) -> None:
         """Note how long an output was under way: a thousandth of a period moves the median."""
@@ -122,10 +119,6 @@ class CommandHistory:
         pairs = [self._at(each) for each in latest_ns]
         return [v for v, _ in pairs], [other for _, other in pairs]
 
-    def begin(self, end_ns: int) -> None:
-        """Note the first output: reports up to here belong to nothing."""
-        self._output_ns = end_ns
-
     def newest_report(self, end_ns: int) -> float:
         """The v reported for the interval that ended at end_ns, nan without one.
 
@@ -145,7 +138,7 @@ class CommandHistory:
         then, and the v of its next report was in use all the time. Empty, and counted, where there
         is not one per interval though they are used.
         """
-        begin_ns, self._output_ns = self._output_ns, end_ns
+        begin_ns, self.output_ns = self.output_ns, end_ns
         stamp_ns, reports = begin_ns, []
         while self._reported and self._reported[0][0] <= end_ns:
             stamp_ns, v = self._reported.popleft()
@@ -155,7 +148,7 @@ class CommandHistory:
             reports += reports[-1:] * unsent
         # The report of the newest interval may still be under way while older ones are here.
         complete = len(reports) == intervals and stamp_ns > end_ns - 0.5 * self._period_ns
-        if not self._trust.note(complete):
+        if not self.trust.note(complete):
             return []
         self.counts.unreported += not complete
         return reports if complete else []
@@ -202,8 +195,7 @@ def v_of_intervals(
     the v that acted, one just before each y; else commands, of which the newest acts that is there
     when the interval ends with the next y.
     """
-    begin = output_ns[0]
-    outputs, commands = (output_ns - begin).astype(float), (command_ns - begin).astype(float)
+    outputs, commands = ((each - output_ns[0]).astype(float) for each in (output_ns, command_ns))
     ends = np.interp(np.arange(1, index[-1] + 2), index, outputs)
     ends[-1] = inf
     acted: Array = np.append(v, nan)[np.searchsorted(commands, ends, side='right') - 1]

@@ -200,8 +200,6 @@ class ControlLoop:
     def _may_answer(self, output: Output) -> bool:
         """Begin anew where too much is missing; returns whether a v to go on from is known."""
         p, gap = self._p, self._gap
-        if self.begins and not (p.lockstep or self._may_begin(output)):
-            return False
         if gap is not NEXT_SAMPLE or self.silent:
             too_long = gap.missing > LONGEST_GAP or (
                 not p.lockstep
@@ -211,7 +209,7 @@ class ControlLoop:
                 self.statistics.interruptions += 1
                 self._happens(Event.INTERRUPTION)
                 self._renew_core(self.estimate)
-        return True
+        return self.phase is Phase.RUNS or p.lockstep or self._may_begin(output)
 
     def _may_begin(self, output: Output) -> bool:
         """Whether it is known from which v the first command goes on, or waiting is in vain."""
@@ -221,7 +219,9 @@ class ControlLoop:
                 f'{", ".join(missing)}: not set, so nothing keeps v within what the actuator '
                 'bears: set them'
             )
-        self._learn_v(output.stamp_ns)
+        reported = self.commands.newest_report(output.stamp_ns)
+        if isfinite(reported):
+            self._go_on_from(self.core.command_of(reported))
         if self.knows_v:
             return True
         self._unanswered += 1
@@ -243,10 +243,8 @@ class ControlLoop:
         (_, lost, _, unsent), self._gap = self._gap, NEXT_SAMPLE
         if self.phase is Phase.BEGINS:
             self._happens(Event.ANSWER)
-            if not self._p.lockstep:
-                self._learn_v(stamp_ns)
             core.start_from(self.v)
-            commands.begin(stamp_ns)
+            commands.output_ns = stamp_ns
             return core.step(y, y_m)
         if self._p.lockstep:
             return core.step(y, y_m, lost)
@@ -332,12 +330,6 @@ class ControlLoop:
         core.compensating = before.compensating
         core.estimator.adapting = before.estimator.adapting
         self._gap, self._ending = NEXT_SAMPLE, iter(())
-
-    def _learn_v(self, stamp_ns: int) -> None:
-        """Take the v that the driver reports with this output, if any, for the one that acts."""
-        reported = self.commands.newest_report(stamp_ns)
-        if isfinite(reported):
-            self._go_on_from(self.core.command_of(reported))
 
     def _go_on_from(self, told: float) -> None:
         """Take this v for the one that acts."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import islice
 from math import isfinite, nan, sqrt
 from typing import NamedTuple
 
@@ -58,6 +59,9 @@ class DriverPeriod:
         """Take in the stamp of the next sample."""
         self._stamps_ns.append(stamp_ns)
         self._since_learned += 1
+
+    def learn(self) -> None:
+        """Learn the period to count with, if it is time: for whenever nothing waits for it."""
         if self._since_learned < LEARN_PERIOD_AFTER:
             return
         self._since_learned = 0
@@ -81,7 +85,8 @@ class DriverPeriod:
         It is known to some 0.1 % after a second. A message that was lost, or came twice, does not
         disturb it; unknown where most intervals are no period at all, or scatter widely.
         """
-        stamps = list(self._stamps_ns)[-intervals - 1:]
+        newest = islice(reversed(self._stamps_ns), intervals + 1)
+        stamps = list(newest)[::-1]
         begin = len(stamps) - 21  # 20 intervals at least
         if begin < 0:
             return UNKNOWN_PERIOD

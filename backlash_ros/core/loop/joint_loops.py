@@ -60,6 +60,7 @@ class JointLoops:
             elif (step := loop.answer(output, arrival, y_m)) is not None:
                 steps[joint] = step
         self._send_waiting()
+        self.counter.sender.learn()
         return steps
 
     def take_references(self, y_m: Mapping[str, float]) -> list[str]:

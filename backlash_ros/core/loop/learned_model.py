@@ -14,7 +14,6 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 # At which the response of G is judged, as shares of the sampling rate: from slow motion to where
 # little is left of it.
 FREQUENCIES: tuple[float, ...] = tuple(np.geomspace(0.01, 0.2, 5).tolist())
-_POINTS = np.exp(2j * np.pi * np.array(FREQUENCIES))
 STD_LABELS = tuple(f'response_std_at_{share:.4g}_of_sampling_rate' for share in FREQUENCIES)
 
 
@@ -23,9 +22,8 @@ class LearnedModel:
     """G(z) = z^-delay_samples numerator / denominator, in descending powers of z.
 
     response_std: relative standard deviation |dG/G| of the true response from it at FREQUENCIES;
-    the gain at rest is part of m. noise_ratio: deviation of the noise as learned over the one that
-    was told. unexplained: motion of u that no backlash and no G explains, over m times the gap. The
-    last three are nan where nothing was learned, or the law does not learn it.
+    the gain at rest is part of m. noise_ratio and unexplained: as in LawReport. All three are nan
+    where nothing was learned, or the law does not learn it.
     """
 
     numerator: tuple[float, ...]
@@ -59,7 +57,8 @@ def learned_model_of(law: Law, nominal: TransferFunction) -> LearnedModel:
     learned, report = law.learned_model, law.report
     model = nominal if learned is None else learned.transfer_function
     numerator, denominator, delay = model.without_delay()
+    response_std = law.response_std(np.exp(2j * np.pi * np.array(FREQUENCIES)))
     return LearnedModel(
-        tuple(numerator), tuple(denominator), delay, tuple(law.response_std(_POINTS).tolist()),
+        tuple(numerator), tuple(denominator), delay, tuple(response_std.tolist()),
         report.noise_ratio, report.unexplained,
     )

@@ -6,10 +6,6 @@ from math import inf
 
 from backlash_ros.core.loop.sample_counter import JITTER
 
-# y_m leaves so many periods after the newest output: half a period after the next one is due.
-LEAD = 1.5
-CLOSEST = 0.5  # periods between two messages at least
-
 
 class ReferencePace:
     """Says at any time which sample of y_m is to leave now, if any.
@@ -19,16 +15,16 @@ class ReferencePace:
     samples, and y_m goes on by the own clock until one comes again. So at most one message leaves
     per period, and none for the same sample twice once the first output has come.
 
-    begins_with_output: y_m(0) is repeated until the first output comes; else the own clock runs
-    from the start, and goes on from there. own_clock: False on simulated time, which may run at
-    any speed: without outputs the newest y_m is repeated. Times are on the steady clock [s].
+    waits: whether y_m(0) is repeated until the first output comes; else the own clock runs from the
+    start, and goes on from there. own_clock: False on simulated time, which may run at any speed:
+    without outputs the newest y_m is repeated. Times are on the steady clock [s].
     """
 
     def __init__(
-        self, period_s: float, begins_with_output: bool, now_s: float, own_clock: bool = True,
+        self, period_s: float, waits: bool, now_s: float, own_clock: bool = True,
     ) -> None:
+        self.waits = waits
         self._period_s, self._own_clock = period_s, own_clock
-        self._begins_with_output = begins_with_output
         self._heard = self._fresh = False  # any output; one that is not answered yet
         self._heard_s = -inf
         self._offset = 0  # sample of y_m that follows the newest output, less its index
@@ -39,21 +35,12 @@ class ReferencePace:
     def hear(self, index: int, at_s: float) -> None:
         """Take in that output number `index` has come at this time."""
         if not self._heard:
-            self._offset = 1 if self._begins_with_output else self._next - index
+            self._offset = 1 if self.waits else self._next - index
         # Where the own clock has run ahead, y_m does not go back.
         self._offset = max(self._offset, self._sent - index)
         self._next = index + self._offset
         self._heard = self._fresh = True
-        self._heard_s = at_s
-
-    @property
-    def waits(self) -> bool:
-        """Whether y_m(0) is repeated until an output comes."""
-        return self._begins_with_output and not self._heard
-
-    def wait_no_longer(self) -> None:
-        """Go by the own clock although no output has come."""
-        self._begins_with_output = False
+        self._heard_s, self.waits = at_s, False
 
     def listens(self, now_s: float) -> bool:
         """Whether it is time to look for an output, and to wait for one if none is there."""
@@ -65,39 +52,33 @@ class ReferencePace:
 
     def sample_to_send(self, now_s: float) -> int | None:
         """The sample whose y_m has to leave now; None where it is not time yet."""
+        period, sample = self._period_s, self._next
         if now_s < self._due_s:
             return None
         if not self._heard:
-            return self._before_the_first_output(now_s)
+            # Messages that were due while the process was held up are not made up for.
+            self._due_s = max(self._due_s, now_s - 0.5 * period) + period
+            self._next += not self.waits
+            self._sent = sample
+            return sample
         if self._fresh:
             self._fresh = False
-            self._due_s = self._heard_s + LEAD * self._period_s
-            return self._send_once(self._next, now_s)
-        if now_s < self._give_up_s:
+            self._due_s = self._heard_s + 1.5 * period
+        elif now_s < self._give_up_s:
             return None
-        if not self._own_clock:
-            self._due_s = now_s + self._period_s
-            return self._next
-        missing = max(int((now_s - self._heard_s) / self._period_s - JITTER), 1)
-        self._due_s = self._heard_s + (1 + missing + JITTER) * self._period_s
-        return self._send_once(self._next + missing, now_s)
+        elif not self._own_clock:
+            self._due_s = now_s + period
+            return sample
+        else:
+            missing = max(int((now_s - self._heard_s) / period - JITTER), 1)
+            self._due_s = self._heard_s + (1 + missing + JITTER) * period
+            sample += missing
+        if sample <= self._sent:
+            return None
+        self._sent, self._due_s = sample, max(self._due_s, now_s + 0.5 * period)
+        return sample
 
     @property
     def _give_up_s(self) -> float:
         """When an output that has not come yet counts as lost."""
         return max(self._due_s, self._heard_s + (1.0 + JITTER) * self._period_s)
-
-    def _before_the_first_output(self, now_s: float) -> int:
-        # Messages that were due while the process was held up are not made up for.
-        self._due_s = max(self._due_s, now_s - CLOSEST * self._period_s) + self._period_s
-        self._sent = self._next
-        if not self._begins_with_output:
-            self._next += 1
-        return self._sent
-
-    def _send_once(self, sample: int, now_s: float) -> int | None:
-        if sample <= self._sent:
-            return None
-        self._sent = sample
-        self._due_s = max(self._due_s, now_s + CLOSEST * self._period_s)
-        return sample

@@ -91,6 +91,7 @@ class SampleCounter:
         """Take in a message and say what it is; `numbered` as in Output."""
         known = sequence != UNNUMBERED
         numbered = numbered and known
+        self.sender.learn()
         period = self.sender.period_ns
         if self.index < 0:
             if not self._from_zero:

@@ -217,7 +217,7 @@ def values_of(loop: ControlLoop, period: Period) -> dict[str, object]:
         'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f,
         **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
         'learning': law.adapting, 'compensating': loop.core.compensating,
-        'using applied_control': loop.commands.uses_reports,
+        'using applied_control': loop.commands.trust.trusted,
         # Above 1 the gap is crossed, without which nothing can be learned of it.
         'excitation: swing of v / gap': swing / gap if gap > 0.0 else swing,
         'rate [Hz]': 0.0 if isnan(mean_s) or mean_s <= 0.0 else 1.0 / mean_s,

@@ -21,20 +21,17 @@ from backlash_ros.core.simulation.run_record import stated_deviations
 from backlash_ros.nodes.runtime.messages import LabelledArrayPublisher, without_events
 
 WATCH_PERIOD_S = 0.04  # between two messages of a topic; a loop at 1 kHz has no time for many more
-U_INDEX = topics.SIGNAL_LABELS.index('u_hat')
-Row = tuple[float, ...]
 # Who comes late gets the newest ones: G may never change again. More than one, so that a subscriber
 # that is held up misses none, and one of each joint.
 NEWEST = QoSProfile(depth=20, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+Row = tuple[float, ...]
 
 
 class WatchPublisher:
     """Publishes `controller/watch/<label>` for each label of which there is a subscriber.
 
-    Of a joint that has a name: `controller/watch/<joint>/<label>`.
-
-    The topics take turns, so that after a command of a fast loop one message leaves, not all.
-    After v(k) comes the u that it led to, which is known with y(k+1): points of their loop.
+    Of a joint that has a name: `controller/watch/<joint>/<label>`. After v(k) comes the u that it
+    led to, which is known with y(k+1): points of their loop.
     """
 
     def __init__(self, node: Node, joint: str = '') -> None:
@@ -44,15 +41,12 @@ class WatchPublisher:
                 event_callbacks=without_events(),
             ) for label in topics.WATCH_LABELS
         }
-        self._message = Float64()
         self._heard: list[str] = []  # labels with a subscriber
-        self._turn = -1  # whose turn it was among these
-        self._looked_at_s = self._sent_at_s = -inf
-        self._v_sent = False  # with the newest sample, so that its u is that of the next one
-        self._u_of_v: float | None = None  # u that belongs to the v that was sent last
+        self._looked_at_s = self._due_s = -inf
+        self._u_waits = False  # for the sample after that of the newest v
 
     def is_heard(self, now_s: float) -> bool:
-        """Whether there is any subscriber, as far as was looked lately [s, steady clock]."""
+        """Whether anybody listens, as far as was looked lately; now_s: on the steady clock."""
         if now_s >= self._looked_at_s + 0.5:
             self._looked_at_s = now_s
             self._heard = [
@@ -61,33 +55,23 @@ class WatchPublisher:
             ]
         return bool(self._heard)
 
-    def follow(self, signals: Sequence[float], estimates: Sequence[float], now_s: float) -> None:
+    def follow(self, signals: Row, estimates: Row, now_s: float) -> None:
         """Publish what is due of a sample, given by its rows in the order of their labels."""
-        if not self.is_heard(now_s):
-            return
-        if self._v_sent:
-            self._v_sent, self._u_of_v = False, signals[U_INDEX]
-        spacing = WATCH_PERIOD_S / len(self._heard)
-        # After a pause each is due once.
-        self._sent_at_s = max(self._sent_at_s, now_s - WATCH_PERIOD_S)
         # The comparison of times must not lose one message of each round to rounding.
-        due = int((now_s - self._sent_at_s) / spacing + 1e-6)
-        values = watched_values(signals, estimates) if due else {}
-        for _ in range(due):
-            turn = (self._turn + 1) % len(self._heard)
-            label = self._heard[turn]
-            if label == 'u_hat' and self._v_sent:
-                return
-            self._turn = turn
-            self._sent_at_s += spacing
-            self._message.data = values[label]
-            if label == 'u_hat' and self._u_of_v is not None:
-                self._message.data, self._u_of_v = self._u_of_v, None
-            self._v_sent = self._v_sent or label == 'v'
-            self._publishers[label].publish(self._message)
+        due = self.is_heard(now_s) and now_s > self._due_s - 1e-9
+        if not due and not self._u_waits:
+            return
+        values = watched_values(signals, estimates)
+        for label in self._heard:
+            if self._u_waits if label == 'u_hat' else due:
+                self._publishers[label].publish(Float64(data=values[label]))
+        self._u_waits = due
+        if due:
+            # After a pause each is due once.
+            self._due_s = max(self._due_s, now_s - WATCH_PERIOD_S) + WATCH_PERIOD_S
 
 
-def watched_values(signals: Sequence[float], estimates: Sequence[float]) -> dict[str, float]:
+def watched_values(signals: Row, estimates: Row) -> dict[str, float]:
     """The value of each of WATCH_LABELS, nan for bands where the law has no deviations."""
     signal = dict(zip(topics.SIGNAL_LABELS, signals, strict=True))
     estimate = dict(zip(topics.ESTIMATE_LABELS, estimates, strict=True))

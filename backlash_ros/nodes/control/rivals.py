@@ -30,14 +30,10 @@ ENDPOINT, SINCE = 'endpoint of control', 'active since [ns]'
 class Presence:
     """Makes a publisher of a topic known to all of this machine until it is closed.
 
-    Discovery takes as long as it takes: a tenth of a second, or several where a message of it is
-    lost or a processor is busy. Every controller therefore holds a Unix socket in the abstract
-    namespace of Linux, whose name tells the domain, the topic and the identity of its publisher.
-    The kernel lists these names, and takes a name back with its process, however that ends.
-    Processes in containers see each other if they share the network; other systems than Linux list
-    nobody.
-
-    domain: ROS_DOMAIN_ID. topic: its full name. identity: of the publisher, in letters and digits.
+    Discovery may take seconds. Every controller therefore holds a Unix socket in the abstract
+    namespace of Linux, named after domain, topic and the identity of its publisher. The kernel
+    lists these names, and takes a name back with its process, however that ends. Processes in
+    containers see each other if they share the network; other systems than Linux list nobody.
     """
 
     def __init__(self, domain: int, topic: str, identity: str) -> None:
@@ -81,9 +77,10 @@ class Rivals:
     Controllers say in /diagnostics since when they are active; equal times are ordered by the
     identity of the publisher. Whoever says nothing of the kind was first if it was there when this
     controller became active. A controller that is not active, or has fallen silent, is no rival.
-    All times but since_ns are on the steady clock [s].
 
-    own: identity of the own publisher. settled_at: when the node has found who was there already.
+    own: identity of the own publisher. since_ns: since when this controller is active, 0 if it is
+    not. settled_at: when it has found who was there already, on the steady clock as all other
+    times [s].
     """
 
     def __init__(self, own: str, settled_at: float) -> None:
@@ -95,12 +92,8 @@ class Rivals:
         self._claims: dict[str, tuple[int, float]] = {}
 
     def begin(self, since_ns: int, now: float) -> None:
-        """The controller has become active."""
-        self.since_ns, self._active_at = since_ns, now
-
-    def end(self) -> None:
-        """It is not active any more."""
-        self.since_ns, self._active_at = 0, inf
+        """The controller has become active; since 0: it has ceased to be."""
+        self.since_ns, self._active_at = since_ns, now if since_ns else inf
 
     def hear(self, values: Mapping[str, str], now: float) -> None:
         """Take in what a node says in /diagnostics."""
@@ -112,10 +105,8 @@ class Rivals:
         """The rivals among the other publishers, given by identity with their names."""
         self._first_seen = {each: self._first_seen.get(each, now) for each in others}
         self._claims = {each: c for each, c in self._claims.items() if each in others}
-        if not self.since_ns:
-            return ()
         found = []
-        for each, name in others.items():
+        for each, name in others.items() if self.since_ns else ():
             since_ns, heard_at = self._claims.get(each, (0, inf))
             if heard_at == inf:
                 was_first = self._first_seen[each] <= max(self._active_at, self.settled_at)
@@ -129,7 +120,8 @@ class RivalWatch:
     """Looks out for other publishers of the command while the node runs.
 
     advertise: makes the own publisher. changed: called when there is something new to say.
-    found: the rivals at the newest look.
+    found: the rivals at the newest look. awaited: controllers of this machine that were there at
+    activation and are not found yet, however long it takes.
     """
 
     def __init__(
@@ -138,13 +130,13 @@ class RivalWatch:
     ) -> None:
         self.topic = node.resolve_topic_name(topic)
         self.found: tuple[Rival, ...] = ()
+        self.awaited: frozenset[str] = frozenset()
         self._node, self._changed = node, changed
         own = identity_made_by(node, self.topic, advertise)
         # What discovery mostly takes: a publisher that is found so soon after the node was made was
         # there before it.
         self._rivals = Rivals(own, node.begun_at + 0.7)
-        self._presence = Presence(node.context.get_domain_id(), self.topic, own)
-        self._awaited: frozenset[str] = frozenset()  # there already, and not found yet
+        self.presence = Presence(node.context.get_domain_id(), self.topic, own)
         self._others: frozenset[str] = frozenset()
         self._hello_until = -inf  # until then others are told at every look who was first
         self._diagnostics: Subscription | None = None  # listened to only beside others
@@ -156,39 +148,16 @@ class RivalWatch:
         return time.monotonic() >= self._rivals.settled_at
 
     @property
-    def complete(self) -> bool:
-        """Whether all controllers of this machine that were there at activation are found.
-
-        They are waited for however long it takes.
-        """
-        return not self._awaited
-
-    @property
     def claim(self) -> dict[str, object]:
         """What the node has to say in /diagnostics."""
         return {ENDPOINT: self._rivals.own, SINCE: self._rivals.since_ns}
 
-    @property
-    def came_first(self) -> bool:
-        """Whether no rival was active before this controller."""
-        return not any(rival.was_first for rival in self.found)
-
-    def begin(self) -> None:
-        """The controller has become active."""
+    def begin(self, active: bool) -> None:
+        """The controller has become active, or has ceased to be."""
         # Of two that begin at once the one that is listed later waits for the other at least.
-        self._awaited = self._presence.others()
-        self._rivals.begin(time.time_ns(), time.monotonic())
+        self.awaited = self.presence.others() if active else frozenset()
+        self._rivals.begin(time.time_ns() if active else 0, time.monotonic())
         self.look()
-
-    def end(self) -> None:
-        """It is not active any more."""
-        self._awaited = frozenset()
-        self._rivals.end()
-        self.look()
-
-    def close(self) -> None:
-        """Nothing is commanded any more: nobody has to wait for this node."""
-        self._presence.close()
 
     def look(self) -> None:
         """Look at the graph."""
@@ -198,8 +167,8 @@ class RivalWatch:
             if node.count_publishers(self.topic) > 1 else []
         others = {identity_of(info): name_of(info) for info in infos}
         others.pop(self._rivals.own, None)
-        if self._awaited:
-            self._awaited = self._awaited & self._presence.others() - others.keys()
+        if self.awaited:
+            self.awaited = self.awaited & self.presence.others() - others.keys()
             # Whoever has been found while it was waited for was there before.
             self._rivals.settled_at = max(self._rivals.settled_at, now)
         if self._others != others.keys():

@@ -116,7 +116,7 @@ def test_the_command_next_to_the_one_in_use_may_have_acted_instead() -> None:
 def reported(end: int, *reports: tuple[float, float]) -> list[list[float]]:
     """What reports (sample, v) tell of outputs 1 .. end, each taken as far as it has come."""
     commands = CommandHistory(PERIOD_S)
-    commands.begin(START_NS)
+    commands.output_ns = START_NS
     answers = []
     for k in range(1, end + 1):
         for sample, v in reports:
@@ -132,7 +132,7 @@ def test_a_reported_control_belongs_to_the_output_after_it() -> None:
 
 def test_a_report_that_comes_after_its_output_is_not_taken_for_the_next_one() -> None:
     commands = CommandHistory(PERIOD_S)
-    commands.begin(START_NS)
+    commands.output_ns = START_NS
     assert commands.reported_over(1, START_NS + PERIOD_NS) == []
     commands.report(10.0, START_NS + PERIOD_NS - 1000)
     assert commands.reported_over(1, START_NS + 2 * PERIOD_NS) == []
@@ -141,7 +141,7 @@ def test_a_report_that_comes_after_its_output_is_not_taken_for_the_next_one() ->
 
 def test_the_report_of_an_interval_that_took_longer_holds_for_all_of_it() -> None:
     commands = CommandHistory(PERIOD_S)
-    commands.begin(START_NS)
+    commands.output_ns = START_NS
     commands.report(10.0, START_NS + 3 * PERIOD_NS - 1000)
     # Two samples were never taken: the driver was held up from the first to the third.
     assert commands.reported_over(3, START_NS + 3 * PERIOD_NS, unsent=2) == [10.0, 10.0, 10.0]
@@ -153,7 +153,7 @@ def test_the_report_of_an_interval_that_took_longer_holds_for_all_of_it() -> Non
 def uses(pattern: list[bool], use: ReportUse = ReportUse.AUTO) -> tuple[list[bool], int]:
     """Of outputs with and without a report: whether it is used, and how many are missed."""
     commands = CommandHistory(PERIOD_S, use)
-    commands.begin(START_NS)
+    commands.output_ns = START_NS
     used = []
     for k, is_reported in enumerate(pattern, 1):
         if is_reported:

@@ -24,7 +24,7 @@ def messages_of(
 
     sleeps: whether the node looks for outputs only when it has something to do, as it really does.
     """
-    pace = ReferencePace(PERIOD_S, begins_with_output=True, now_s=0.0)
+    pace = ReferencePace(PERIOD_S, waits=True, now_s=0.0)
     counter = SampleCounter(PERIOD_S)
     waiting, sent = list(arrivals_s), []
     now = 0.0
@@ -85,7 +85,7 @@ def test_a_single_late_output_is_waited_for_and_then_answered_at_once() -> None:
 
 
 def test_a_node_that_waits_for_nobody_goes_on_by_its_own_clock() -> None:
-    pace = ReferencePace(PERIOD_S, begins_with_output=False, now_s=0.0)
+    pace = ReferencePace(PERIOD_S, waits=False, now_s=0.0)
     sent = [pace.sample_to_send(k * STEP_S) for k in range(1000)]
     assert [sample for sample in sent if sample is not None] == list(range(20))
     pace.hear(7, 1000 * STEP_S)
@@ -96,7 +96,7 @@ def test_a_node_that_waits_for_nobody_goes_on_by_its_own_clock() -> None:
 
 
 def test_on_simulated_time_only_outputs_move_the_reference() -> None:
-    pace = ReferencePace(PERIOD_S, begins_with_output=True, now_s=0.0, own_clock=False)
+    pace = ReferencePace(PERIOD_S, waits=True, now_s=0.0, own_clock=False)
     pace.hear(0, 0.0)
     sent = [pace.sample_to_send(k * STEP_S) for k in range(1000)]
     assert {sample for sample in sent if sample is not None} == {1}
@@ -104,10 +104,9 @@ def test_on_simulated_time_only_outputs_move_the_reference() -> None:
 
 
 def test_signal_goes_on_by_the_own_clock_once_outputs_are_no_longer_waited_for() -> None:
-    pace = ReferencePace(PERIOD_S, begins_with_output=True, now_s=0.0)
+    pace = ReferencePace(PERIOD_S, waits=True, now_s=0.0)
     assert [pace.sample_to_send(k * PERIOD_S) for k in range(3)] == [0, 0, 0]
     assert pace.waits
-    pace.wait_no_longer()
-    assert not pace.waits
+    pace.waits = False
     sent = [pace.sample_to_send(k * PERIOD_S) for k in range(3, 6)]
     assert sent == [0, 1, 2]

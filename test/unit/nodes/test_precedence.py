@@ -54,5 +54,5 @@ def test_who_is_inactive_has_no_rivals_and_is_none() -> None:
     assert rivals.among({'x': '/other'}, 10.1) == ()
     rivals.hear(claim('x', 50), 10.2)
     assert rivals.among({'x': '/other'}, 10.3) == (Rival('/other', True),)
-    rivals.end()
+    rivals.begin(0, 10.35)
     assert rivals.among({'x': '/other'}, 10.4) == ()
