@@ -200,7 +200,7 @@ class ControllerNode(ManagedNode):
             return not wanted or (
                 io.listeners >= wanted and self._steps.listeners >= wanted - 1
                 and (self.count_publishers(io.topics.reference) > 0 if lockstep
-                     else all(joint.reference_at is not None for joint in self.joints))
+                     else all(loop.referred_at is not None for loop in self.configured))
             )
 
         self.call_when(
@@ -277,11 +277,7 @@ class ControllerNode(ManagedNode):
     def _on_reference(self, y_m: Mapping[str, float]) -> None:
         if self.loops is None:
             return
-        taken = self.loops.take_references(y_m)
-        now = time.monotonic()
-        for joint in self.joints:
-            if joint.name in taken:
-                joint.reference_at = now
+        self.loops.take_references(y_m)
         if self.settings.lockstep:
             self._references.append(self.loops.by_name[''].y_m)
             self._pair()

@@ -48,7 +48,8 @@ class ControlLoop:
     send: takes v to the driver. estimate: to begin with, None for what was known before. counter:
     goes on counting where another loop has ended. v: the command that acts; None, and then taken
     for 0, as long as nobody knows (knows_v). executor: where fits are made, None for here. y_m: the
-    newest reference. phase: see phase.py. heard_at: when the newest y came, on the steady clock.
+    newest reference. phase: see phase.py. heard_at, referred_at: when the newest y and y_m came, on
+    the steady clock [s].
     """
 
     def __init__(
@@ -63,6 +64,7 @@ class ControlLoop:
         self.y_m = nan
         self.phase = Phase.BEGINS
         self.heard_at: float | None = None
+        self.referred_at: float | None = None
         self.executor = executor or InlineExecutor()
         self.core = build_controller(p, estimate, self.executor)
         self.knows_v = v is not None
@@ -107,13 +109,12 @@ class ControlLoop:
 
     # --- at every sample -------------------------------------------------------------------------
 
-    def take_reference(self, y_m: float) -> bool:
+    def take_reference(self, y_m: float) -> None:
         """Take in a reference; an absurd one is counted and the last one holds."""
-        if not plausible(y_m):
+        if plausible(y_m):
+            self.y_m, self.referred_at = y_m, self._driver.steady_s()
+        else:
             self.statistics.bad_references += 1
-            return False
-        self.y_m = y_m
-        return True
 
     def take_applied(self, v: float, stamp_ns: int) -> None:
         """Take in a v that the driver reports to have applied."""
@@ -314,10 +315,6 @@ class ControlLoop:
     def reset(self) -> None:
         """Begin with the estimates of estimator.initial."""
         self.renew(first_guess(self._p))
-
-    def close(self) -> None:
-        """Give back what it holds elsewhere; it answers no more."""
-        self.core.close()
 
     def _happens(self, event: Event) -> None:
         self.phase = after(self.phase, event)

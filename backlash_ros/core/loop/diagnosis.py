@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
 from typing import NamedTuple
@@ -19,8 +19,10 @@ LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line hold
 TROUBLE, PATIENCE_S = 0.01, 3.0
 UNNAMED = 'a node without a name'
 SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
-LATENESS = ('late', 'lost', 'unsent')
 OK, WARN, ERROR = Level.OK, Level.WARN, Level.ERROR
+LATENESS = ('late', 'lost', 'unsent')
+# Kinds of findings that pass by themselves as a rule.
+LASTING = frozenset((*LATENESS, 'waiting for output', 'waiting for reference', 'unheard', 'clock'))
 # Kinds of findings about the messages, which are the same for all joints of a controller.
 OF_MESSAGES = frozenset((
     'control type', 'control qos', 'rivals', 'second driver', 'second reference', 'unheard', 'rate',
@@ -65,6 +67,11 @@ class TopicFigures:
     def heard(self) -> list[Peer]:
         """Those whose messages pass."""
         return [peer for peer in self.peers if not peer.unfit]
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is nobody whose messages do not pass."""
+        return len(self.heard) == len(self.peers)
 
     def waiting(self, start: str) -> str:
         """Why nothing comes; start: what to do where nobody publishes it."""
@@ -115,11 +122,6 @@ class LoopFigures(Counts):
         return self.used + self.without_reference + self.bad_outputs
 
     @property
-    def due(self) -> int:
-        """Samples that should have come."""
-        return self.heard + self.lost
-
-    @property
     def is_stretched(self) -> bool:
         """Whether pauses make the period of the driver longer."""
         return self.period.is_stretched(self.sample_period, 0.01)
@@ -150,35 +152,8 @@ class LoopFigures(Counts):
         """Whether so much motion is explained by nothing that it is worth naming."""
         return 0.05 <= self.law.unexplained < inf
 
-    def waits_for(self, topic: TopicFigures, missing: bool) -> bool:
-        """Whether the loop cannot begin because a topic that fits says nothing."""
-        return self.status is None and self.silent_s == 0.0 and missing \
-            and not any(peer.unfit for peer in topic.peers)
 
-
-Condition = Callable[[LoopFigures], bool]
-Text = Callable[[LoopFigures], str]
-
-
-class Rule(NamedTuple):
-    """A line of the table: what is said at which level where the condition holds.
-
-    kind and lasting: as in Finding. text: with the figure and the cure.
-    """
-
-    kind: str
-    level: Level
-    holds: Condition
-    text: Text
-    lasting: bool = False
-
-    def finding(self, f: LoopFigures) -> Finding:
-        """What it says; most nodes get their name soon after they are found."""
-        text = self.text(f)
-        lasting = self.lasting or UNNAMED in text
-        if len(text) > LONGEST_TEXT:
-            text = text[:LONGEST_TEXT - 1] + '…'
-        return Finding(self.level, self.kind, text, lasting)
+Row = tuple[str, Level, bool, str]  # kind, level, whether it holds, text with figure and cure
 
 
 def findings_of(f: LoopFigures) -> list[Finding]:
@@ -187,9 +162,9 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     The model is blamed only where nothing else explains why y does not follow from v: an estimate
     that is held for a while because samples are late or lost is a warning about these.
     """
-    causes = [rule.finding(f) for rule in CAUSES if rule.holds(f)]
+    causes = [_finding(row) for row in causes_of(f) if row[2]]
     kinds = {cause.kind for cause in causes}
-    state = next(rule.finding(f) for rule in _states_beside(kinds) if rule.holds(f))
+    state = next(_finding(row) for row in _states_beside(kinds, f) if row[2])
     if state.kind == 'model':
         # What the fit has found out itself says more than what is late or missing, and a sign more
         # than the rate of a driver that is held up.
@@ -201,163 +176,145 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     return [*causes, state] if state.level != OK or not causes else causes
 
 
+def _finding(row: Row) -> Finding:
+    kind, level, _, text = row
+    # Most nodes get their name soon after they are found.
+    lasting = kind in LASTING or UNNAMED in text
+    text = text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT - 1] + '…'
+    return Finding(level, kind, text, lasting)
+
+
 def _percent(count: int, of: int) -> str:
     return f'{100.0 * count / max(of, 1):.3g} %'
 
 
-def _unfit(role: str, reason: str, text: str) -> Rule:
-    """Somebody is there on a topic, but no message passes; role: a topic of LoopFigures."""
-    def unfit(f: LoopFigures) -> list[Peer]:
-        return [peer for peer in getattr(f, role).peers if peer.unfit == reason]
+def _unheard(f: LoopFigures) -> Iterator[Row]:
+    """Who is there on a topic though no message passes."""
+    publish = {'output': 'set io.best_effort to true', 'reference': 'publish it reliable'}
+    for role, topic in (('output', f.output), ('reference', f.reference), ('control', f.control)):
+        for peer in topic.peers:
+            texts = {
+                'type': f'{topic} is sent as {peer.kind}, {topic.kind} is wanted: change {peer}',
+                'reliability': f'{topic} is sent best effort, which does not arrive: '
+                               f'{publish.get(role)}',
+                'qos': f'{topic} of {peer} does not arrive: its QoS does not fit',
+            } if role in publish else {
+                'type': f'{topic} is a {topic.kind}, but {peer} wants {peer.kind}: change it',
+                'reliability': f'{topic} does not reach {peer}: its QoS does not fit',
+                'qos': f'{topic} does not reach {peer}: its QoS does not fit',
+            }
+            if peer.unfit:
+                yield f'{role} {peer.unfit}', ERROR, True, texts[peer.unfit]
 
-    return Rule(
-        f'{role} {reason}', ERROR, lambda f: bool(unfit(f)),
-        lambda f: text.format(topic=getattr(f, role), peer=unfit(f)[0]),
+
+def causes_of(f: LoopFigures) -> tuple[Row, ...]:
+    """The table of causes, the likeliest first."""
+    y, y_m, v = f.output, f.reference, f.control
+    due = f.heard + f.lost
+    begins = f.status is None and f.silent_s == 0.0
+    runs = f.status is not None and f.silent_s == 0.0
+    late_ms, clocks = f'{1e3 * abs(f.age_s):.3g} ms', 'set both clocks (chrony, PTP)'
+    return (
+        *_unheard(f),
+        # What comes is of no use.
+        ('bad outputs', WARN if f.used else ERROR, f.bad_outputs > TROUBLE * f.heard,
+         f'{_percent(f.bad_outputs, f.heard)} of {y} is no finite number: check the sensor'),
+        ('bad references', WARN, f.bad_references > 0,
+         f'{f.bad_references} {y_m} messages lately were no finite number: the last good one '
+         'holds'),
+        ('wraps', WARN, f.wraps > 0,
+         f'{y} jumps by 2 pi: it is an angle that wraps: let the driver count the turns'),
+        # Who else is there.
+        ('rivals', ERROR, f.standing_down,
+         f'standing down: {(*f.rivals, "another node")[0]} published {v} before: stop one'),
+        ('rivals', ERROR, bool(f.rivals) and not f.standing_down,
+         f'{1 + len(f.rivals)} publishers of {v}, also {(*f.rivals, "")[0]}: stop one'),
+        ('second driver', WARN, len(y.heard) > 1,
+         f'{len(y.heard)} publishers of {y}, the first one is used: stop the others'),
+        ('second reference', WARN, len(y_m.heard) > 1,
+         f'{y_m} is published by {", ".join(map(str, y_m.heard[:2]))}: stop all but one'),
+        # What does not come.
+        ('silent', WARN, f.silent_s > 0.0,
+         f'no {y} for {f.silent_s:g} s: is the driver running? on_timeout: {f.on_timeout}'),
+        ('waiting for output', WARN, begins and f.heard == 0 and y.fits,
+         y.waiting('start the driver')),
+        ('waiting for reference', WARN,
+         begins and not f.referred and f.bad_references == 0 and y_m.fits,
+         y_m.waiting('start one')),
+        ('unheard', WARN, runs and not v.peers,
+         f'nobody listens to {v}: is it the name that the driver uses?'),
+        # When it comes.
+        ('rate', WARN, isfinite(f.rate),
+         f'{y} comes at {f.rate:.4g} Hz, sample_period is {f.sample_period:g} s '
+         f'({1.0 / f.sample_period:.4g} Hz): '
+         + ('is the driver held up?' if f.is_stretched else 'correct one of them')),
+        ('stamps', WARN, f.repeats_stamps,
+         f'{y} repeats its stamps, so the time of sending counts: stamp each message anew'),
+        ('clock', WARN, abs(f.age_s) > SKEW * f.sample_period,
+         f'{y} comes {late_ms} before its stamp: {clocks}' if f.age_s < 0.0
+         else f'{y} comes {late_ms} after its stamp: {clocks} or shorten the way'),
+        ('late', WARN, f.late > TROUBLE * f.used,
+         f'{_percent(f.late, f.used)} of {v} came too late: relieve the machine or lengthen '
+         'sample_period'),
+        ('unsent', WARN, f.unsent > TROUBLE * due and not isfinite(f.rate),
+         f'{_percent(f.unsent, due)} of {y} was never sent or much too late: is the driver held '
+         'up?'),
+        ('lost', WARN, f.lost - f.unsent > TROUBLE * due,
+         f'{_percent(f.lost - f.unsent, due)} of {y} was lost on its way: check the network'),
+        ('reference silent', WARN, f.reference_silent_s > 0.0,
+         f'no {y_m} for more than {f.reference_silent_s:g} s, the last one is held: publish it '
+         'every sample'),
+        # What becomes of v.
+        ('still', WARN, f.stands_still,
+         f'{y} stands still while v swings over {f.v_swing:.3g}'
+         + (f' ({f.v_swing / f.gap:.3g} gaps)' if f.gap > 0.0 else '')
+         + ': check sensor, actuator, its controller'),
+        ('limited', WARN, f.limited > 0.5 * f.used
+         and f.status in (Status.INCONSISTENT, Status.NOT_EXCITED),
+         f'v is limited in {_percent(f.limited, f.used)} of the samples: widen control.min, max or '
+         'rate_max'),
+        ('unreported', WARN, f.unreported > TROUBLE * f.used,
+         f'{_percent(f.unreported, f.used)} of the samples came without applied_control just '
+         'before them'),
+        ('worker', WARN, f.dead_workers > 0,
+         'the process that makes the fits died '
+         + ('lately' if f.dead_workers == 1 else f'{f.dead_workers} times lately')
+         + '; v is not affected: check the memory'),
     )
 
 
-def _age(f: LoopFigures) -> str:
-    age, cure = f'{1e3 * abs(f.age_s):.3g} ms', 'set both clocks (chrony, PTP)'
-    return f'{f.output} comes {age} before its stamp: {cure}' if f.age_s < 0.0 \
-        else f'{f.output} comes {age} after its stamp: {cure} or shorten the way'
-
-
-def _bad_outputs(f: LoopFigures) -> str:
-    return f'{_percent(f.bad_outputs, f.heard)} of {f.output} is no finite number: check the sensor'
-
-
-_WRONG_TYPE = '{topic} is sent as {peer.kind}, {topic.kind} is wanted: change {peer}'
-_WRONG_QOS = '{topic} of {peer} does not arrive: its QoS does not fit'
-_OWN_QOS = '{topic} does not reach {peer}: its QoS does not fit'
-CAUSES: tuple[Rule, ...] = (
-    # Who is there but not heard.
-    _unfit('output', 'type', _WRONG_TYPE),
-    _unfit('output', 'reliability', '{topic} is sent best effort, which does not arrive: '
-           'set io.best_effort to true'),
-    _unfit('output', 'qos', _WRONG_QOS),
-    _unfit('reference', 'type', _WRONG_TYPE),
-    _unfit('reference', 'reliability', '{topic} is sent best effort, which does not arrive: '
-           'publish it reliable'),
-    _unfit('reference', 'qos', _WRONG_QOS),
-    _unfit('control', 'type', '{topic} is a {topic.kind}, but {peer} wants {peer.kind}: change it'),
-    _unfit('control', 'qos', _OWN_QOS),
-    _unfit('control', 'reliability', _OWN_QOS),
-    # What comes is of no use.
-    Rule('bad outputs', ERROR, lambda f: f.used == 0 < f.bad_outputs, _bad_outputs),
-    Rule('bad outputs', WARN, lambda f: f.used > 0 and f.bad_outputs > TROUBLE * f.heard,
-         _bad_outputs),
-    Rule('bad references', WARN, lambda f: f.bad_references > 0,
-         lambda f: f'{f.bad_references} {f.reference} messages lately were no finite number: '
-         'the last good one holds'),
-    Rule('wraps', WARN, lambda f: f.wraps > 0,
-         lambda f: f'{f.output} jumps by 2 pi: it is an angle that wraps: let the driver count the '
-         'turns'),
-    # Who else is there.
-    Rule('rivals', ERROR, lambda f: f.standing_down,
-         lambda f: f'standing down: {f.rivals[0] if f.rivals else "another node"} published '
-         f'{f.control} before: stop one'),
-    Rule('rivals', ERROR, lambda f: bool(f.rivals) and not f.standing_down,
-         lambda f: f'{1 + len(f.rivals)} publishers of {f.control}, also {f.rivals[0]}: stop one'),
-    Rule('second driver', WARN, lambda f: len(f.output.heard) > 1,
-         lambda f: f'{len(f.output.heard)} publishers of {f.output}, the first one is used: '
-         'stop the others'),
-    Rule('second reference', WARN, lambda f: len(f.reference.heard) > 1,
-         lambda f: f'{f.reference} is published by {", ".join(map(str, f.reference.heard[:2]))}: '
-         'stop all but one'),
-    # What does not come.
-    Rule('silent', WARN, lambda f: f.silent_s > 0.0,
-         lambda f: f'no {f.output} for {f.silent_s:g} s: is the driver running? '
-         f'on_timeout: {f.on_timeout}'),
-    Rule('waiting for output', WARN, lambda f: f.waits_for(f.output, f.heard == 0),
-         lambda f: f.output.waiting('start the driver'), lasting=True),
-    Rule('waiting for reference', WARN,
-         lambda f: f.waits_for(f.reference, not f.referred and f.bad_references == 0),
-         lambda f: f.reference.waiting('start one'), lasting=True),
-    Rule('unheard', WARN,
-         lambda f: f.status is not None and f.silent_s == 0.0 and not f.control.peers,
-         lambda f: f'nobody listens to {f.control}: is it the name that the driver uses?',
-         lasting=True),
-    # When it comes.
-    Rule('rate', WARN, lambda f: isfinite(f.rate),
-         lambda f: f'{f.output} comes at {f.rate:.4g} Hz, sample_period is {f.sample_period:g} s '
-         f'({1.0 / f.sample_period:.4g} Hz): '
-         + ('is the driver held up?' if f.is_stretched else 'correct one of them')),
-    Rule('stamps', WARN, lambda f: f.repeats_stamps,
-         lambda f: f'{f.output} repeats its stamps, so the time of sending counts: stamp each '
-         'message anew'),
-    Rule('clock', WARN, lambda f: abs(f.age_s) > SKEW * f.sample_period, _age, lasting=True),
-    Rule('late', WARN, lambda f: f.late > TROUBLE * f.used,
-         lambda f: f'{_percent(f.late, f.used)} of {f.control} came too late: relieve the machine '
-         'or lengthen sample_period', lasting=True),
-    Rule('unsent', WARN, lambda f: f.unsent > TROUBLE * f.due and not isfinite(f.rate),
-         lambda f: f'{_percent(f.unsent, f.due)} of {f.output} was never sent or much too late: '
-         'is the driver held up?', lasting=True),
-    Rule('lost', WARN, lambda f: f.lost - f.unsent > TROUBLE * f.due,
-         lambda f: f'{_percent(f.lost - f.unsent, f.due)} of {f.output} was lost on its way: '
-         'check the network', lasting=True),
-    Rule('reference silent', WARN, lambda f: f.reference_silent_s > 0.0,
-         lambda f: f'no {f.reference} for more than {f.reference_silent_s:g} s, the last one is '
-         'held: publish it every sample'),
-    # What becomes of v.
-    Rule('still', WARN, lambda f: f.stands_still,
-         lambda f: f'{f.output} stands still while v swings over {f.v_swing:.3g}'
-         + (f' ({f.v_swing / f.gap:.3g} gaps)' if f.gap > 0.0 else '')
-         + ': check sensor, actuator, its controller'),
-    Rule('limited', WARN,
-         lambda f: f.status in (Status.INCONSISTENT, Status.NOT_EXCITED)
-         and f.limited > 0.5 * f.used,
-         lambda f: f'v is limited in {_percent(f.limited, f.used)} of the samples: widen '
-         'control.min, max or rate_max'),
-    Rule('unreported', WARN, lambda f: f.unreported > TROUBLE * f.used,
-         lambda f: f'{_percent(f.unreported, f.used)} of the samples came without applied_control '
-         'just before them'),
-    Rule('worker', WARN, lambda f: f.dead_workers > 0,
-         lambda f: 'the process that makes the fits died '
-         + ('lately' if f.dead_workers == 1 else f'{f.dead_workers} times lately')
-         + '; v is not affected: check the memory'),
-)
-# The first one that holds is the state of the loop. What is not there yet is among the causes; else
-# all is about to begin.
-STATES: tuple[Rule, ...] = (
-    Rule('begins', OK, lambda f: f.status is None, lambda f: 'the loop begins'),
-    Rule('given', OK, lambda f: f.given and f.status == Status.TRACKING,
-         lambda f: 'estimates as given: estimator.law fixed learns nothing'),
-    Rule('adaptation off', OK, lambda f: not f.adapting and f.status != Status.INCONSISTENT,
-         lambda f: 'estimates held as ~/freeze_adaptation asked; v is still answered'),
-    Rule('known', OK, lambda f: f.law.unconfirmed and f.status == Status.ACQUIRING,
-         lambda f: 'estimates of before hold: only a v at several speeds could confirm them'),
-    Rule('acquiring', OK, lambda f: f.status == Status.ACQUIRING,
-         lambda f: 'learning: the estimates still move freely'),
-    Rule('learned', OK, lambda f: f.status == Status.TRACKING,
-         lambda f: 'learned: the estimates agree with the data'),
-    Rule('not excited', WARN, lambda f: f.status == Status.NOT_EXCITED,
-         lambda f: 'estimates held: v did not swing past the gap lately; move it wider'),
-    Rule('no data', WARN, lambda f: f.status == Status.NO_DATA,
-         lambda f: f'estimates held: {f.output} is missing'),
-    Rule('model', ERROR, lambda f: f.law.wrong_sign,
-         lambda f: f'{f.output} moves against v: reverse it, or the sign of plant.numerator'),
-    Rule('model', ERROR, lambda f: f.law.coasts,
-         lambda f: f'the load coasts in the gap ({100.0 * f.law.unexplained:.2g} % of m*gap): '
-         'brake it, or move more slowly'),
-    Rule('model', ERROR, lambda f: f.unexplained,
-         lambda f: f'{100.0 * f.law.unexplained:.3g} % of m*gap of the motion of u fits no G and '
-         'no backlash: check G(z), load, sensor'),
-    Rule('model', ERROR, lambda f: True,
-         lambda f: f'{f.output} does not follow from v through G(z): check G(z), the sensor, the '
-         'actuator'),
-)
-
-
-def _states_beside(causes: set[str]) -> Iterator[Rule]:
-    """The rules of the state where causes of these kinds have been found; none turns a sign."""
-    def contradicts(f: LoopFigures) -> bool:
-        return f.status == Status.INCONSISTENT and not f.law.wrong_sign
-
-    if 'rate' in causes:
-        yield Rule('held', WARN, contradicts, lambda f: f'{f.output} does not follow from v at '
-                   'this rate: estimates held')
-    if not causes.isdisjoint(LATENESS):
-        yield Rule('held', WARN, lambda f: contradicts(f) and f.inconsistent_s < PATIENCE_S,
-                   lambda f: f'{f.output} does not follow from v while samples are late or lost: '
-                   'estimates held')
-    yield from STATES
+def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
+    """The table of states where causes of these kinds were found: the first that holds counts."""
+    y, status, share = f.output, f.status, 100.0 * f.law.unexplained
+    # Neither rate nor lateness turns a sign.
+    held = status == Status.INCONSISTENT and not f.law.wrong_sign
+    late = not causes.isdisjoint(LATENESS) and f.inconsistent_s < PATIENCE_S
+    return (
+        ('held', WARN, held and 'rate' in causes,
+         f'{y} does not follow from v at this rate: estimates held'),
+        ('held', WARN, held and late,
+         f'{y} does not follow from v while samples are late or lost: estimates held'),
+        # What is not there yet is among the causes; else all is about to begin.
+        ('begins', OK, status is None, 'the loop begins'),
+        ('given', OK, f.given and status == Status.TRACKING,
+         'estimates as given: estimator.law fixed learns nothing'),
+        ('adaptation off', OK, not f.adapting and status != Status.INCONSISTENT,
+         'estimates held as ~/freeze_adaptation asked; v is still answered'),
+        ('known', OK, f.law.unconfirmed and status == Status.ACQUIRING,
+         'estimates of before hold: only a v at several speeds could confirm them'),
+        ('acquiring', OK, status == Status.ACQUIRING,
+         'learning: the estimates still move freely'),
+        ('learned', OK, status == Status.TRACKING, 'learned: the estimates agree with the data'),
+        ('not excited', WARN, status == Status.NOT_EXCITED,
+         'estimates held: v did not swing past the gap lately; move it wider'),
+        ('no data', WARN, status == Status.NO_DATA, f'estimates held: {y} is missing'),
+        ('model', ERROR, f.law.wrong_sign,
+         f'{y} moves against v: reverse it, or the sign of plant.numerator'),
+        ('model', ERROR, f.law.coasts,
+         f'the load coasts in the gap ({share:.2g} % of m*gap): brake it, or move more slowly'),
+        ('model', ERROR, f.unexplained,
+         f'{share:.3g} % of m*gap of the motion of u fits no G and no backlash: check G(z), load, '
+         'sensor'),
+        ('model', ERROR, True,
+         f'{y} does not follow from v through G(z): check G(z), the sensor, the actuator'),
+    )

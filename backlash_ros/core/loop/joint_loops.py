@@ -63,10 +63,10 @@ class JointLoops:
         self.counter.sender.learn()
         return steps
 
-    def take_references(self, y_m: Mapping[str, float]) -> list[str]:
-        """Take in references by joint; returns the joints whose is of use."""
-        return [joint for joint, value in y_m.items()
-                if self.by_name[joint].take_reference(value)]
+    def take_references(self, y_m: Mapping[str, float]) -> None:
+        """Take in references by joint."""
+        for joint, value in y_m.items():
+            self.by_name[joint].take_reference(value)
 
     def give_up_silent(self) -> bool:
         """Give up drivers that are newly silent; returns whether there are any.

@@ -10,9 +10,6 @@ from math import inf, nan, pi
 
 import numpy as np
 
-INTERVALS = 50  # of which the rate of y is taken, and the age of a message
-LATELY_S = 3.0
-
 
 @dataclass
 class Counts:
@@ -46,16 +43,17 @@ class Counts:
 class LoopStatistics(Counts):
     """Counts since the loop began, and what tells how well it runs now.
 
-    still_band: by how much y may differ where it stands still. latencies [s]: the newest ones, as
-    topics.py defines them.
+    still_band: by how much y may differ where it stands still. still: newest values of y in a row
+    that are equal. inconsistent: newest samples in a row that contradict the estimate. latencies
+    [s]: the newest ones, as topics.py defines them.
     """
 
     still_band: float = 0.0
-    still: int = 0  # newest values of y in a row that are equal
-    inconsistent: int = 0  # newest samples in a row that contradict the estimate
+    still: int = 0
+    inconsistent: int = 0
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
-    _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=INTERVALS + 1))
-    _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
+    _stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=51))
+    _ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=50))
     _y: float = nan  # with which the newest row of equal values began
     _y_before: float = nan
     _pace: float = inf  # how far y moves from sample to sample, as a rule
@@ -96,9 +94,7 @@ class LoopStatistics(Counts):
 
     def latencies_ms(self, *shares: float) -> list[float]:
         """Latencies that these shares of the latest commands stayed below; nan without any."""
-        if not self.latencies:
-            return [nan] * len(shares)
-        return [float(each) * 1e3 for each in np.quantile(self.latencies, shares)]
+        return [1e3 * float(each) for each in np.quantile(self.latencies or [nan], shares)]
 
     def intervals_s(self) -> tuple[float, float, float]:
         """Newest intervals between messages of y: low, mean and high [s]; nan while few.
@@ -108,8 +104,7 @@ class LoopStatistics(Counts):
         intervals = sorted(later - earlier for earlier, later in pairwise(self._stamps_ns))
         if len(intervals) < 20:
             return nan, nan, nan
-        tenth = len(intervals) // 10
-        mean = sum(intervals) / len(intervals)
+        tenth, mean = len(intervals) // 10, sum(intervals) / len(intervals)
         return 1e-9 * intervals[tenth], 1e-9 * mean, 1e-9 * intervals[-1 - tenth]
 
     def age_s(self) -> float:
@@ -127,7 +122,7 @@ class LoopStatistics(Counts):
 
 
 class Lately:
-    """What counters have gained within the last LATELY_S, or a little more."""
+    """What counters have gained within the last three seconds, or a little more."""
 
     def __init__(self) -> None:
         self._looks: deque[tuple[float, Mapping[str, int]]] = deque()
@@ -137,10 +132,11 @@ class Lately:
 
         Counters that have fallen are those of another loop, which has begun with 0.
         """
-        if self._looks and any(counts[name] < n for name, n in self._looks[-1][1].items()):
-            self._looks.clear()
-        while len(self._looks) > 1 and self._looks[1][0] <= now_s - LATELY_S:
-            self._looks.popleft()
-        before = self._looks[0][1] if self._looks else {}
-        self._looks.append((now_s, counts))
+        looks = self._looks
+        if looks and any(counts[name] < n for name, n in looks[-1][1].items()):
+            looks.clear()
+        while len(looks) > 1 and looks[1][0] <= now_s - 3.0:
+            looks.popleft()
+        before = looks[0][1] if looks else {}
+        looks.append((now_s, counts))
         return {name: count - before.get(name, 0) for name, count in counts.items()}

@@ -20,9 +20,7 @@ KEEPS_TIME_AFTER = 20
 # Samples in a row that all came later than expected, after which the least lateness among them is
 # the new phase of the sender, which has paused: at its start, and when its period is known.
 PHASE_AT_START, PHASE_SAMPLES = 6, 20
-# Another sender, or a clock that was set back, is believed after so many messages and periods
-# without a sample in between.
-STRANGERS, SILENCE = 5, 3.0
+STRANGERS = 5
 
 
 class Output(NamedTuple):
@@ -59,18 +57,17 @@ NO_SAMPLE, NEXT_SAMPLE = Arrival(is_sample=False), Arrival(is_sample=True)
 
 
 class SampleCounter:
-    """Counts samples by two witnesses: sequence numbers and time stamps.
+    """Counts samples by two witnesses, of which the larger count is believed.
 
-    Sequence numbers tell what the middleware lost; they cannot tell what was never published, or
-    what a relay that renumbers has lost. Time stamps can: sample k is due one period after
-    sample k-1, where the period is that of the sender if it is slow or fast. The larger count is
-    believed. A sender that does not keep time, like one that answers each control at once, is
+    Sequence numbers tell what the middleware lost. Time stamps tell besides what was never
+    published, or lost by a relay that renumbers: sample k is due one period of the sender after
+    sample k-1. A sender that does not keep time, like one that answers each control at once, is
     counted by number alone as long as it is not late.
 
-    index: of the newest sample, -1 before the first. due_ns: when that sample was due at the
-    sender. from_zero: the first index is the count of the sender, which begins with 1, where
-    messages are numbered, else 0. Otherwise it is the time of the first sample in periods, so that
-    who is restarted goes on where the one before has ended, and no index is used twice.
+    index: of the newest sample, -1 before the first. due_ns: when that was due at the sender.
+    from_zero: the first index is the count of the sender, which begins with 1, where messages are
+    numbered, else 0. Otherwise it is the time of the first sample in periods, so that who is
+    restarted uses no index twice.
     """
 
     def __init__(self, sample_period_s: float, from_zero: bool = True) -> None:
@@ -111,7 +108,7 @@ class SampleCounter:
             passed = self._repeated if self._repeated < sequence else self._sequence
             skipped = sequence - passed - 1
             if skipped < 0:
-                silent = stamp_ns - self._stamp_ns > SILENCE * period
+                silent = stamp_ns - self._stamp_ns > 3.0 * period
                 if keeps_time and not silent:
                     return NO_SAMPLE
                 # Two senders in turn must not each look like one that restarted.
@@ -163,10 +160,10 @@ class SampleCounter:
         self._early_ns = max(min(early, stamp_ns), self.due_ns - 0.5 * period)
 
     def _stranger(self, stamp_ns: int, sequence: int, missing: int = 0) -> Arrival:
+        """Another sender, or a clock that was set back: believed after so many messages."""
         self._strange += 1
-        if self._strange < STRANGERS:
-            return NO_SAMPLE
-        return self._restarted(stamp_ns, sequence, missing)
+        return NO_SAMPLE if self._strange < STRANGERS \
+            else self._restarted(stamp_ns, sequence, missing)
 
     def _restarted(self, stamp_ns: int, sequence: int, missing: int) -> Arrival:
         self.index += 1 + missing

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from math import isfinite, isnan, nan
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from rclpy.node import Node
@@ -14,23 +14,14 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.diagnosis import (
-    LONGEST_TEXT,
-    OF_MESSAGES,
-    LoopFigures,
-    Peer,
-    TopicFigures,
-    findings_of,
-)
+from backlash_ros.core.loop.diagnosis import LONGEST_TEXT, LoopFigures, Peer, TopicFigures
 from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD, Period
 from backlash_ros.core.loop.finding import Finding, Level
-from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import stated_deviations
-from backlash_ros.nodes.control.rivals import RivalWatch, name_of
+from backlash_ros.nodes.control.rivals import name_of
 from backlash_ros.nodes.runtime.driver_io import DriverIo, output_qos
-from backlash_ros.nodes.runtime.messages import DEPTH, DiagnosticsPublisher
-from backlash_ros.nodes.runtime.process import ProcessNode
+from backlash_ros.nodes.runtime.messages import DEPTH
 
 # What was counted, as /diagnostics and the last line of the log call it.
 COUNTS = {
@@ -78,89 +69,51 @@ def _peer(
     return Peer(name_of(info), str(info.topic_type).rsplit('/', 1)[-1], unfit)
 
 
-class Diagnosis:
-    """Collects what is known of a loop and its neighbours, and says what is wrong with it.
+def figures_of(
+    node: Node, io: DriverIo, loop: ControlLoop, p: Parameters, period: Period,
+    counts: Mapping[str, int], rivals: tuple[str, ...], references: QoSProfile,
+) -> LoopFigures:
+    """What is known of a loop and its neighbours.
 
-    joint: of the loop. about: what the messages are about, empty for the command. references: with
-    which quality of service the controller listens to them.
+    counts: gained lately. period: of the driver. references: with which quality of service the
+    controller listens to them.
     """
-
-    def __init__(
-        self, node: ProcessNode, io: DriverIo, joint: str, about: str, references: QoSProfile,
-    ) -> None:
-        self._node, self._io, self._joint, self._references = node, io, joint, references
-        self._lately = Lately()
-        self._publisher = DiagnosticsPublisher(node, about or io.publisher.topic_name, part=joint)
-
-    def tell(
-        self, loop: ControlLoop | None, p: Parameters, reference_at_s: float | None,
-        rivals: RivalWatch, active: bool,
-    ) -> None:
-        """Publish what is going on. reference_at_s: when the newest y_m came, steady clock."""
-        if loop is None:
-            finding = Finding(Level.OK, 'unconfigured', 'unconfigured')
-            self._publisher.publish(finding, rivals.claim)
-            return
-        period = loop.counter.sender.newest()
-        values = {**values_of(loop, period), **rivals.claim}
-        if not active:
-            text = f'inactive: no {self._io.topics.control} is published'
-            self._publisher.publish(Finding(Level.OK, 'inactive', text), values)
-            return
-        figures = self._figures(loop, p, period, reference_at_s, rivals)
-        findings = [*self._of_messages(p), *findings_of(figures)]
-        finding = worst(findings)
-        # What is true of all joints the first one says in the log.
-        speaks = self._joint == self._io.joint_names[0] or finding.kind not in OF_MESSAGES
-        self._publisher.publish(finding, {**_details(findings, figures), **values}, logs=speaks)
-
-    def _figures(
-        self, loop: ControlLoop, p: Parameters, period: Period, reference_at_s: float | None,
-        rivals: RivalWatch,
-    ) -> LoopFigures:
-        statistics, io, node = loop.statistics, self._io, self._node
-        to, timeout, estimate = io.topics, p.timeout.reference, loop.estimate
-        # Hardware on topics falls silent where all joints are where they belong.
-        overdue = reference_at_s is not None and not (p.lockstep or io.in_joint_space) \
-            and 0.0 < timeout < time.monotonic() - reference_at_s
-        counts: Mapping[str, Any] = self._lately.gained(
-            {**statistics.by_name(), 'dead_workers': loop.executor.restarts}, time.monotonic()
-        )
-        return LoopFigures(
-            **counts, sample_period=p.sample_period,
-            output=publishers_of(node, to.output, to.output_type, output_qos(p, DEPTH)),
-            reference=publishers_of(node, to.reference, to.reference_type, self._references),
-            control=subscribers_of(node, to.control, to.control_type),
-            rivals=tuple(rival.name for rival in rivals.found),
-            standing_down=loop.standing_down,
-            status=estimate.status if statistics.used else None,
-            inconsistent_s=statistics.inconsistent * p.sample_period,
-            law=loop.core.estimator.report, adapting=loop.core.estimator.adapting,
-            given=was_given(estimate),
-            silent_s=p.timeout.plant_output if loop.silent else 0.0, on_timeout=p.on_timeout,
-            referred=isfinite(loop.y_m), reference_silent_s=timeout if overdue else 0.0,
-            # In lockstep the outputs come as fast as the machine goes.
-            intervals_s=(nan, nan, nan) if p.lockstep else statistics.intervals_s(),
-            period=UNKNOWN_PERIOD if p.lockstep else period,
-            repeats_stamps=io.stamps.repeated,
-            # Stamps of simulated time have nothing to do with the time of arrival.
-            age_s=nan if p.lockstep or io.simulated_time else statistics.age_s(),
-            still=statistics.still, v_swing=statistics.still_swing,
-            gap=estimate.c_r - estimate.c_l if estimate.learned else nan,
-        )
-
-    def _of_messages(self, p: Parameters) -> list[Finding]:
-        io = self._io
-        if io.skipped[self._joint] < 5:
-            return []
-        text = (
-            f'{io.topics.output} has no {p.io.field} of joint {p.io.joint!r} '
-            f'but {io.seen}: set io.joint, io.field'
-        )
-        return [Finding(Level.ERROR, 'joint', text[:LONGEST_TEXT])]
+    statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
+    to, timeout, lately = io.topics, p.timeout.reference, cast(Mapping[str, Any], counts)
+    # Hardware on topics falls silent where all joints are where they belong.
+    overdue = loop.referred_at is not None and not (p.lockstep or io.in_joint_space) \
+        and 0.0 < timeout < time.monotonic() - loop.referred_at
+    return LoopFigures(
+        **lately, sample_period=p.sample_period,
+        output=publishers_of(node, to.output, to.output_type, output_qos(p, DEPTH)),
+        reference=publishers_of(node, to.reference, to.reference_type, references),
+        control=subscribers_of(node, to.control, to.control_type),
+        rivals=rivals, standing_down=loop.standing_down,
+        status=estimate.status if statistics.used else None,
+        inconsistent_s=statistics.inconsistent * p.sample_period,
+        law=law.report, adapting=law.adapting, given=was_given(estimate),
+        silent_s=p.timeout.plant_output if loop.silent else 0.0, on_timeout=p.on_timeout,
+        referred=isfinite(loop.y_m), reference_silent_s=timeout if overdue else 0.0,
+        # In lockstep the outputs come as fast as the machine goes.
+        intervals_s=(nan, nan, nan) if p.lockstep else statistics.intervals_s(),
+        period=UNKNOWN_PERIOD if p.lockstep else period, repeats_stamps=io.stamps.repeated,
+        # Stamps of simulated time have nothing to do with the time of arrival.
+        age_s=nan if p.lockstep or io.simulated_time else statistics.age_s(),
+        still=statistics.still, v_swing=statistics.still_swing,
+        gap=estimate.c_r - estimate.c_l if estimate.learned else nan,
+    )
 
 
-def _details(findings: list[Finding], figures: LoopFigures) -> dict[str, object]:
+def missing_joint(io: DriverIo, joint: str, p: Parameters) -> list[Finding]:
+    """What is said of a joint that the messages of the driver do not name."""
+    if io.skipped[joint] < 5:
+        return []
+    text = f'{io.topics.output} has no {p.io.field} of joint {p.io.joint!r} but {io.seen}: ' \
+        'set io.joint, io.field'
+    return [Finding(Level.ERROR, 'joint', text[:LONGEST_TEXT])]
+
+
+def details_of(findings: list[Finding], figures: LoopFigures) -> dict[str, object]:
     """All findings, and who is on the topics where that matters."""
     details: dict[str, object] = {
         f'finding {i}': finding.text for i, finding in enumerate(findings, start=1)

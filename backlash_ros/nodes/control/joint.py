@@ -14,21 +14,32 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.estimates_file import save_estimate, worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
+from backlash_ros.core.loop.diagnosis import OF_MESSAGES, findings_of
+from backlash_ros.core.loop.finding import Finding, Level
+from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import NOISE, Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.nodes.control.diagnosis import Diagnosis, counts_of
+from backlash_ros.nodes.control.diagnosis import (
+    counts_of,
+    details_of,
+    figures_of,
+    missing_joint,
+    values_of,
+    worst,
+)
 from backlash_ros.nodes.control.publishing import ModelPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.runtime.messages import DiagnosticsPublisher
 from backlash_ros.nodes.runtime.process import ProcessNode
 
 
 class Joint:
     """What the controller has of each joint; a single one is nameless.
 
-    p: its parameters. loop: None while the node is unconfigured. reference_at: when the newest y_m
-    came, on the steady clock [s]. v: the command that acts as far as this node can know, None if
-    it cannot. told: what /diagnostics has, None where it is to be told anew.
+    p: its parameters. loop: None while the node is unconfigured. v: the command that acts as far as
+    this node can know, None if it cannot. told: what /diagnostics has, None where it is to be told
+    anew.
     """
 
     def __init__(
@@ -36,7 +47,6 @@ class Joint:
     ) -> None:
         self.name, self.p = name, p
         self.loop: ControlLoop | None = None
-        self.reference_at: float | None = None
         # In lockstep there is the simulated plant alone, which begins at 0.
         initial = p.control.initial
         self.v = initial if isfinite(initial) and not p.lockstep else None
@@ -44,7 +54,10 @@ class Joint:
         self._node, self._io = node, io
         self._warned: set[str] = set()  # texts
         self.told: object = None
-        self._diagnosis = Diagnosis(node, io, name, p.io.joint, references)
+        self._references, self._lately = references, Lately()
+        self._diagnostics = DiagnosticsPublisher(
+            node, p.io.joint or io.publisher.topic_name, part=name
+        )
         # A disk that is slow to confirm a file would cost samples; one writing follows the other.
         self._writer = ThreadPoolExecutor(1, thread_name_prefix='estimates')
         self._saved_at = time.monotonic()
@@ -77,7 +90,7 @@ class Joint:
     def end(self) -> None:
         """Give the loop up, but remember its v."""
         if self.loop is not None:
-            self.loop.close()
+            self.loop.core.close()
             if self.loop.knows_v:
                 self.v = self.loop.v
         self.loop = None
@@ -135,7 +148,26 @@ class Joint:
 
     def diagnose(self, rivals: RivalWatch, active: bool) -> None:
         """Publish what is going on to /diagnostics."""
-        self._diagnosis.tell(self.loop, self.p, self.reference_at, rivals, active)
+        loop, p, claim, publish = self.loop, self.p, rivals.claim, self._diagnostics.publish
+        if loop is None:
+            publish(Finding(Level.OK, 'unconfigured', 'unconfigured'), claim)
+            return
+        period = loop.counter.sender.newest()
+        values = {**values_of(loop, period), **claim}
+        if not active:
+            text = f'inactive: no {self._io.topics.control} is published'
+            publish(Finding(Level.OK, 'inactive', text), values)
+            return
+        counts = {**loop.statistics.by_name(), 'dead_workers': loop.executor.restarts}
+        figures = figures_of(
+            self._node, self._io, loop, p, period, self._lately.gained(counts, time.monotonic()),
+            tuple(rival.name for rival in rivals.found), self._references,
+        )
+        findings = [*missing_joint(self._io, self.name, p), *findings_of(figures)]
+        finding = worst(findings)
+        # What is true of all joints the first one says in the log.
+        speaks = self.name == self._io.joint_names[0] or finding.kind not in OF_MESSAGES
+        publish(finding, {**details_of(findings, figures), **values}, logs=speaks)
 
     def close(self) -> None:
         """Wait until everything is written, and say in the log what was counted."""
