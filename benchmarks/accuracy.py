@@ -28,8 +28,12 @@ from typing import Any
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+import faults
 import ordinary_motions
-from contract import following_rows, learning_rows, situation_rows, timing_rows
+from contract import following_rows as following
+from contract import learning_rows as learning
+from contract import situation_rows as situation
+from contract import timing_rows as timing
 from contract.figures import COMPARED_HEADER, Row, as_json, compare, from_json, show
 from reporting import ROOT, machine, markdown_table, text_table
 from tqdm import tqdm
@@ -54,42 +58,28 @@ class Measured:
 
 
 ROWS: dict[str, Measured] = {
-    'step': Measured(
-        timing_rows.step_jobs, timing_rows.run_step, timing_rows.times_figures, alone=True),
-    'latency': Measured(
-        timing_rows.latency_jobs, timing_rows.run_latency, timing_rows.times_figures, alone=True),
+    'step': Measured(timing.step_jobs, timing.run_step, timing.times_figures, alone=True),
+    'latency': Measured(timing.latency_jobs, timing.run_latency, timing.times_figures, alone=True),
     'simulate': Measured(
-        timing_rows.simulate_jobs, timing_rows.run_simulate, timing_rows.times_figures,
-        alone=True),
+        timing.simulate_jobs, timing.run_simulate, timing.times_figures, alone=True),
     'identify': Measured(
-        timing_rows.identify_jobs, timing_rows.run_identify, timing_rows.times_figures,
-        alone=True),
-    'bound': Measured(
-        learning_rows.bound_jobs, learning_rows.run_job, learning_rows.bound_figures),
-    'losses': Measured(
-        learning_rows.losses_jobs, learning_rows.run_job, learning_rows.bound_figures),
-    'random': Measured(
-        learning_rows.random_jobs, learning_rows.run_random, learning_rows.random_figures),
+        timing.identify_jobs, timing.run_identify, timing.times_figures, alone=True),
+    'bound': Measured(learning.bound_jobs, learning.run_job, learning.bound_figures),
+    'losses': Measured(learning.losses_jobs, learning.run_job, learning.bound_figures),
+    'random': Measured(learning.random_jobs, learning.run_random, learning.random_figures),
     'plants, open loop': Measured(
-        partial(learning_rows.plants_jobs, 'proportional'), learning_rows.run_job,
-        learning_rows.plants_figures),
+        partial(learning.plants_jobs, 'proportional'), learning.run_job, learning.plants_figures),
     'plants, closed loop': Measured(
-        partial(learning_rows.plants_jobs, 'tracking'), learning_rows.run_job,
-        learning_rows.plants_figures),
-    'changes': Measured(
-        learning_rows.changes_jobs, learning_rows.run_job, learning_rows.changes_figures),
+        partial(learning.plants_jobs, 'tracking'), learning.run_job, learning.plants_figures),
+    'changes': Measured(learning.changes_jobs, learning.run_job, learning.changes_figures),
     'following': Measured(
-        following_rows.following_jobs, following_rows.run_following,
-        following_rows.following_figures),
-    'late': Measured(
-        situation_rows.late_jobs, situation_rows.run_late, situation_rows.late_figures),
-    'faults': Measured(
-        situation_rows.faults_jobs, situation_rows.play, situation_rows.faults_figures),
+        following.following_jobs, following.run_following, following.following_figures),
+    'late': Measured(situation.late_jobs, situation.run_late, situation.late_figures),
+    'faults': Measured(situation.faults_jobs, faults.play, situation.faults_figures),
     'identification': Measured(
-        situation_rows.identification_jobs, situation_rows.run_identification,
-        situation_rows.identification_figures),
-    'gears': Measured(
-        situation_rows.gears_jobs, situation_rows.run_gear, situation_rows.gears_figures),
+        situation.identification_jobs, situation.run_identification,
+        situation.identification_figures),
+    'gears': Measured(situation.gears_jobs, situation.run_gear, situation.gears_figures),
     'ordinary motions': Measured(
         ordinary_motions.contract_cases, ordinary_motions.run_case,
         ordinary_motions.contract_figures),

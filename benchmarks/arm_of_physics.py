@@ -40,7 +40,7 @@ from backlash_ros.core.loop.control_loop import Driver
 from backlash_ros.core.loop.joint_loops import JointLoops
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.config import load_config, read_parameter_file
+from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.figures import TIME_LABEL, curve, label
 from backlash_ros.tools.identify.command import main as identify
 
@@ -71,7 +71,7 @@ class Motion(NamedTuple):
 
 def shared_parameters() -> dict[str, object]:
     """What config/arm.yaml says of all joints."""
-    given = load_config(ROOT / 'config' / 'arm.yaml')
+    given = read_configuration(ROOT / 'config' / 'arm.yaml').given()
     return {name: value for name, value in given.items() if name.partition('.')[0] not in NAMES}
 
 
@@ -99,7 +99,7 @@ def identified(folder: Path) -> dict[str, object]:
         'estimates.file': str(folder / '{joint}' / 'estimates.json'),
     }
     for name in NAMES:
-        found = read_parameter_file(folder / name / 'identified.yaml').values('')
+        found = read_configuration(folder / name / 'identified.yaml').given()
         values |= {f'{name}.{own}': value for own, value in found.items()
                    if own.startswith(OF_A_JOINT)}
     return values

@@ -20,14 +20,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import pi
 from pathlib import Path
-from typing import Any
 
 # Before numpy is imported: the matrices are tiny, threads would only disturb the processes.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import numpy as np
 from cases.geared_motor import motor, random_backlash
-from contract.figures import Figure, figure, rms, share, upper
+from contract.figures import Figure, by_group, figure, rms, share, upper
 from contract.judged import FAR, Judged, judged
 from numpy.typing import NDArray
 from reporting import ROOT, parallel, text_table
@@ -275,55 +274,43 @@ ALIKE = {
     'slow waves': r'sine|triangle', 'squares': r'square', 'moves': r'^moves|^slow|^fast',
     'small moves': r'^small', 'one-way moves': r'^one-way',
 }
-OTHER_RATES = 'other rates'
 
 
 def contract_figures(results: Sequence[Result]) -> dict[str, Figure]:
     """Figures of motions that are alike, and of every plant."""
-    found: dict[str, list[Result]] = {}
-    for result in results:
-        kind = next(name for name, words in ALIKE.items() if re.search(words, result.motion))
-        found.setdefault(kind if result.rate == RATES[0] else OTHER_RATES, []).append(result)
-        if result.rate == RATES[0]:
-            found.setdefault(result.plant, []).append(result)
+    def kind(result: Result) -> str:
+        if result.rate != RATES[0]:
+            return 'other rates'
+        return next(name for name, words in ALIKE.items() if re.search(words, result.motion))
+
+    usual = [result for result in results if result.rate == RATES[0]]
+    return by_group(results, figures_of, kind) | by_group(usual, figures_of, lambda r: r.plant)
+
+
+def figures_of(of: Sequence[Result]) -> dict[str, Figure]:
+    """Figures of runs that are alike."""
     return {
-        f'{name}: {what}': one for name, of in found.items() for what, one in {
-            'as due': share([r.good for r in of], 'more'),
-            'learned': share([r.learned is not None for r in of], 'more'),
-            'reversals until learned, median': figure([r.learned for r in of]),
-            'error at five periods, median [gap]': figure([r.at_five for r in of]),
-            'error at five periods, 90 % [gap]': figure([r.at_five for r in of], upper),
-            'tracking': share([r.shares.get('tracking', 0.0) for r in of], 'more'),
-            'inconsistent': share([r.shares.get('inconsistent', 1.0) for r in of]),
-            'error / deviation, RMS': figure([r.rms for r in of], rms, 'one'),
-            'beyond five deviations': share([r.beyond for r in of]),
-            'wrong while tracking': share([r.wrong for r in of]),
-        }.items()
+        'as due': share([r.good for r in of], 'more'),
+        'learned': share([r.learned is not None for r in of], 'more'),
+        'reversals until learned, median': figure([r.learned for r in of]),
+        'error at five periods, median [gap]': figure([r.at_five for r in of]),
+        'error at five periods, 90 % [gap]': figure([r.at_five for r in of], upper),
+        'tracking': share([r.shares.get('tracking', 0.0) for r in of], 'more'),
+        'inconsistent': share([r.shares.get('inconsistent', 1.0) for r in of]),
+        'error / deviation, RMS': figure([r.rms for r in of], rms, 'one'),
+        'beyond five deviations': share([r.beyond for r in of]),
+        'wrong while tracking': share([r.wrong for r in of]),
     }
 
 
-HEADER = ('case', 'good', 'learned', 'reversals', 'error at 5 [% gap]', 'worst',
-          'RMS of e/std', 'beyond 5', 'wrong', 'acquiring', 'tracking', 'inconsistent', 'ms')
+HEADER = ('case', 'runs', 'as due', 'learned', 'reversals', 'error at 5 [gap]', '90 %', 'tracking',
+          'inconsistent', 'RMS of e/std', 'beyond 5', 'wrong', 'ms')
 
 
 def row(name: str, results: Sequence[Result]) -> list[str]:
-    """One row of the table: the runs of one case or motion."""
-    def over(values: Sequence[float | None], how: Callable[[Any], Any], form: str) -> str:
-        known = [value for value in values if value is not None]
-        return format(float(how(known)), form) if known else '–'
-
-    learned = [r.learned for r in results if r.learned is not None]
-    return [
-        name, f'{sum(r.good for r in results)}/{len(results)}', f'{len(learned)}/{len(results)}',
-        over(learned, np.median, 'g'), over([100 * r.at_five for r in results], np.median, '.3g'),
-        over([100 * r.at_five for r in results], max, '.3g'),
-        over([r.rms for r in results], lambda x: np.sqrt(np.mean(np.square(x))), '.2f'),
-        over([r.beyond for r in results], np.mean, '.1%'),
-        over([r.wrong for r in results], np.mean, '.1%'),
-        *(over([r.shares.get(word) for r in results], np.mean, '.0%')
-          for word in ('acquiring', 'tracking', 'inconsistent')),
-        over([r.ms for r in results], np.mean, '.2f'),
-    ]
+    """One row of the table: the figures of the runs of one case or motion."""
+    figures = [f'{one.value:.3g}' if one.runs else '–' for one in figures_of(results).values()]
+    return [name, str(len(results)), *figures, f'{np.mean([r.ms for r in results]):.2f}']
 
 
 def main() -> int:

@@ -24,7 +24,7 @@ from std_srvs.srv import SetBool, Trigger
 from waiting import wait_until
 
 from backlash_ros.core.assembly import build_plant, build_reference
-from backlash_ros.core.jobs.executor import InlineExecutor
+from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
@@ -50,7 +50,7 @@ def node_with(values: dict[str, object], domain: int) -> Iterator[ControllerNode
     try:
         node = ControllerNode()
         # Samples come as fast as they are computed: a worker would fall behind them.
-        node._executor = InlineExecutor()
+        node._executor = Executor()
         try:
             yield node
         finally:

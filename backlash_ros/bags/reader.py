@@ -5,12 +5,10 @@ Neither needs the index or the metadata.yaml that only a bag that was closed has
 
 from __future__ import annotations
 
-import fcntl
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,8 +30,7 @@ class NoBagError(BagError):
     """There is no bag where one was looked for."""
 
 
-@dataclass(frozen=True)
-class Topic:
+class Topic(NamedTuple):
     """A recorded topic; definition: text of the .msg file with all it refers to, if recorded."""
 
     name: str
@@ -49,6 +46,19 @@ class Message(NamedTuple):
     data: bytes
 
 
+def is_bag(path: Path) -> bool:
+    """Whether path is the folder of a bag, properly closed or not, or a file of one."""
+    return (path / BAG_METADATA).is_file() or bool(message_files(path))
+
+
+def message_files(path: Path) -> list[Path]:
+    """The files with the messages of a bag in their order; itself, if it is one."""
+    files = [path] if path.is_file() else path.glob('*')
+    # bag_10 comes after bag_9.
+    return sorted((file for file in files if file.suffix in STORAGE_OF_SUFFIX),
+                  key=lambda file: (len(file.name), file.name))
+
+
 class BagReader:
     """The messages of a bag: its folder, or a lone .mcap or .db3 file. Raises NoBagError.
 
@@ -57,14 +67,12 @@ class BagReader:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.files = path, message_files(path)
         self.topics: set[Topic] = set()
         self.damage = ''
-        if not path.exists():
-            raise NoBagError(f'{path}: does not exist')
-        self.files = message_files(path)
         if not self.files:
-            rule = 'holds no .mcap and no .db3 file' if path.is_dir() else \
+            rule = 'does not exist' if not path.exists() else \
+                'holds no .mcap and no .db3 file' if path.is_dir() else \
                 'is neither the folder of a bag nor an .mcap or .db3 file'
             raise NoBagError(f'{path}: {rule}')
 
@@ -134,38 +142,5 @@ def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Messag
             f'WHERE topic_id IN ({", ".join(map(str, chosen))}) ORDER BY id'
         ):
             yield Message(topics[number], int(stamp_ns), bytes(data))
-        closed = database.execute('SELECT count(*) FROM metadata').fetchone()[0]
-    if not closed:
-        raise BagError(f'{file}: was never closed')
-
-
-def is_bag(path: Path) -> bool:
-    """Whether path is the folder of a bag, properly closed or not, or a file of one."""
-    return (path / BAG_METADATA).is_file() or bool(message_files(path))
-
-
-def message_files(path: Path) -> list[Path]:
-    """The files with the messages of a bag in their order; itself, if it is one."""
-    if path.is_file():
-        return [path] if path.suffix in STORAGE_OF_SUFFIX else []
-    # bag_10 comes after bag_9.
-    return sorted(
-        (file for file in path.glob('*') if file.suffix in STORAGE_OF_SUFFIX),
-        key=lambda file: (len(file.name), file.name),
-    )
-
-
-def lock_folder(path: Path) -> int | None:
-    """Mark a bag as being written until the descriptor is closed, or the process gone.
-
-    Raises BlockingIOError if another process writes it; None where folders cannot be locked.
-    """
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        os.close(descriptor)
-        if isinstance(error, BlockingIOError):
-            raise
-        return None
-    return descriptor
+        if not database.execute('SELECT count(*) FROM metadata').fetchone()[0]:
+            raise BagError(f'{file}: was never closed')

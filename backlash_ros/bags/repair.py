@@ -6,10 +6,10 @@ import os
 import sqlite3
 import sys
 from collections import Counter
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Writer, WriterError
@@ -22,18 +22,16 @@ from backlash_ros.bags.reader import (
     BagReader,
     NoBagError,
     Topic,
-    lock_folder,
 )
-from backlash_ros.bags.writer import STORAGE, sync_path
+from backlash_ros.bags.writer import STORAGE, lock_folder, sync_path
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
 
-@dataclass(frozen=True)
-class Repair:
+class Repair(NamedTuple):
     """What was saved: messages by topic, and the time from the first to the last of them."""
 
     why: str
-    messages: dict[str, int]
+    messages: Counter[str]
     duration_s: float
     original: Path
 
@@ -96,11 +94,22 @@ def repair(bag: Path) -> Repair | None:
 
 def _rewrite(reader: BagReader, why: str) -> Repair:
     bag = reader.path
+    messages: Counter[str] = Counter()
+    first, last = 2**63, 0
+    connections: dict[Topic, Connection] = {}
+    storage = STORAGE[STORAGE_OF_SUFFIX[reader.files[0].suffix]]
     with TemporaryDirectory(dir=bag.parent, prefix=f'{bag.name}.') as folder:
         # The name of a bag is that of its file as well.
         repaired = Path(folder) / bag.name
-        counts, duration_s = _write(reader, repaired)
-        if not counts.total():
+        with Writer(repaired, version=9, storage_plugin=storage) as writer:
+            for topic, stamp_ns, data in reader.messages():
+                for new in reader.topics - connections.keys():
+                    connections[new] = _announce(writer, new)
+                    messages[new.name] += 0
+                writer.write(connections[topic], stamp_ns, data)
+                messages[topic.name] += 1
+                first, last = min(first, stamp_ns), max(last, stamp_ns)
+        if not messages.total():
             raise BagError(f'{bag}: {why}, and holds no message that could be saved')
         for file in (*repaired.iterdir(), repaired):
             sync_path(file)
@@ -109,24 +118,7 @@ def _rewrite(reader: BagReader, why: str) -> Repair:
         bag.rename(original)
         repaired.rename(bag)
         sync_path(bag.parent)
-    return Repair(why, dict(counts), duration_s, original)
-
-
-def _write(reader: BagReader, path: Path) -> tuple[Counter[str], float]:
-    """Write all that is left to a new bag; returns messages by topic, and the time they span."""
-    counts: Counter[str] = Counter()
-    first, last = 2**63, 0
-    connections: dict[Topic, Connection] = {}
-    storage = STORAGE[STORAGE_OF_SUFFIX[reader.files[0].suffix]]
-    with Writer(path, version=9, storage_plugin=storage) as writer:
-        for message in reader.messages():
-            for topic in reader.topics - connections.keys():
-                connections[topic] = _announce(writer, topic)
-                counts[topic.name] += 0
-            writer.write(connections[message.topic], message.stamp_ns, message.data)
-            counts[message.topic.name] += 1
-            first, last = min(first, message.stamp_ns), max(last, message.stamp_ns)
-    return counts, max(last - first, 0) * 1e-9
+    return Repair(why, messages, (last - first) * 1e-9, original)
 
 
 def _announce(writer: Writer, topic: Topic) -> Connection:

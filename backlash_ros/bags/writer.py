@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
 import sqlite3
@@ -14,7 +15,6 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from backlash_ros.bags.reader import lock_folder
 from backlash_ros.core.parameters.errors import ParameterError
 
 STORAGE = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
@@ -33,27 +33,26 @@ class Bag:
 
     def __init__(self, path: str, storage: str) -> None:
         self.path = Path(path)
-        self.saved = 0
-        self.saved_ns = 0
+        self.saved = self.saved_ns = 0
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._lock: int | None = None
         if self.path.exists():
             raise ParameterError('bag', path, 'exists already', 'name a new folder')
         self._writer = Writer(self.path, version=9, storage_plugin=STORAGE[storage])
         try:
-            self._writer.open()
-            self._lock = lock_folder(self.path)
-            self._flush = _flush_of(self._writer)
-            if self._flush is not None:
-                self._flush()
-            sync_path(self.path)
-            sync_path(self.path.parent)
-        except (OSError, sqlite3.Error) as error:
-            self._abort()
+            with self._closed_on_error():
+                self._writer.open()
+                self._lock = lock_folder(self.path)
+                self._flush = _flush_of(self._writer)
+                if self._flush is not None:
+                    self._flush()
+                sync_path(self.path)
+                sync_path(self.path.parent)
+        except RecordingError as error:
             # Half a bag would be in the way of the next attempt.
             shutil.rmtree(self.path, ignore_errors=True)
             raise ParameterError(
-                'bag', path, f'cannot be made: {_reason(error)}',
+                'bag', path, f'cannot be made: {error}',
                 'name a folder where there is room and you may write',
             ) from None
 
@@ -98,14 +97,13 @@ class Bag:
         try:
             yield
         except (OSError, sqlite3.Error) as error:
-            self._abort()
-            raise RecordingError(_reason(error)) from error
-
-    def _abort(self) -> None:
-        # What does not fit on the disk now did not a moment ago.
-        with suppress(OSError, sqlite3.Error):
-            self._writer.abort()
-        self._unlock()
+            # What does not fit on the disk now did not a moment ago.
+            with suppress(OSError, sqlite3.Error):
+                self._writer.abort()
+            self._unlock()
+            text = (error.strerror or '') if isinstance(error, OSError) else ''
+            reason = text or ' '.join(str(error).split()) or type(error).__name__
+            raise RecordingError(reason) from error
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -139,6 +137,22 @@ def _flush_of(writer: Writer) -> Callable[[], None] | None:
     return flush
 
 
+def lock_folder(path: Path) -> int | None:
+    """Mark a bag as being written until the descriptor is closed, or the process gone.
+
+    Raises BlockingIOError if another process writes it; None where folders cannot be locked.
+    """
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        if isinstance(error, BlockingIOError):
+            raise
+        return None
+    return descriptor
+
+
 def sync_path(path: Path) -> None:
     """Let a file or the entries of a folder survive a power cut; raises OSError."""
     descriptor = os.open(path, os.O_RDONLY)
@@ -150,8 +164,3 @@ def sync_path(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
-
-
-def _reason(error: Exception) -> str:
-    text = (error.strerror or '') if isinstance(error, OSError) else ''
-    return text or ' '.join(str(error).split()) or type(error).__name__

@@ -25,7 +25,7 @@ from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.core.estimation.estimator import MovingHorizon, fitted
-from backlash_ros.core.jobs.executor import Executor, InlineExecutor
+from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.law import Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.laws.gradient import GradientEstimator
@@ -92,7 +92,7 @@ def build_controller(
             'structure', p.structure, f'must be {only} for estimator.law: {law}',
             f'{why}; moving_horizon, lms and fixed fit any structure',
         )
-    executor, actuator = executor or InlineExecutor(), build_actuator(p)
+    executor, actuator = executor or Executor(), build_actuator(p)
     estimator = build_law(p, estimate or known_before(p), executor)
     serial = None if actuator is None else SerialPlant(
         actuator, build_state_model(p), p.estimator.output_noise_std

@@ -23,7 +23,7 @@ from backlash_ros.core.assembly import (
     warnings_of,
 )
 from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
-from backlash_ros.core.jobs.executor import Executor, InlineExecutor
+from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.jobs.worker import WorkerExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.joint_loops import JointLoops
@@ -74,7 +74,7 @@ class ControllerNode(ManagedNode):
         self.loops: JointLoops | None = None  # None while unconfigured
         # A fit that shared the process of the loop would hold up its commands.
         self._executor: Executor = (
-            InlineExecutor() if p.lockstep else WorkerExecutor(WORKER_MODULES)
+            Executor() if p.lockstep else WorkerExecutor(WORKER_MODULES)
         )
         self._io = DriverIo(self, p)
         if not p.lockstep:

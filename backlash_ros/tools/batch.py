@@ -1,18 +1,20 @@
-"""Many simulated runs: seeds and sweeps as jobs, in parallel processes, and their statistics."""
+"""Many simulated runs: seeds and sweeps as jobs, here or on a cluster, and their statistics."""
 
 from __future__ import annotations
 
 import itertools
+import logging
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Generator, Mapping, Sequence
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import closing
+from importlib.metadata import version
 from math import inf, nan
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -29,6 +31,10 @@ from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
 
+if TYPE_CHECKING:
+    from distributed import Client
+
+CLUSTER_ANSWER_S = 10.0  # for a scheduler to answer, and for a first worker to be there
 # What an outcome has of m, c_r and c_l: the beginning of a column, and the group in a summary.
 OUTCOME_GROUPS = {
     '': 'final', 'std_': 'final_std', 'true_': 'truth', 'settling_': 'settling_time_s',
@@ -42,24 +48,21 @@ OUTCOME_COLUMNS = (
 Outcome = Mapping[str, float | str | None]
 
 
-@dataclass(frozen=True)
-class Sweep:
+class Sweep(NamedTuple):
     """A parameter and the values it takes in turn."""
 
     name: str
     values: tuple[Value, ...]
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """One run: its complete parameters and its length."""
 
     values: Mapping[str, Value]
     samples: int
 
 
-@dataclass(frozen=True)
-class ParameterStatistics:
+class ParameterStatistics(NamedTuple):
     """Statistics of one estimated parameter over runs.
 
     rmse_percent: of the truth, nan where that is 0. settling times [s]: inf for never. within:
@@ -134,32 +137,40 @@ def run_job(job: Job) -> Outcome:
         summary = summarise(run_loop(build_closed_loop(parameters), job.samples), parameters)
     except BrokenOffError as error:
         return {**dict.fromkeys(OUTCOME_COLUMNS), 'problem': str(error)}
-    groups = {f'{prefix}{name}': summary[group][name]
-              for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH}
-    return {name: {**summary, **groups, 'problem': ''}[name] for name in OUTCOME_COLUMNS}
+    known = {**summary, 'problem': '', **{
+        f'{prefix}{name}': summary[group][name]
+        for prefix, group in OUTCOME_GROUPS.items() for name in BACKLASH
+    }}
+    return {name: known[name] for name in OUTCOME_COLUMNS}
 
 
-def run_jobs(jobs: Sequence[Job], workers: int | None = None, label: str = '') -> list[Outcome]:
-    """Outcomes in the order of the jobs, whatever the number of processes.
+def run_jobs(
+    jobs: Sequence[Job], workers: int | None = None, cluster: str | None = None, label: str = '',
+) -> list[Outcome]:
+    """Outcomes in the order of the jobs, the same wherever they were computed.
 
-    workers: None takes one process per processor, 1 none besides this one. Call it from the main
-    thread, which alone receives signals. Raises BrokenOffError if a worker was killed.
+    workers: None takes one process per processor, 1 none besides this one. cluster: address of a
+    Dask scheduler, whose workers are used instead. Call it from the main thread, which alone
+    receives signals. Raises BrokenOffError if a worker was killed.
     """
     if workers is None:
         workers = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
             os.cpu_count() or 1)
+    if cluster is not None:
+        finished = _on_cluster(jobs, cluster)
+    elif min(workers, len(jobs)) > 1:
+        finished = _in_processes(jobs, min(workers, len(jobs)))
+    else:
+        finished = ((i, run_job(job)) for i, job in enumerate(jobs))
     # disable=None: no bar where stderr is not a terminal.
-    with tqdm(total=len(jobs), desc=label, unit='run', disable=None) as bar:
-        if min(workers, len(jobs)) > 1:
-            return _in_processes(jobs, min(workers, len(jobs)), bar)
-        outcomes = []
-        for job in jobs:
-            outcomes.append(run_job(job))
-            bar.update()
-        return outcomes
+    bar = tqdm(finished, desc=label, total=len(jobs), unit='run', disable=None)
+    with closing(finished), bar:
+        outcomes = dict(bar)
+    return [outcomes[i] for i in range(len(jobs))]
 
 
-def _in_processes(jobs: Sequence[Job], workers: int, bar: tqdm[None]) -> list[Outcome]:
+def _in_processes(jobs: Sequence[Job], workers: int) -> Generator[tuple[int, Outcome], None, None]:
+    """Number and outcome of each job, as they come."""
     # The matrices are tiny: threads of the linear algebra would only disturb the other processes.
     # It is read when a worker imports numpy.
     os.environ.update(OMP_NUM_THREADS='1', OPENBLAS_NUM_THREADS='1', MKL_NUM_THREADS='1')
@@ -167,40 +178,21 @@ def _in_processes(jobs: Sequence[Job], workers: int, bar: tqdm[None]) -> list[Ou
         workers, multiprocessing.get_context('spawn'), initializer=_end_with_parent
     )
     try:
-        with _signals_held():
-            futures = [executor.submit(run_job, job) for job in jobs]
-        for _ in as_completed(futures):
-            bar.update()
-        return [future.result() for future in futures]
+        # Workers inherit for good what is blocked: signals are for their parent alone, where
+        # they take effect once the workers have started.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+        try:
+            numbers = {executor.submit(run_job, job): i for i, job in enumerate(jobs)}
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for future in as_completed(numbers):
+            yield numbers[future], future.result()
     except BrokenProcessPool:
         raise BrokenOffError('a worker process was killed: is there enough memory?') from None
     finally:
         for worker in multiprocessing.active_children():
             worker.kill()  # it has nothing to save
         executor.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _signals_held() -> Iterator[None]:
-    """What is started now hears no Ctrl-C, which is for its parent alone, then and later.
-
-    A signal that would cut short a start takes effect afterwards.
-    """
-    held: list[int] = []
-    handlers = {
-        number: signal.signal(number, lambda number, _: held.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    # Processes inherit for good what is blocked while they start.
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-    if held:
-        raise KeyboardInterrupt
 
 
 def _end_with_parent() -> None:
@@ -213,6 +205,75 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _on_cluster(jobs: Sequence[Job], address: str) -> Generator[tuple[int, Outcome], None, None]:
+    """Number and outcome of each job, as they come.
+
+    A run whose worker is lost is given to another one. address: of the scheduler, as tcp://HOST:PORT.
+    Raises InputError where there is no such cluster, or one with other libraries; BrokenOffError
+    where it ends before the runs do, or a run has ended several workers.
+    """
+    try:
+        from distributed import Client, KilledWorker
+        from distributed import as_completed as completed
+    except ImportError:
+        raise InputError(
+            "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
+        ) from None
+    # The error below says in one line what the user needs to know.
+    logging.getLogger('distributed').setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f'--cluster {address}: no scheduler answers ({reason}): start one with '
+            '`dask scheduler --host HOST`, and workers with `dask worker tcp://HOST:8786`'
+        ) from None
+    with client:
+        _check_workers(client, address)
+        try:
+            # Not pure: runs of the same parameters are runs all the same.
+            futures = client.map(run_job, jobs, pure=False)
+            numbers = {future.key: i for i, future in enumerate(futures)}
+            for future, outcome in completed(futures, loop=client.loop, with_results=True):
+                yield numbers[future.key], outcome
+        except KilledWorker:
+            why = 'a run has ended several workers: is there enough memory?'
+            raise BrokenOffError(f'--cluster {address}: {why}') from None
+        except CancelledError:
+            why = 'the scheduler has ended: start it and simulate again'
+            raise BrokenOffError(f'--cluster {address}: {why}') from None
+
+
+def _check_workers(client: Client, address: str) -> None:
+    """Raise InputError unless there are workers, with the libraries of this process."""
+    from distributed import TimeoutError as NoWorkerError
+    here = libraries()
+    try:
+        client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
+        there: dict[str, Any] = client.run(libraries)
+    except NoWorkerError:
+        raise InputError(
+            f'--cluster {address}: no worker within {CLUSTER_ANSWER_S:g} s: start some with '
+            f'`dask worker {address}`'
+        ) from None
+    except ImportError as error:
+        raise InputError(
+            f'--cluster {address}: a worker says {error}: install the same backlash_ros there'
+        ) from None
+    for worker, found in there.items():
+        if found != here:
+            raise InputError(
+                f'--cluster {address}: {worker} has {found}, here is {here}: install the same '
+                'versions, else the last digits differ'
+            )
+
+
+def libraries() -> dict[str, str]:
+    """Versions of the libraries on which the last bit of a result may depend."""
+    return {name: version(name) for name in ('numpy', 'scipy')}
 
 
 def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
@@ -231,10 +292,9 @@ def _statistics(outcomes: Sequence[Outcome], name: str) -> ParameterStatistics:
         np.array([one[f'{prefix}{name}'] for one in outcomes], dtype=float)
         for prefix in OUTCOME_GROUPS
     )
-    error = final - truth
+    error, n = final - truth, len(outcomes)
     settling = np.sort(np.where(np.isnan(settling), inf, settling))
     known = bool(np.all(np.isfinite(std) & (std > 0.0)))
-    n = len(outcomes)
     # Quantiles of chi squared with n degrees of freedom: n times the mean has that distribution.
     low, high = chdtri(n, [0.975, 0.025]) / n
     relative = error / np.where(truth == 0.0, nan, truth)

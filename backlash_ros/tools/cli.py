@@ -6,17 +6,15 @@ import argparse
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from types import FrameType, TracebackType
-from typing import Any
+from types import FrameType
+from typing import Any, NamedTuple
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
-DEFAULT_DURATION_S = 10.0  # of a run
 NOTHING = '–'  # in a table, where there is no number
 
 
@@ -28,8 +26,7 @@ class BrokenOffError(RuntimeError):
     """A run could not go on, although everything given was valid: one line says why."""
 
 
-@dataclass(frozen=True)
-class Span:
+class Span(NamedTuple):
     """A part of a run, in seconds from its first sample: from_s <= t < to_s."""
 
     from_s: float = 0.0
@@ -69,8 +66,7 @@ def add_duration_option(parser: argparse.ArgumentParser, further: str = '') -> N
     """Add --duration, for `number_of_samples`; further: a sentence on other values."""
     parser.add_argument(
         '--duration', type=float, metavar='SECONDS',
-        help=f'length of a run (default: the parameter samples, or {DEFAULT_DURATION_S:g} s)'
-             + further,
+        help=f'length of a run (default: the parameter samples, or 10 s){further}',
     )
 
 
@@ -96,8 +92,7 @@ def number_of_samples(parameters: Parameters, duration: float | None) -> int:
     """
     if duration is None and parameters.samples > 0:
         return parameters.samples
-    if duration is None:
-        duration = DEFAULT_DURATION_S
+    duration = 10.0 if duration is None else duration
     if not 0.0 < duration < inf:
         raise InputError(f'--duration={duration!r} must be finite and > 0')
     period = parameters.sample_period
@@ -118,20 +113,17 @@ def run_tool(name: str, tool: Callable[[], None]) -> int:
     handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         tool()
+        return DONE
     except (ParameterError, InputError) as error:
-        return _fail(name, str(error), BAD_INPUT)
+        message, code = str(error), BAD_INPUT
     except SystemExit as ended:
         return int(ended.code or DONE)  # the parser of the options has said why
     except KeyboardInterrupt:
-        return _fail(name, 'interrupted', FAILED)
+        message, code = 'interrupted', FAILED
     except (BrokenOffError, OSError) as error:
-        return _fail(name, str(error), FAILED)
+        message, code = str(error), FAILED
     finally:
         signal.signal(signal.SIGTERM, handler)
-    return DONE
-
-
-def _fail(name: str, message: str, code: int) -> int:
     print(f'{name}: {message}', file=sys.stderr)
     return code
 
@@ -146,12 +138,9 @@ def print_warnings(name: str, parameters: Parameters) -> None:
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Columns aligned: the first to the left, all others to the right."""
-    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     return '\n'.join(
-        '  '.join(
-            cell.rjust(width) if i else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
+        '  '.join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip()
         for row in (header, *rows)
     )
 
@@ -178,16 +167,9 @@ class StopRequests:
                 self._before[caught] = signal.signal(caught, self._note)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for caught, handler in self._before.items():
             signal.signal(caught, handler)
-
-    def insist(self) -> bool:
-        """Whether there was a second request."""
-        return self.count > 1
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self.count += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
@@ -29,17 +29,16 @@ from backlash_ros.tools.runs.figure_data import ErrorCurves, control_error, movi
 from backlash_ros.tools.runs.files import result_directory
 from backlash_ros.tools.runs.read_run import run_loop
 
-COMPARISON_WINDOW_S = 0.5  # over which the error of a curve is averaged
-# No gap is wider than this one by definition (2.1), which is as good as none.
-GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 COMPARISON_HEADER = (
     'loop', 'control error', 'tracking error', 'backlash penalty', 'total variation of v',
     'crossings per reversal',
 )
+COMPARISON_WINDOW_S = 0.5  # over which the error of a curve is averaged
+# No gap is wider than this one by definition (2.1), which is as good as none.
+GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
 
-@dataclass(frozen=True)
-class Contender:
+class Contender(NamedTuple):
     """A loop of the comparison: its name and what sets it apart.
 
     follows: whether y is meant to follow y_m; otherwise y_m sets u_d.
@@ -47,16 +46,15 @@ class Contender:
 
     name: str
     changes: Mapping[str, object]
-    follows: bool
+    follows: bool = True
 
 
-@dataclass(frozen=True)
-class Result:
+class Result(NamedTuple):
     """What became of a contender.
 
     merits: what stands in the table behind the name, None where it does not apply: control error
     [unit of u], relative tracking error, the part of it that the backlash costs, way of v [unit of
-    v], crossings of the gap per reversal. curves: of its errors. note: why the run broke off.
+    v], crossings of the gap per reversal. note: why the run broke off.
     """
 
     contender: Contender
@@ -64,32 +62,37 @@ class Result:
     curves: ErrorCurves | None = None
     note: str = ''
 
+    @property
+    def row(self) -> tuple[str, ...]:
+        """The line of the table."""
+        if self.note:
+            return (self.contender.name, 'broke off', *[NOTHING] * (len(COMPARISON_HEADER) - 2))
+        return (self.contender.name, *(number(merit, 3) for merit in self.merits))
+
 
 def contenders(scenario: Parameters) -> list[Contender]:
     """The loops to compare, from the paper's to the one without a backlash."""
     m, c_r, c_l = (getattr(scenario.backlash, name) for name in ('m', 'c_r', 'c_l'))
-    paper = {'structure': 'proportional'}
-    tracks = {'structure': 'tracking'}
+    tracks = {'structure': 'tracking', 'fixed.doubt': 0.5}
     return [
         *(
-            Contender(f'{law}, u_d = y_m + f v', {**paper, 'estimator.law': law}, False)
+            Contender(f'{law}, u_d = y_m + f v',
+                      {'structure': 'proportional', 'estimator.law': law}, follows=False)
             for law in ('printed', 'lms', 'moving_horizon')
         ),
         Contender('gradient, four blocks', {
             'structure': 'pole_placement', 'estimator.law': 'gradient',
             # With less, y, which they feed back unfiltered, has to be less noisy.
             'tracking.input_weight': 1.0,
-        }, True),
-        Contender('moving_horizon, tracking', {**tracks, 'estimator.law': 'moving_horizon'}, True),
-        Contender('wrong constants, tracking', {
-            **tracks, **_fixed(m, 1.3 * c_r, 1.3 * c_l), 'fixed.doubt': 0.5,
-        }, True),
-        Contender('no compensation, tracking', {
-            **tracks, **_fixed(m, 0.0, 0.0), 'fixed.doubt': 0.5,
-        }, True),
+        }),
+        Contender('moving_horizon, tracking', {
+            'structure': 'tracking', 'estimator.law': 'moving_horizon',
+        }),
+        Contender('wrong constants, tracking', {**tracks, **_fixed(m, 1.3 * c_r, 1.3 * c_l)}),
+        Contender('no compensation, tracking', {**tracks, **_fixed(m, 0.0, 0.0)}),
         Contender('no backlash, tracking', {
-            **tracks, **_fixed(m, 0.0, 0.0), **GAPLESS,
-        }, True),
+            'structure': 'tracking', **_fixed(m, 0.0, 0.0), **GAPLESS,
+        }),
     ]
 
 
@@ -106,79 +109,53 @@ def compare(scenario: Parameters, samples: int) -> list[Result]:
     Where y follows y_m, y_m is scaled by |G| at its frequency, so that every loop asks about the
     same motion of G.
     """
-    results = []
-    for contender in tqdm(contenders(scenario), desc='compare', unit='loop', disable=None):
-        results.append(_measure(contender, _parameters(contender, scenario), samples))
-    return results
+    bar = tqdm(contenders(scenario), desc='compare', unit='loop', disable=None)
+    return [_measure(contender, scenario, samples) for contender in bar]
 
 
-def _parameters(contender: Contender, scenario: Parameters) -> Parameters:
-    changed = scenario.replaced(contender.changes)
-    if changed['estimator.law'] != scenario['estimator.law']:
-        changed = changed.replaced({'estimates.load': False})  # they belong to another law
-    if not contender.follows:
-        return changed
-    z = np.exp(1j * scenario.frequency * scenario.sample_period)
-    gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
-    return changed.replaced({
-        name: gain * getattr(scenario, name) for name in ('amplitude', 'bias')
-    })
-
-
-def _measure(contender: Contender, parameters: Parameters, samples: int) -> Result:
-    loop = build_closed_loop(parameters)
+def _measure(contender: Contender, scenario: Parameters, samples: int) -> Result:
+    p = scenario.replaced(contender.changes)
+    if p.estimator.law != scenario.estimator.law:
+        p = p.replaced({'estimates.load': False})  # they belong to another law
+    if contender.follows:
+        z = np.exp(1j * scenario.frequency * scenario.sample_period)
+        gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
+        p = p.replaced({'amplitude': gain * scenario.amplitude, 'bias': gain * scenario.bias})
+    loop = build_closed_loop(p)
     delay = loop.controller.structure.delay
     try:
         run = run_loop(loop, samples)
     except BrokenOffError as broken:
         return Result(contender, note=str(broken))
-    since = 0.2 * run.samples * run.sample_period
+    t, since = run.column('t'), 0.2 * run.samples * run.sample_period
     window = max(round(COMPARISON_WINDOW_S / run.sample_period), 1)
     error = penalty = tracking = None
     if contender.follows:
         tracking = moving_rms(run.column('y') - delayed_reference(run, delay), window)
-        gapless = run_loop(build_closed_loop(parameters.replaced({
-            **GAPLESS, **_fixed(parameters.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
+        gapless = run_loop(build_closed_loop(p.replaced({
+            **GAPLESS, **_fixed(p.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
         })), samples)
         error, best = (delayed_tracking_error_rms(each, delay, since) for each in (run, gapless))
         penalty = None if error is None or best is None else error - best
-    # The curve of the loop without backlash comes to lie on that of the one that has learned it.
-    width = 3.4 if contender.follows and 'moving_horizon' in contender.name else 1.7
     return Result(contender, (
-        control_error_rms(run), error, penalty,
-        total_variation(run.column('v')[run.column('t') >= since]),
+        control_error_rms(run), error, penalty, total_variation(run.column('v')[t >= since]),
         gap_crossings_per_reversal(run, since),
-    ), ErrorCurves(
-        contender.name, run.column('t'), moving_rms(control_error(run), window), tracking, width,
-    ))
+    ), ErrorCurves(contender.name, t, moving_rms(control_error(run), window), tracking))
 
 
-def row(result: Result) -> tuple[str, ...]:
-    """The line of the table for a result."""
-    if result.note:
-        return (result.contender.name, 'broke off', *[NOTHING] * (len(COMPARISON_HEADER) - 2))
-    return (result.contender.name, *(number(merit, 3) for merit in result.merits))
-
-
-def comparison_document(
-    scenario: Parameters, results: Sequence[Result], figure: str,
-) -> str:
+def comparison_document(scenario: Parameters, results: Sequence[Result], figure: str) -> str:
     """docs/results/comparison.md as text."""
-    lines = [
+    backlash = scenario.backlash
+    return '\n'.join([
         '# Comparison of laws and structures', '',
         f'![Control error and tracking error of every loop over time]({figure})', '',
         '| ' + ' | '.join(COMPARISON_HEADER) + ' |', '|---' * len(COMPARISON_HEADER) + '|',
-        *('| ' + ' | '.join(row(result)) + ' |' for result in results), '',
-    ]
-    lines += [f'- {result.contender.name}: {result.note}.' for result in results if result.note]
-    noise = scenario.output_noise_std
-    lines += [
-        f'Scenario: the plant of the configuration, m = {scenario.backlash.m:g}, '
-        f'c_r = {scenario.backlash.c_r:g}, '
-        f'c_l = {scenario.backlash.c_l:g}, '
-        f'{scenario.waveform} at {scenario.frequency:g} rad/s, '
-        f'noise on y with standard deviation {noise:g}. Written by `compare --out docs/results`; '
-        'do not edit.',
+        *('| ' + ' | '.join(result.row) + ' |' for result in results), '',
+        *(f'- {result.contender.name}: {result.note}.' for result in results if result.note),
+        f'Scenario: the plant of the configuration, m = {backlash.m:g}, c_r = {backlash.c_r:g}, '
+        f'c_l = {backlash.c_l:g}, {scenario.waveform} at {scenario.frequency:g} rad/s, noise on y '
+        f'with standard deviation {scenario.output_noise_std:g}. Written by `compare --out '
+        'docs/results`; do not edit.',
         '',
         "- In the paper's structure y_m sets u_d, elsewhere y follows y_m scaled by |G| at its "
         'frequency: every loop asks for about the same motion.',
@@ -191,13 +168,7 @@ def comparison_document(
         '- No compensation and wrong constants (the crossings 30 % too large) know the slope, '
         'and have an observer that allows for a disturbance of u.',
         '',
-    ]
-    return '\n'.join(lines)
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `compare`."""
-    return cli.run_tool('compare', lambda: _compare(args))
+    ])
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -211,13 +182,11 @@ def make_parser() -> argparse.ArgumentParser:
 
 def _compare(args: Sequence[str] | None) -> None:
     options = make_parser().parse_args(args)
-    scenario = effective_parameters(
-        options.config, options.settings, options.seed, options.axis
-    )
+    scenario = effective_parameters(options.config, options.settings, options.seed, options.axis)
     results = compare(scenario, cli.number_of_samples(scenario, options.duration))
     # Drawing libraries take a second to load, which bad input should not cost.
     from backlash_ros.tools.figures import draw_comparison, png
-    print(cli.format_table(COMPARISON_HEADER, [row(result) for result in results]))
+    print(cli.format_table(COMPARISON_HEADER, [result.row for result in results]))
     out = result_directory(options.out)
     figure, document = 'images/comparison.png', out / 'comparison.md'
     (out / figure).parent.mkdir(parents=True, exist_ok=True)
@@ -225,6 +194,11 @@ def _compare(args: Sequence[str] | None) -> None:
     write_atomically(out / figure, png(draw_comparison(curves, COMPARISON_WINDOW_S)))
     write_atomically(document, comparison_document(scenario, results, figure))
     print(f'document: {document}')
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `compare`."""
+    return cli.run_tool('compare', lambda: _compare(args))
 
 
 if __name__ == '__main__':

@@ -7,10 +7,10 @@ A section /AXIS/NODE holds values of one node of one axis; ** stands for all axe
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -34,8 +34,7 @@ ANY = '**'
 EVERY_NODE = f'/{ANY}'
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """Checked values under one name of a file.
 
     axis: ANY for a wildcard, empty for the node without a namespace. node: ANY for all nodes.
@@ -46,70 +45,12 @@ class Section:
     node: str
     values: Mapping[str, Value]
 
-    @property
-    def rank(self) -> tuple[bool, bool]:
-        """The larger one wins: the name of a node goes before the namespace of an axis."""
-        return self.node != ANY, self.axis not in (ANY, '')
-
     def is_for(self, *axes: str) -> bool:
         """Whether it belongs to one of the axes, or to the whole run."""
         return self.axis in (ANY, *axes) or (self.node == BRINGUP and not self.axis)
 
 
-@dataclass(frozen=True)
-class ParameterFile:
-    """A file that was read, its names and values checked."""
-
-    path: Path
-    sections: tuple[Section, ...]
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """The axes that the file lists; raises InputError for two different lists."""
-        return self._names('axes')
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The joints that the file lists; raises InputError for two different lists."""
-        return self._names(JOINTS)
-
-    def check_axes(self, axes: Sequence[str]) -> None:
-        """Raise InputError for a section that belongs to none of the axes of the run."""
-        for section in self.sections:
-            if section.is_for(*axes) or not (section.axis or axes):
-                continue
-            rule = f': {no_such_axis(section.axis, axes)}' if section.axis else (
-                f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
-                f'/{axes[0]}/{section.node} for one'
-            )
-            raise InputError(f'{self.path}: section {section.name!r}{rule}')
-
-    def values(self, axis: str) -> dict[str, Value]:
-        """Values for an axis by flat name, empty for a run without axes; raises InputError."""
-        return self._merged([section for section in self.sections if section.is_for(axis)])
-
-    def _names(self, parameter: str) -> tuple[str, ...]:
-        listing = [section for section in self.sections if parameter in section.values]
-        value = self._merged(listing).get(parameter, ())
-        assert isinstance(value, tuple)
-        return tuple(map(str, value))
-
-    def _merged(self, sections: Sequence[Section]) -> dict[str, Value]:
-        merged: dict[str, Value] = {}
-        ranks: dict[str, tuple[bool, bool]] = {}
-        for section in sorted(sections, key=lambda section: section.rank, reverse=True):
-            for name, value in section.values.items():
-                if ranks.setdefault(name, section.rank) != section.rank:
-                    continue
-                if merged.setdefault(name, value) != value:
-                    raise InputError(
-                        f'{self.path}: {name} has two values, {merged[name]!r} and {value!r}'
-                    )
-        return merged
-
-
-@dataclass(frozen=True)
-class Setting:
+class Setting(NamedTuple):
     """One --set: axis is empty for all axes."""
 
     axis: str
@@ -121,10 +62,16 @@ class Setting:
 class Configuration:
     """A file with what the command line changes in it; axes: empty for a run without axes."""
 
-    file: ParameterFile
-    settings: tuple[Setting, ...]
+    path: Path
+    sections: Sequence[Section]
+    settings: Sequence[Setting]
     seed: int | None
     axes: tuple[str, ...]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The joints of one controller, empty for a file without."""
+        return () if self.axes else _listed(self.path, self.sections, JOINTS)
 
     def parameters(self, axis: str = '') -> Parameters:
         """Return the complete set of one loop: defaults, the file, then --set, then --seed.
@@ -134,15 +81,14 @@ class Configuration:
         joints = self.joints
         if joints and axis not in joints:
             raise InputError(
-                f'{self.file.path}: holds the joints {", ".join(joints)} of one controller: choose '
+                f'{self.path}: holds the joints {", ".join(joints)} of one controller: choose '
                 f'one of them, like --axis {joints[0]}, or start `controller` with the file itself'
             )
         return self.of_controller('' if joints else axis).of_joint(axis)
 
     def of_controller(self, axis: str = '') -> Parameters:
         """Return the same for one controller, with what each of its joints has of its own."""
-        check_axis(self.file, axis, self.axes)
-        values: dict[str, object] = dict(self.file.values(axis))
+        values: dict[str, object] = dict(self.given(axis))
         for meant in ('', axis):
             values |= {s.name: s.value for s in self.settings if s.axis == meant}
         values |= {f'{s.axis}.{s.name}': s.value for s in self.settings if s.axis in self.joints}
@@ -151,29 +97,16 @@ class Configuration:
         values.pop('axes', None)
         return Parameters(values)
 
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """The joints of one controller, empty for a file without."""
-        return () if self.axes else self.file.joints
-
-
-def check_axis(file: ParameterFile, axis: str, axes: Sequence[str]) -> None:
-    """Raise InputError unless the axis is one of the axes, or there are none."""
-    if axes and not axis:
-        raise InputError(
-            f'{file.path}: holds the axes {", ".join(axes)} and only one can be used here: '
-            f'choose it, like --axis {axes[0]}'
-        )
-    if axis and axis not in axes:
-        raise InputError(no_such_axis(axis, axes))
-
-
-def no_such_axis(axis: str, axes: Sequence[str]) -> str:
-    """What is wrong with the name of an axis, and the nearest one that exists."""
-    if not axes:
-        return f'there is no axis {axis!r}: list it in the parameter axes under /{BRINGUP}'
-    near = difflib.get_close_matches(axis, axes, n=1, cutoff=0.0)[0]
-    return f'there is no axis {axis!r} among {", ".join(axes)}: did you mean {near}?'
+    def given(self, axis: str = '') -> dict[str, Value]:
+        """Values of the file for an axis, by flat name; raises InputError for none of them."""
+        if self.axes and not axis:
+            raise InputError(
+                f'{self.path}: holds the axes {", ".join(self.axes)} and only one can be used '
+                f'here: choose it, like --axis {self.axes[0]}'
+            )
+        if axis and axis not in self.axes:
+            raise InputError(_no_such_axis(axis, self.axes))
+        return _merged(self.path, [section for section in self.sections if section.is_for(axis)])
 
 
 def read_configuration(
@@ -183,19 +116,26 @@ def read_configuration(
 
     config: a path, or the name of a shipped file; None for the paper's example.
     """
-    file = read_parameter_file(find_config(config))
-    parsed = tuple(parse_setting(setting) for setting in settings)
-    axes = file.axes
-    for setting in parsed:
-        if setting.name == 'axes':
-            axes = Parameters({'axes': setting.value}).axes
-    named = axes or file.joints
-    for setting in parsed:
-        if setting.axis and setting.axis not in named:
-            raise InputError(f'--set {setting.axis}/{setting.name}: '
-                             + no_such_axis(setting.axis, named))
-    file.check_axes(axes)
-    return Configuration(file, parsed, seed, axes)
+    path = find_config(config)
+    sections = _read_sections(path)
+    parsed = [parse_setting(setting) for setting in settings]
+    axes, joints = (_listed(path, sections, name) for name in ('axes', JOINTS))
+    for _, name, value in parsed:
+        if name == 'axes':
+            axes = Parameters({'axes': value}).axes
+    for axis, name, _ in parsed:
+        if axis and axis not in (axes or joints):
+            raise InputError(f'--set {axis}/{name}: {_no_such_axis(axis, axes or joints)}')
+    for section in sections:
+        if section.axis and not section.is_for(*axes):
+            rule = f': {_no_such_axis(section.axis, axes)}'
+        elif axes and not section.is_for(*axes):
+            rule = (f' belongs to no axis: write /{ANY}/{section.node} for all axes or '
+                    f'/{axes[0]}/{section.node} for one')
+        else:
+            continue
+        raise InputError(f'{path}: section {section.name!r}{rule}')
+    return Configuration(path, sections, parsed, seed, axes)
 
 
 def effective_parameters(
@@ -203,16 +143,6 @@ def effective_parameters(
 ) -> Parameters:
     """Return the complete set for one axis, as `Configuration.parameters` does."""
     return read_configuration(config, settings, seed).parameters(axis)
-
-
-def load_config(path: Path) -> dict[str, Value]:
-    """Return the values that a file without axes holds, by flat name.
-
-    Raises InputError and ParameterError.
-    """
-    file = read_parameter_file(path)
-    file.check_axes(())
-    return file.values('')
 
 
 def find_config(config: Path | None) -> Path:
@@ -241,25 +171,34 @@ def parse_setting(text: str) -> Setting:
     return Setting(axis, name, check_value(BY_NAME[name], value))
 
 
-def read_parameter_file(path: Path) -> ParameterFile:
-    """Read and check a file.
+def _no_such_axis(axis: str, axes: Sequence[str]) -> str:
+    """What is wrong with the name of an axis, and the nearest one that exists."""
+    if not axes:
+        return f'there is no axis {axis!r}: list it in the parameter axes under /{BRINGUP}'
+    near = difflib.get_close_matches(axis, axes, n=1, cutoff=0.0)[0]
+    return f'there is no axis {axis!r} among {", ".join(axes)}: did you mean {near}?'
 
-    Raises InputError for a file that cannot be read, ParameterError for a name or value that
-    breaks a rule; both name the file.
-    """
-    try:
-        values = {str(name): _values(content) for name, content in _read_yaml(path).items()}
-        joints: list[str] = []
-        for of_section in values.values():
-            # What is wrong with the values of a joint, all values together tell.
-            joints += Parameters({JOINTS: of_section.get(JOINTS, ())}).joints
-        return ParameterFile(path, tuple(
-            _read_section(name, of_section, joints) for name, of_section in values.items()
-        ))
-    except (ParameterError, InputError) as error:
-        if not str(error).startswith(f'{path}:'):
-            error.args = (f'{path}: {error}',)
-        raise
+
+def _listed(path: Path, sections: Sequence[Section], parameter: str) -> tuple[str, ...]:
+    """The axes or joints that a file lists; raises InputError for two different lists."""
+    listing = [section for section in sections if parameter in section.values]
+    value = _merged(path, listing).get(parameter, ())
+    return tuple(map(str, value)) if isinstance(value, tuple) else ()
+
+
+def _merged(path: Path, sections: Sequence[Section]) -> dict[str, Value]:
+    """The values of sections, of each name those of the most specific; raises InputError."""
+    merged: dict[str, Value] = {}
+    ranks: dict[str, tuple[bool, bool]] = {}
+    # A named node goes before a named axis.
+    ranked = [((s.node != ANY, s.axis not in (ANY, '')), s.values) for s in sections]
+    for rank, values in sorted(ranked, key=lambda each: each[0], reverse=True):
+        for name, value in values.items():
+            if ranks.setdefault(name, rank) == rank and merged.setdefault(name, value) != value:
+                raise InputError(
+                    f'{path}: {name} has two values, {merged[name]!r} and {value!r}'
+                )
+    return merged
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -275,7 +214,12 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
-def _read_yaml(path: Path) -> dict[object, object]:
+def _read_sections(path: Path) -> list[Section]:
+    """Read and check a file.
+
+    Raises InputError for a file that cannot be read, ParameterError for a name or value that
+    breaks a rule; both name the file.
+    """
     try:
         document = yaml.load(path.read_text(encoding='utf-8'), Loader=_StrictLoader)
     except OSError as error:
@@ -287,39 +231,52 @@ def _read_yaml(path: Path) -> dict[object, object]:
         raise InputError(f'{path}:{line} {error.problem}') from None
     except yaml.YAMLError as error:
         raise InputError(f'{path}: is not YAML: {" ".join(str(error).split())}') from None
-    if not isinstance(document, dict) or not document:
-        raise InputError(f'{path}: must hold "/**: {{ros__parameters: {{...}}}}"')
-    return document
+    try:
+        if not isinstance(document, dict) or not document:
+            raise InputError('must hold "/**: {ros__parameters: {...}}"')
+        sections = {str(name): _section_values(content) for name, content in document.items()}
+        # What is wrong with the values of a joint, all values together tell.
+        joints = [joint for values in sections.values()
+                  for joint in Parameters({JOINTS: values.get(JOINTS, ())}).joints]
+        return [_checked(name, values, joints) for name, values in sections.items()]
+    except (ParameterError, InputError) as error:
+        error.args = (f'{path}: {error}',)
+        raise
 
 
-def _values(content: object) -> dict[str, object]:
+def _section_values(content: object) -> dict[str, object]:
     """What a section holds, by flat name."""
     if not isinstance(content, dict) or set(content) != {'ros__parameters'}:
         raise InputError('each section must hold ros__parameters and nothing else')
     if not isinstance(content['ros__parameters'], dict):
         raise InputError('ros__parameters must hold "name: value" lines')
-    return dict(_flatten(content['ros__parameters']))
+    return dict(_flat(content['ros__parameters']))
 
 
-def _read_section(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
+def _flat(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f'{prefix}{key}.')
+        else:
+            yield f'{prefix}{key}', value
+
+
+def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
+    """A section of a file; raises InputError for its name, ParameterError for what it holds."""
     axis, node = _address(name)
     shared, own = split(values, joints)
     check_names(shared, joints)
     for joint, changes in own.items():
         check_names([f'{joint}.{key}' for key in changes if key not in BY_NAME], joints)
-    checked = {key: check_value(BY_NAME[key], value) for key, value in shared.items()}
-    for joint, changes in own.items():
-        checked |= {
-            f'{joint}.{key}': check_value(BY_NAME[key], value) for key, value in changes.items()
-        }
-    for key, value in checked.items():
+    checked = {}
+    for key, value in values.items():
         entry = entry_of(key)
         assert entry is not None
-        users = entry.used_by
-        if node not in (ANY, *users):
+        checked[key] = check_value(entry, value)
+        if node not in (ANY, *entry.used_by):
             raise ParameterError(
-                key, value, f'is not a parameter of {node}',
-                f'put it under {EVERY_NODE} or /{users[0]}',
+                key, checked[key], f'is not a parameter of {node}',
+                f'put it under {EVERY_NODE} or /{entry.used_by[0]}',
             )
         if key == 'axes' and axis not in (ANY, ''):
             raise ParameterError(key, value, 'is for the whole run', f'put it under /{BRINGUP}')
@@ -331,7 +288,7 @@ def _address(name: str) -> tuple[str, str]:
     parts = name.removeprefix('/').split('/')
     if name == EVERY_NODE:
         return ANY, ANY
-    axis, node = ('', parts[0]) if len(parts) == 1 else (parts[0], parts[-1])
+    axis, node = parts[0] if parts[1:] else '', parts[-1]
     if len(parts) <= 2 and (node in NODES or (node == ANY and axis not in ('', ANY))):
         return axis, node
     known = [EVERY_NODE, *(f'/{node}' for node in NODES)]
@@ -342,15 +299,6 @@ def _address(name: str) -> tuple[str, str]:
     raise InputError(f'section {name!r} is none of {", ".join(known)}{cure}')
 
 
-def _flatten(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
-    for key, value in tree.items():
-        name = f'{prefix}{key}'
-        if isinstance(value, dict):
-            yield from _flatten(value, f'{name}.')
-        else:
-            yield name, value
-
-
 class _Dumper(yaml.SafeDumper):
     """SafeDumper that writes each list on one line, and in full: rcl knows no aliases."""
 
@@ -358,12 +306,9 @@ class _Dumper(yaml.SafeDumper):
         return True
 
 
-def _on_one_line(dumper: yaml.SafeDumper, values: Sequence[Any]) -> yaml.Node:
-    return dumper.represent_sequence('tag:yaml.org,2002:seq', values, flow_style=True)
-
-
 for _sequence in (list, tuple):
-    _Dumper.add_representer(_sequence, _on_one_line)
+    _Dumper.add_representer(_sequence, lambda dumper, values: dumper.represent_sequence(
+        'tag:yaml.org,2002:seq', values, flow_style=True))
 
 
 def write_config(parameters: Parameters, path: Path) -> None:
@@ -382,17 +327,17 @@ def config_text(parameters: Parameters) -> str:
     of_all = _tree(parameters, common)
     for joint in parameters.joints:
         of_joint = parameters.of_joint(joint)
-        of_all[joint] = _tree(of_joint, [
+        of_all[joint] = _tree(of_joint, (
             p for p in common if CONTROLLER in p.used_by and not p.per_node
             and of_joint[p.name] != parameters[p.name]
-        ])
+        ))
     document = {EVERY_NODE: {'ros__parameters': of_all}}
     if own:
         document[f'/{BRINGUP}'] = {'ros__parameters': _tree(parameters, own)}
     return yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=1000)
 
 
-def _tree(parameters: Parameters, written: Sequence[Parameter]) -> dict[str, Any]:
+def _tree(parameters: Parameters, written: Iterable[Parameter]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for parameter in written:
         *groups, leaf = parameter.name.split('.')

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from textwrap import fill
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from backlash_ros.core.parameters.parameter import Value
+from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.simulation.run_record import RunRecord
@@ -23,9 +23,7 @@ from backlash_ros.tools.runs.figure_data import (
     FollowedReference,
     LawTrace,
     Part,
-    control_error,
     estimated_loop,
-    frozen,
 )
 from backlash_ros.topics import BACKLASH
 
@@ -71,12 +69,8 @@ def png(figure: Figure) -> bytes:
 
 def label(axes: Axes, title: str = '', y: str = '', x: str = '') -> None:
     """Set the title and the labels with units that are given."""
-    if title:
-        axes.set_title(title)
-    if x:
-        axes.set_xlabel(x)
-    if y:
-        axes.set_ylabel(y)
+    axes.set(**{key: text for key, text in (('title', title), ('ylabel', y), ('xlabel', x))
+                if text})
 
 
 def legend_above(axes: Axes) -> None:
@@ -87,10 +81,10 @@ def legend_above(axes: Axes) -> None:
     )
 
 
-def legend_below(figure: Figure, axes: Axes, title: str = '') -> None:
+def legend_below(figure: Figure, axes: Axes, title: str = '', columns: int = 4) -> None:
     """Put the legend of axes below all axes of the figure."""
     handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, title=title or None, loc='outside lower center', ncol=4)
+    figure.legend(handles, labels, title=title or None, loc='outside lower center', ncol=columns)
 
 
 def limit_decades(axes: Axes, lowest: float, highest: float, decades: float = 8.0) -> None:
@@ -112,6 +106,10 @@ def curve(
 def zero_line(axes: Axes) -> None:
     """Draw a thin line at y = 0."""
     axes.axhline(0.0, color='#444444', linewidth=0.8)
+
+
+def _tolerance_line(axes: Axes) -> None:
+    axes.axhline(100.0 * SETTLING_TOLERANCE, color='#444444', linewidth=0.9, linestyle=':')
 
 
 def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str = '') -> None:
@@ -141,149 +139,152 @@ def limits(values: Sequence[Array], margin: float) -> tuple[float, float]:
     return low - room, high + room
 
 
-def time_grid(figure: Figure, rows: int, parts: Sequence[Part], **others: Any) -> NDArray[Any]:
-    """Axes, shape (rows, len(parts)): each column shows one part of the run."""
-    grid = figure.subplots(rows, len(parts), sharex='col', squeeze=False, **others)
-    for column, part in enumerate(parts):
-        label(grid[0, column], part.name)
-        label(grid[-1, column], x=TIME_LABEL)
-    return np.asarray(grid)
+class Line(NamedTuple):
+    """One signal of a panel; values and t have shape (N,)."""
+
+    t: Array
+    values: Array
+    colour: str
+    name: str = ''
+    style: str = '-'
+    width: float = 1.3
+    alpha: float = 1.0
+
+
+def draw_panels(
+    height: float, rows: Mapping[str, Sequence[Line]], parts: Sequence[Part],
+    frozen_in: RunRecord | None = None, **others: Any,
+) -> tuple[Figure, NDArray[Any]]:
+    """A figure whose columns show parts of a run, and its axes, shape (rows, parts).
+
+    rows: lines by what stands at the vertical axis. frozen_in: the run whose times without learning
+    are shaded.
+    """
+    figure = new_figure(height)
+    grid = np.asarray(figure.subplots(len(rows), len(parts), sharex='col', squeeze=False, **others))
+    for column, part in zip(grid.T, parts, strict=True):
+        label(column[0], part.name)
+        label(column[-1], x=TIME_LABEL)
+        for axes, lines in zip(column, rows.values(), strict=True):
+            for line in lines:
+                curve(axes, line.t[part.rows], line.values[part.rows], *line[2:])
+        if frozen_in is not None:
+            frozen = frozen_in.column('status')[part.rows] >= float(Status.NOT_EXCITED)
+            for axes in column:
+                shade(axes, frozen_in.column('t')[part.rows], frozen, 'frozen')
+    for axes, name in zip(grid[:, 0], rows, strict=True):
+        label(axes, y=name)
+    return figure, grid
 
 
 def draw_parameter_errors(
     run: RunRecord, start: Part, settling: Mapping[str, float | None],
 ) -> Figure:
     """Errors of the estimates over time, as Figure 4 of the paper, and their relative size."""
-    figure = new_figure(7.4)
-    parts = (start, WHOLE_RUN)
-    grid = time_grid(figure, 2, parts, sharey='row')
-    for column, part in enumerate(parts):
-        t = run.column('t')[part.rows]
-        absolute, relative = grid[:, column]
-        errors, percents = [], []
-        for name in BACKLASH:
-            truth, std = run.column(f'true_{name}'), run.column(f'std_{name}')[part.rows]
-            errors.append(truth - run.column(name))
-            unit = BACKLASH_UNITS[name].removeprefix('unit of ')
-            error = errors[-1][part.rows]
-            curve(absolute, t, error, HUES[name], f'${name} - {HATS[name]}$ [{unit}]',
-                  LINE_STYLES[name], 1.8)
-            band(absolute, t, error - 2 * std, error + 2 * std, HUES[name])
-            # Nothing is a percentage of zero, and the logarithm has no zero.
-            size = np.abs(errors[-1] / np.where(truth == 0.0, np.nan, truth))
-            percents.append(np.maximum(100.0 * size, 1e-300))
-            curve(relative, t, percents[-1][part.rows], HUES[name], '', LINE_STYLES[name], 1.5)
+    t, parts = run.column('t'), (start, WHOLE_RUN)
+    errors, percents = [], []
+    for name in BACKLASH:
+        truth = run.column(f'true_{name}')
+        unit = BACKLASH_UNITS[name].removeprefix('unit of ')
+        look = HUES[name], f'${name} - {HATS[name]}$ [{unit}]', LINE_STYLES[name], 1.8
+        errors.append(Line(t, truth - run.column(name), *look))
+        # Nothing is a percentage of zero, and the logarithm has no zero.
+        size = np.abs(errors[-1].values / np.where(truth == 0.0, np.nan, truth))
+        percents.append(Line(t, np.maximum(100.0 * size, 1e-300), look[0], '', look[2], 1.5))
+    figure, grid = draw_panels(7.4, {
+        'true minus estimated': errors, 'size of the error [% of the true value]': percents,
+    }, parts, run, sharey='row')
+    for (absolute, relative), part in zip(grid.T, parts, strict=True):
+        for name, error in zip(BACKLASH, errors, strict=True):
+            std = 2 * run.column(f'std_{name}')
+            band(absolute, t[part.rows], (error.values - std)[part.rows],
+                 (error.values + std)[part.rows], HUES[name])
             settled = settling[name]
-            if settled is not None and settled <= t[-1]:
+            if settled is not None and settled <= t[part.rows][-1]:
                 relative.plot(settled, 100.0 * SETTLING_TOLERANCE, 'o', color=HUES[name],
                               markersize=7, markeredgecolor='white', zorder=5)
-        shade(absolute, t, frozen(run)[part.rows], 'frozen')
         zero_line(absolute)
-        absolute.set_ylim(*limits(errors, margin=0.08))
+        absolute.set_ylim(*limits([error.values for error in errors], margin=0.08))
         _tolerance_line(relative)
-        known = np.concatenate([values[np.isfinite(values)] for values in percents])
+        known = np.concatenate([line.values[part.rows] for line in percents])
+        known = known[np.isfinite(known)]
         if known.size:
             limit_decades(relative, min(float(known.min()), 0.5), max(float(known.max()), 2.0))
-    label(grid[0, 0], y='true minus estimated')
-    label(grid[1, 0], y='size of the error [% of the true value]')
     legend_below(figure, grid[0, 1])
     return figure
 
 
-def _tolerance_line(axes: Axes) -> None:
-    axes.axhline(100.0 * SETTLING_TOLERANCE, color='#444444', linewidth=0.9, linestyle=':')
-
-
 def draw_estimates(run: RunRecord) -> Figure:
     """Estimates over time with two standard deviations, and the truth where it is known."""
-    figure = new_figure(7.0)
-    t = run.column('t')
-    for axes, name in zip(time_grid(figure, 3, [WHOLE_RUN])[:, 0], BACKLASH, strict=True):
-        estimate, std = run.column(name), run.column(f'std_{name}')
+    t, rows = run.column('t'), {}
+    for name in BACKLASH:
+        truth = [Line(t, run.column(f'true_{name}'), HUES['true'], 'true', '-', 6.0, 0.22)]
+        estimated = Line(t, run.column(name), HUES[name], 'estimated', '-', 1.8)
+        rows[f'${HATS[name]}$ [{BACKLASH_UNITS[name]}]'] = [
+            *(truth if run.has_truth else []), estimated,
+        ]
+    figure, grid = draw_panels(7.0, rows, [WHOLE_RUN], run)
+    for axes, name in zip(grid[:, 0], BACKLASH, strict=True):
+        estimate, std = run.column(name), 2 * run.column(f'std_{name}')
         title = f'${HATS[name]}$ = {estimate[-1]:.6g}'
-        if run.has_truth:
-            curve(axes, t, run.column(f'true_{name}'), HUES['true'], 'true', width=6.0,
-                  alpha=0.22)
-        curve(axes, t, estimate, HUES[name], 'estimated', width=1.8)
         if np.isfinite(std).any():
-            band(axes, t, estimate - 2 * std, estimate + 2 * std, HUES[name],
-                 '±2 standard deviations')
+            band(axes, t, estimate - std, estimate + std, HUES[name], '±2 standard deviations')
             # The first, nearly boundless uncertainty would flatten everything else: the limits
             # are those of the curves, with a margin for the deviations.
             axes.set_ylim(*limits([estimate, run.column(f'true_{name}')], 0.25))
-            title += f' ± {2 * std[-1]:.2g}'
-        shade(axes, t, frozen(run), 'frozen')
-        label(axes, f'{title} at the end', f'${HATS[name]}$ [{BACKLASH_UNITS[name]}]')
+            title += f' ± {std[-1]:.2g}'
+        label(axes, f'{title} at the end')
         legend_above(axes)
     return figure
 
 
-def draw_control_error(run: RunRecord, parts: Sequence[Part]) -> Figure:
-    """Control error e = u - u_d (3.4) over the whole run, and closer at its start and end."""
-    return _draw_closer(run, control_error(run), '$u - u_d$ [unit of u]', parts)
-
-
-def draw_innovation(run: RunRecord, parts: Sequence[Part]) -> Figure:
-    """y minus its prediction: the health of the model where no truth is known."""
-    return _draw_closer(run, run.column('innovation'), r'$y - \hat{y}$ [unit of y]', parts)
-
-
-def _draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]) -> Figure:
-    """One signal over the whole run, and below it over each part."""
-    figure = new_figure(5.6)
-    grid = figure.add_gridspec(2, len(parts))
-    panels = [(figure.add_subplot(grid[0, :]), WHOLE_RUN)]
-    panels += [(figure.add_subplot(grid[1, i]), part) for i, part in enumerate(parts)]
-    for axes, part in panels:
-        t = run.column('t')[part.rows]
-        curve(axes, t, values[part.rows], HUES['e'])
-        shade(axes, t, frozen(run)[part.rows], 'frozen')
+def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part]) -> Figure:
+    """A signal over the whole run, and beside it closer over each part."""
+    figure, grid = draw_panels(
+        3.6, {name: [Line(run.column('t'), values, HUES['e'])]}, (WHOLE_RUN, *parts), run,
+        width_ratios=[2.0, *(1.0 for _ in parts)],
+    )
+    for axes in grid[0]:
         zero_line(axes)
-        label(axes, part.name, name, '' if part is WHOLE_RUN else TIME_LABEL)
     return figure
 
 
 def draw_laws(traces: Sequence[LawTrace], start: Part) -> Figure:
     """Control errors of the laws, as Figure 5 of the paper: each alone, then their size."""
-    figure = new_figure(1.7 * len(traces) + 3.4)
-    parts = (start, WHOLE_RUN)
-    grid = time_grid(figure, len(traces) + 1, parts, height_ratios=[1.0] * len(traces) + [1.7])
-    for column, part in enumerate(parts):
-        for axes, trace in zip(grid[:-1, column], traces, strict=True):
-            curve(axes, trace.t[part.rows], trace.e[part.rows], _law_colour(trace))
-            zero_line(axes)
-            axes.text(0.5, 0.5, fill(trace.note, 50), transform=axes.transAxes, ha='center',
-                      va='center', fontsize=9)
-        for trace, style in zip(traces, DASHES * len(traces), strict=False):
-            size = np.where(trace.rms > 0.0, trace.rms, np.nan)[part.rows]
-            curve(grid[-1, column], trace.t[part.rows], size, _law_colour(trace), trace.law,
-                  style, 1.8)
-        sizes = [trace.rms[np.isfinite(trace.rms) & (trace.rms > 0.0)] for trace in traces]
-        # A law that diverges leaves the axes, which are made for those that do not.
-        highest = [float(size.max()) for size in sizes if size.size]
-        if highest:
-            # Not the least of all: an error begins at zero.
-            low = float(np.percentile(np.concatenate(sizes), 2))
-            limit_decades(grid[-1, column], low, min(max(highest), 1e3 * min(highest)))
-    for axes, trace in zip(grid[:-1, 0], traces, strict=True):
+    colours = {'moving_horizon': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
+    rows, sizes = {}, []
+    for trace, style in zip(traces, DASHES * len(traces), strict=False):
+        colour = colours.get(trace.law, '#555555')
         origin = 'this run' if trace.recorded else 'simulated'
-        label(axes, y=f'{trace.law}\n({origin})\n$u - u_d$ [unit of u]')
+        rows[f'{trace.law}\n({origin})\n$u - u_d$ [unit of u]'] = [Line(trace.t, trace.e, colour)]
+        size = np.where(trace.rms > 0.0, trace.rms, np.nan)
+        sizes.append(Line(trace.t, size, colour, trace.law, style, 1.8))
+    rows['RMS of $u - u_d$\nover one period\n[unit of u]'] = sizes
+    figure, grid = draw_panels(
+        1.7 * len(traces) + 3.4, rows, (start, WHOLE_RUN),
+        height_ratios=[1.0] * len(traces) + [1.7],
+    )
+    for axes, trace in zip(grid[:-1].T.ravel(), [*traces, *traces], strict=True):
+        zero_line(axes)
+        axes.text(0.5, 0.5, fill(trace.note, 50), transform=axes.transAxes, ha='center',
+                  va='center', fontsize=9)
+    known = [line.values[np.isfinite(line.values)] for line in sizes]
+    # A law that diverges leaves the axes, which are made for those that do not.
+    if highest := [float(size.max()) for size in known if size.size]:
+        # Not the least of all: an error begins at zero.
+        low = float(np.percentile(np.concatenate(known), 2))
+        for axes in grid[-1]:
+            limit_decades(axes, low, min(max(highest), 1e3 * min(highest)))
     figure.align_ylabels(grid[:, 0])
-    label(grid[-1, 0], y='RMS of $u - u_d$\nover one period\n[unit of u]')
     legend_above(grid[-1, 1])
     return figure
-
-
-def _law_colour(trace: LawTrace) -> str:
-    colours = {'moving_horizon': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
-    return colours.get(trace.law, '#555555')
 
 
 def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     """v-u loop at the end of the run with the true and the estimated lines."""
     figure = new_figure(6.0)
     axes = figure.subplots()
-    v, truth = run.column('v'), run.has_truth
+    t, v, truth = run.column('t')[end.rows], run.column('v'), run.has_truth
     u = run.column('u') if truth else estimated_loop(run)
     span = np.array(limits([v[end.rows]], margin=0.15))
     for name, side in (('c_r', 'right'), ('c_l', 'left')):
@@ -295,7 +296,6 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
         curve(axes, span, m * (span - c), HUES[name],
               f'estimated {side} line\n${HATS["m"]}(v - {HATS[name]})$', '--', 1.6)
     axes.plot(v, u, color='#999999', linewidth=0.8, zorder=1, label='earlier')
-    t = run.column('t')[end.rows]
     axes.plot(v[end.rows], u[end.rows], color=HUES['u'], linewidth=1.1, marker='.',
               markersize=3, label=f'samples from\n{t[0]:.4g} s to {t[-1]:.4g} s')
     axes.set_xlim(*span)
@@ -308,77 +308,67 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
 
 def draw_output(run: RunRecord, end: Part, reference: FollowedReference) -> Figure:
     """Reference and output: on one scale where y follows, else each on its own."""
-    figure = new_figure(5.6)
-    t, y = run.column('t'), run.column('y')
-    parts = (WHOLE_RUN, end)
-    grid = time_grid(figure, 2, parts)
+    t, y, y_m = run.column('t'), run.column('y'), reference.values
     late = f', {reference.delay:.4g} s late' if reference.delay else ''
-    below = y - reference.values if reference.followed else y
-    for (upper, lower), part in zip(grid.T, parts, strict=True):
-        curve(upper, t[part.rows], reference.values[part.rows], HUES['y_m'], f'$y_m${late}',
-              '--' if reference.followed else '-')
-        curve(lower, t[part.rows], below[part.rows], HUES['y'])
-        if reference.followed:
-            curve(upper, t[part.rows], y[part.rows], HUES['y'], 'y')
-            legend_above(upper)
-    above = '[unit of y]' if reference.followed else f'reference $y_m$ [unit of $y_m$]{late}'
-    label(grid[0, 0], y=above)
-    label(grid[1, 0], y='y minus reference [unit of y]' if reference.followed else
-          'output y [unit of y]')
+    rows = {
+        '[unit of y]': [
+            Line(t, y_m, HUES['y_m'], f'$y_m${late}', '--'), Line(t, y, HUES['y'], 'y'),
+        ],
+        'y minus reference [unit of y]': [Line(t, y - y_m, HUES['y'])],
+    } if reference.followed else {
+        f'reference $y_m$ [unit of $y_m$]{late}': [Line(t, y_m, HUES['y_m'])],
+        'output y [unit of y]': [Line(t, y, HUES['y'])],
+    }
+    figure, grid = draw_panels(5.6, rows, (WHOLE_RUN, end))
+    if reference.followed:
+        for axes in grid[0]:
+            legend_above(axes)
     return figure
 
 
 def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
     """Desired and true input of G, and the control v that causes it."""
-    figure = new_figure(5.6)
-    grid = time_grid(figure, 2, parts)
-    t = run.column('t')
-    known = bool(np.isfinite(run.column('u')).any())
-    for (upper, lower), part in zip(grid.T, parts, strict=True):
-        if known:
-            curve(upper, t[part.rows], run.column('u')[part.rows], HUES['u'], 'u', width=1.6)
-        curve(upper, t[part.rows], run.column('u_d')[part.rows], HUES['u_d'], '$u_d$',
-              '--' if known else '-', 1.6)
-        curve(lower, t[part.rows], run.column('v')[part.rows], HUES['v'])
-    label(grid[0, 0], y='input of G [unit of u]')
-    label(grid[1, 0], y='control v [unit of v]')
+    t, u = run.column('t'), run.column('u')
+    known = [Line(t, u, HUES['u'], 'u', '-', 1.6)] if np.isfinite(u).any() else []
+    desired = Line(t, run.column('u_d'), HUES['u_d'], '$u_d$', '--' if known else '-', 1.6)
+    figure, grid = draw_panels(5.6, {
+        'input of G [unit of u]': [*known, desired],
+        'control v [unit of v]': [Line(t, run.column('v'), HUES['v'])],
+    }, parts)
     legend_above(grid[0, -1])
     return figure
 
 
 def draw_sweep(
-    swept: str, values: Sequence[Value], lines: Mapping[str, Array], others: str = '',
+    swept: str, values: Sequence[Any], lines: Mapping[str, Sequence[Sequence[float]]], others: str,
 ) -> Figure:
     """Relative RMSE of m, c_r, c_l [%] and the settling time of the slowest of them [s].
 
-    swept: the parameter on the horizontal axis, and the values it takes. lines: by the values of
-    the other parameters, shape (4, len(values)). others: the names of these.
+    swept, values: the parameter of the horizontal axis. lines: by the values of the other
+    parameters, shape (values, 4). others: the names of these.
     """
     figure = new_figure(7.4)
     panels = figure.subplots(2, 2).ravel().tolist()
-    numbers = [float(value) for value in values
-               if isinstance(value, (int, float)) and not isinstance(value, bool)]
-    places = numbers if len(numbers) == len(values) else list(map(float, range(len(values))))
+    numeric = all(isinstance(value, (int, float)) for value in values)
+    places = np.array(values if numeric else range(len(values)), dtype=float)
     for i, (name, rows) in enumerate(lines.items()):
-        for panel, row in zip(panels, rows, strict=True):
+        for panel, row in zip(panels, np.array(rows).T, strict=True):
             panel.plot(places, row, color=CYCLE[i % len(CYCLE)], marker='osD^vP*X'[i % 8],
                        linewidth=1.6, markersize=6, label=name)
+    for panel, name in zip(panels, BACKLASH, strict=False):
+        panel.set_yscale('log')
+        _tolerance_line(panel)
+        label(panel, f'RMSE of ${name}$ at the end', '% of the true value')
+    label(panels[3], 'Settled within 1 % (median; no point: never)', 'time [s]')
+    panels[3].set_xlim(panels[0].get_xlim())
+    panels[3].set_ylim(bottom=0.0)
     unit = f' [{BY_NAME[swept].unit}]' if BY_NAME[swept].unit else ''
-    for panel, parameter in zip(panels, (*BACKLASH, None), strict=True):
+    for panel in panels:
         label(panel, x=f'{swept}{unit}')
-        if places is not numbers:
+        if not numeric:
             panel.set_xticks(places, list(map(str, values)))
-        elif min(places) > 0.0 and max(places) / min(places) >= 20.0:
+        elif places.min() > 0.0 and places.max() >= 20.0 * places.min():
             panel.set_xscale('log')
-        if parameter is None:
-            label(panel, 'Settled within 1 % (median; no point: never)', 'time [s]')
-            low, high = panel.get_ylim()
-            panel.set_ylim(0.0, high + 0.1 * (high - low))
-            panel.set_xlim(panels[0].get_xlim())
-        else:
-            panel.set_yscale('log')
-            _tolerance_line(panel)
-            label(panel, f'RMSE of ${parameter}$ at the end', '% of the true value')
     if others:
         legend_below(figure, panels[0], others)
     return figure
@@ -389,26 +379,26 @@ def draw_comparison(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
 
     window_s: over which the RMS was taken [s].
     """
-    figure = new_figure(8.4)
-    upper, lower = figure.subplots(2, 1, sharex=True)
-    for i, loop in enumerate(loops):
-        look = CYCLE[i % len(CYCLE)], loop.name, DASHES[i % len(DASHES)], loop.width
-        curve(upper, loop.t, loop.control, *look)
-        if loop.tracking is not None:
-            curve(lower, loop.t, loop.tracking, *look)
-    for axes, shown in (
-        (upper, [loop.control for loop in loops]),
-        (lower, [loop.tracking for loop in loops if loop.tracking is not None]),
-    ):
-        known = np.concatenate([values[values > 0.0] for values in shown] or [np.empty(0)])
+    control, tracking = [], []
+    for i, (name, t, of_control, of_tracking) in enumerate(loops):
+        # The curve of the loop without backlash comes to lie on that of the one that has learned.
+        width = 3.4 if name == 'moving_horizon, tracking' else 1.7
+        look = CYCLE[i % len(CYCLE)], name, DASHES[i % len(DASHES)], width
+        control.append(Line(t, of_control, *look))
+        if of_tracking is not None:
+            tracking.append(Line(t, of_tracking, *look))
+    rows = {
+        f'RMS of $u - u_d$ over {window_s:g} s\n[unit of u]': control,
+        f'RMS of $y - y_m$ over {window_s:g} s\n[unit of y]': tracking,
+    }
+    figure, grid = draw_panels(8.4, rows, [WHOLE_RUN])
+    for axes, lines in zip(grid[:, 0], rows.values(), strict=True):
+        known = np.concatenate([line.values[line.values > 0.0] for line in lines] or [np.empty(0)])
         if known.size:
-            low, high = np.percentile(known, [2, 100])
-            limit_decades(axes, float(low), float(high))
-    label(upper, 'Control error', f'RMS of $u - u_d$ over {window_s:g} s\n[unit of u]')
-    label(lower, 'Tracking error, where y is meant to follow',
-          f'RMS of $y - y_m$ over {window_s:g} s\n[unit of y]', TIME_LABEL)
-    handles, names = upper.get_legend_handles_labels()
-    figure.legend(handles, names, loc='outside lower center', ncol=3)
+            limit_decades(axes, *np.percentile(known, [2, 100]).tolist())
+    label(grid[0, 0], 'Control error')
+    label(grid[1, 0], 'Tracking error, where y is meant to follow')
+    legend_below(figure, grid[0, 0], columns=3)
     return figure
 
 

@@ -23,9 +23,8 @@ th, td { padding: 5px 10px; text-align: right; border-bottom: 1px solid #e6e6e6;
 th:first-child, td:first-child { text-align: left; }
 th { font-weight: 600; color: #555; }
 .facts { margin-top: 18px; }
-.facts td { width: 25%; }
-.facts td:nth-child(odd) { text-align: left; color: #555; }
-.facts td:nth-child(even) { text-align: left; }
+.facts td { width: 25%; text-align: left; }
+.facts td:nth-child(odd) { color: #555; }
 .lead { color: #444; }
 .warning { background: #fff4e0; border-left: 4px solid #E69F00; padding: 8px 12px; }
 img { width: 100%; height: auto; display: block; }
@@ -53,32 +52,23 @@ def page(
     lead: the outcome in a sentence, HTML like the parts, which are sections between the warnings
     and the pictures. folded: heading and text of a last section that opens on a click.
     """
-    body = [
-        f'<h1>{escape(title)}</h1>', f'<p class="lead">{lead}</p>',
-        *(f'<p class="warning">{escape(warning)}</p>' for warning in warnings),
-        *(f'<section>{part}</section>' for part in parts),
-        *(_section(picture) for picture in pictures),
-    ]
+    sections = list(parts)
+    for picture in pictures:
+        heading, data = escape(picture.heading), base64.b64encode(picture.data).decode('ascii')
+        sections.append(f'<h2>{heading}</h2>\n<p>{picture.caption}</p>\n'
+                        f'<img alt="{heading}" src="data:image/png;base64,{data}">')
     if folded is not None:
-        heading, text = folded
-        body.append(
-            f'<section><details><summary>{escape(heading)}</summary>'
-            f'<pre>{escape(text)}</pre></details></section>'
-        )
+        summary, text = map(escape, folded)
+        sections.append(f'<details><summary>{summary}</summary><pre>{text}</pre></details>')
     return '\n'.join([
         '<!DOCTYPE html>', '<html lang="en">', '<head>', '<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>', '<body>',
-        '<main>', *body, '</main>', '</body>', '</html>', '',
+        f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>', '<body>', '<main>',
+        f'<h1>{escape(title)}</h1>', f'<p class="lead">{lead}</p>',
+        *(f'<p class="warning">{escape(warning)}</p>' for warning in warnings),
+        *(f'<section>\n{section}\n</section>' for section in sections),
+        '</main>', '</body>', '</html>', '',
     ])
-
-
-def _section(picture: Picture) -> str:
-    encoded = base64.b64encode(picture.data).decode('ascii')
-    return (
-        f'<section>\n<h2>{escape(picture.heading)}</h2>\n<p>{picture.caption}</p>\n'
-        f'<img alt="{escape(picture.heading)}" src="data:image/png;base64,{encoded}">\n</section>'
-    )
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -89,10 +79,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def facts(pairs: Sequence[tuple[str, str]], columns: int = 2) -> str:
     """A table of names and values, so many pairs in a row; the cells are HTML."""
-    rows = [
-        [cell for pair in pairs[i:i + columns] for cell in pair]
-        for i in range(0, len(pairs), columns)
-    ]
+    rows = [sum(pairs[i:i + columns], ()) for i in range(0, len(pairs), columns)]
     return f'<table class="facts">{_body(rows)}</table>'
 
 

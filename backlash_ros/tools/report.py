@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
@@ -29,12 +30,7 @@ from backlash_ros.tools.config import write_config
 from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
-from backlash_ros.tools.runs.figure_data import (
-    compare_laws,
-    compared_samples,
-    followed_reference,
-    interesting_parts,
-)
+from backlash_ros.tools.runs import figure_data
 from backlash_ros.tools.runs.files import (
     CONFIG_FILE,
     SUMMARY_FILE,
@@ -65,79 +61,84 @@ def write_report(run: Run, out: Path) -> dict[str, Any]:
     if run.parameters is not None:
         write_config(run.parameters, out / CONFIG_FILE)
         folded = ('Parameters of this run', (out / CONFIG_FILE).read_text(encoding='utf-8'))
-    pictures = list(draw(run.record, run.parameters, summary))
+    pictures = [
+        Picture(name, heading, caption, figures.png(figure))
+        for name, heading, caption, figure in _figures(run.record, run.parameters, summary)
+    ]
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)
     notes = [f'{note[0].upper()}{note[1:]}.' for note in run.notes]
-    tables = _backlash_table(summary) + _facts(summary)
     write_atomically(out / REPORT_PAGE, page(
-        'Adaptive backlash inverse control', headline(summary), notes, [tables], pictures, folded))
+        'Adaptive backlash inverse control', headline(summary), notes, [_tables(summary)],
+        pictures, folded,
+    ))
     return summary
 
 
-def draw(
+def _figures(
     run: RunRecord, parameters: Parameters | None, summary: Mapping[str, Any],
-) -> Iterator[Picture]:
-    """Every figure that this run allows, in the order of the page."""
+) -> Iterator[tuple[str, str, str, Figure]]:
+    """File, heading, caption (HTML) and figure of all that this run allows, in their order."""
     if not np.isfinite(run.column('m')).any():
-        yield Picture(
+        yield (
             'log.png', 'v and y', 'What the log holds, as it was read. With play, y over v is a '
             'loop with level stretches, as wide as the gap, where v turns.',
-            figures.png(figures.draw_log(run)),
+            figures.draw_log(run),
         )
         return
-    start, end = parts = interesting_parts(run, parameters)
+    start, end = parts = figure_data.interesting_parts(run, parameters)
     if run.has_truth:
-        yield Picture(
+        yield (
             'parameter_errors.png', 'Parameter errors over time (Figure 4 of the paper)',
             'How far the estimates are from the hidden backlash, and in percent of it. A dot marks '
             'the time from which the error stays within 1 %.',
-            figures.png(figures.draw_parameter_errors(run, start, summary['settling_time_s'])),
+            figures.draw_parameter_errors(run, start, summary['settling_time_s']),
         )
-    yield Picture(
+    yield (
         'estimates.png', 'Estimates over time',
         'What the controller has learned from v and y alone; a band shows how sure it is where '
-        'the law knows.', figures.png(figures.draw_estimates(run)),
+        'the law knows.', figures.draw_estimates(run),
     )
     if np.isfinite(run.column('u')).any():
-        yield Picture(
+        error = figure_data.control_error(run)
+        yield (
             'control_error.png', 'Control error of this run',
             'e = u − u<sub>d</sub> (3.4): what the inverse leaves of the backlash.',
-            figures.png(figures.draw_control_error(run, parts)),
+            figures.draw_closer(run, error, '$u - u_d$ [unit of u]', parts),
         )
     elif np.isfinite(run.column('innovation')).any():
-        yield Picture(
+        yield (
             'innovation.png', 'Innovation',
             'y minus its prediction. White and small: the model explains the plant.',
-            figures.png(figures.draw_innovation(run, parts)),
+            figures.draw_closer(run, run.column('innovation'), r'$y - \hat{y}$ [unit of y]', parts),
         )
     if run.has_truth and parameters is not None:
-        duration = compared_samples(run) * run.sample_period
-        yield Picture(
+        duration = figure_data.compared_samples(run) * run.sample_period
+        yield (
             'laws.png', 'Control error of the laws (Figure 5 of the paper)',
             'This run beside the other laws, simulated with the same parameters, over the first '
             f'{duration:.6g} s. Each has its own scale; the last panel has all on one.',
-            figures.png(figures.draw_laws(compare_laws(run, parameters), start)),
+            figures.draw_laws(figure_data.compare_laws(run, parameters), start),
         )
-    yield Picture(
+    yield (
         'hysteresis.png', 'Backlash: the v–u loop',
         'u follows the right line going up, the left line going down, and is held between them. '
         'Where a dashed line lies on the wide one, the estimate is right.' if run.has_truth else
         'The loop as the last estimates see it: u itself was not measured.',
-        figures.png(figures.draw_hysteresis(run, end)),
+        figures.draw_hysteresis(run, end),
     )
-    reference = followed_reference(run, parameters)
-    yield Picture(
+    reference = figure_data.followed_reference(run, parameters)
+    yield (
         'output.png', 'Reference and output',
         'y follows y<sub>m</sub>.' if reference.followed else
         'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
         'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-        figures.png(figures.draw_output(run, end, reference)),
+        figures.draw_output(run, end, reference),
     )
-    yield Picture(
+    yield (
         'input.png', 'Desired input and control',
         'v jumps by the width of the gap whenever u<sub>d</sub> turns.',
-        figures.png(figures.draw_input(run, parts)),
+        figures.draw_input(run, parts),
     )
 
 
@@ -161,25 +162,24 @@ def headline(summary: Mapping[str, Any]) -> str:
     )
 
 
-def _backlash_table(summary: Mapping[str, Any]) -> str:
+def _tables(summary: Mapping[str, Any]) -> str:
+    """The backlash that was learned, and what else is known of the run."""
     rows = [
         (symbol, *estimate_cells(summary, name), 'of u/v' if name == 'm' else 'of v')
         for name, symbol in HTML_SYMBOLS.items()
     ]
     rows.append(('f', number(summary['final']['f'], 6), *[NOTHING] * 4, 'of u/v'))
-    return table(('', *ESTIMATE_HEADER, 'unit'), rows)
-
-
-def _facts(summary: Mapping[str, Any]) -> str:
     latency = summary['loop_latency_ms'] or {'p50': None, 'p99': None}
     duration = (summary['samples'] + summary['lost_samples']) * summary['sample_period']
     unexplained = summary['unexplained']
-    return facts([
+    first = summary['began_with']
+    began = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
+    return table(('', *ESTIMATE_HEADER, 'unit'), rows) + facts([
         ('samples', f'{summary["samples"]} in {duration:.6g} s'),
         ('lost samples', str(summary['lost_samples'])),
         ('sample period', f'{summary["sample_period"]:.6g} s'),
         ('structure', escape(summary['structure'] or NOTHING)),
-        ('began with', _beginning(summary['began_with'])),
+        ('began with', f'{began}: {escape(first["from"])}' if first['from'] else began),
         ('control error RMS, last second', number(summary['control_error_rms'], 4, '[unit of u]')),
         ('tracking error RMS, last half',
          number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)),
@@ -192,16 +192,6 @@ def _facts(summary: Mapping[str, Any]) -> str:
         ('samples in state tracking',
          number((summary['status_share'] or {}).get('tracking'), 3, '%', 100.0)),
     ])
-
-
-def _beginning(first: Mapping[str, Any]) -> str:
-    values = ', '.join(f'{name} {number(first[name], 6)}' for name in BACKLASH)
-    return f'{values}: {escape(first["from"])}' if first['from'] else values
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `report`."""
-    return run_tool('report', lambda: _report(args))
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -234,6 +224,11 @@ def _report(args: Sequence[str] | None) -> None:
     out = result_directory(options.out)
     write_report(run, out)
     print(out / REPORT_PAGE)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `report`."""
+    return run_tool('report', lambda: _report(args))
 
 
 if __name__ == '__main__':

@@ -4,35 +4,23 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from math import isfinite, nan
-from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
 from backlash_ros.tools.batch import OUTCOME_COLUMNS, Job, Outcome, statistics
 from backlash_ros.tools.cli import NOTHING, InputError, format_table
-from backlash_ros.tools.cluster import run_on_cluster
 from backlash_ros.tools.config import effective_parameters, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, Run, result_directory, write_table
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import estimate_table
 from backlash_ros.topics import BACKLASH
-
-Group = tuple[Mapping[str, Value], Sequence[Outcome]]  # a change and the outcomes of its runs
-
-
-def main(args: Sequence[str] | None = None) -> int:
-    """Entry point of `simulate`."""
-    return cli.run_tool('simulate', lambda: _simulate(args))
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -68,28 +56,28 @@ def _simulate(args: Sequence[str] | None) -> None:
     elif options.cluster is not None:
         raise InputError('--cluster does many runs: give --seeds or --sweep as well')
     else:
-        _once(parameters, options.duration, options.out)
+        _once(parameters, options)
 
 
-def _once(parameters: Parameters, duration: float | None, out: Path | None) -> None:
+def _once(parameters: Parameters, options: argparse.Namespace) -> None:
     # Drawing libraries take a second to load, which neither a worker nor bad input should cost.
     from backlash_ros.tools.report import REPORT_PAGE, write_report
-    samples = cli.number_of_samples(parameters, duration)
+    samples = cli.number_of_samples(parameters, options.duration)
     loop = build_closed_loop(parameters)
     cli.print_warnings('simulate', parameters)
-    _refuse_bad(out)
+    _refuse_bad_out(options)
     # disable=None: no bar where stderr is not a terminal.
     with tqdm(total=samples, desc='simulate', unit='sample', disable=None) as bar:
         run = run_loop(loop, samples, lambda _: bar.update())
-    directory = result_directory(out)
+    directory = result_directory(options.out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
     print(f'report: {directory / REPORT_PAGE}')
 
 
-def _refuse_bad(out: Path | None) -> None:
+def _refuse_bad_out(options: argparse.Namespace) -> None:
     """Fail before a long run, not after it; a folder of its own is made only for a whole run."""
-    if out is not None:
-        result_directory(out)
+    if options.out is not None:
+        result_directory(options.out)
 
 
 def _many(parameters: Parameters, options: argparse.Namespace) -> None:
@@ -101,25 +89,31 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     first = parameters.seed
     seeds = range(first, first + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
-    _refuse_bad(options.out)
-    outcomes = batch.run_jobs(jobs, label='simulate') if options.cluster is None \
-        else run_on_cluster(jobs, options.cluster, label='simulate')
+    _refuse_bad_out(options)
+    outcomes = batch.run_jobs(jobs, cluster=options.cluster, label='simulate')
     directory = result_directory(options.out)
     write_config(parameters, directory / CONFIG_FILE)
     csv = directory / ('sweep.csv' if swept else 'seeds.csv')
-    named = (*swept, 'seed')
-    write_table(csv, (*named, *OUTCOME_COLUMNS), [
+    write_table(csv, (*swept, 'seed', *OUTCOME_COLUMNS), [
         [*(list(value) if isinstance(value := job.values[name], tuple) else value
-           for name in named), *(outcome[name] for name in OUTCOME_COLUMNS)]
+           for name in (*swept, 'seed')), *outcome.values()]
         for job, outcome in zip(jobs, outcomes, strict=True)
     ])
     if swept:
         # The jobs of one change stand together.
         size = len(outcomes) // len(changes)
-        groups = [(change, outcomes[i * size:(i + 1) * size]) for i, change in enumerate(changes)]
-        print(_sweep_table(swept, groups))
+        rows = [_sweep_row(outcomes[i * size:(i + 1) * size]) for i in range(len(changes))]
+        header = [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %']
+        print(format_table(header, [
+            [*map(batch.value_text, change.values()), *row]
+            for change, (row, _) in zip(changes, rows, strict=True)
+        ]))
         from backlash_ros.tools.figures import draw_sweep, png
-        figure = draw_sweep(swept[0], sweeps[0].values, _lines(swept, groups), ', '.join(swept[1:]))
+        lines: dict[str, list[list[float]]] = {}
+        for change, (_, points) in zip(changes, rows, strict=True):
+            others = map(batch.value_text, list(change.values())[1:])
+            lines.setdefault(', '.join(others), []).append(points)
+        figure = draw_sweep(*sweeps[0], lines, ', '.join(swept[1:]))
         write_atomically(directory / 'sweep.png', png(figure))
         print(f'figure: {directory / "sweep.png"}')
     else:
@@ -142,63 +136,43 @@ def _seeds_table(outcomes: Sequence[Outcome]) -> str:
     return format_table(header[:shown], [row[:shown] for row in rows])
 
 
-def _sweep_table(swept: Sequence[str], groups: Sequence[Group]) -> str:
-    """A row for each combination: RMSE of each parameter, when the slowest settles, as text."""
-    header = [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %']
-    rows = []
-    for change, outcomes in groups:
-        row = [batch.value_text(change[name]) for name in swept]
-        if all(outcome['problem'] for outcome in outcomes):
-            rows.append([*row, *[NOTHING] * 3, 'broke off', NOTHING])
-            continue
-        of = statistics(outcomes).values()
-        rows.append([
-            *row, *(f'{s.rmse:.3g}' for s in of), _seconds(max(s.settling_median for s in of)),
-            f'{100.0 * min(s.within for s in of):.4g} %',
-        ])
-    return format_table(header, rows)
+def _sweep_row(outcomes: Sequence[Outcome]) -> tuple[list[str], list[float]]:
+    """RMSE of each parameter, settling time of the slowest, share within 1 %; and for the figure.
 
-
-def _lines(swept: Sequence[str], groups: Sequence[Group]) -> dict[str, NDArray[np.float64]]:
-    """RMSE of m, c_r, c_l [% of the truth] and settling time [s] over the first swept parameter.
-
-    A line, shape (4, values), for each combination of the other parameters.
+    Of that: RMSE of m, c_r, c_l [% of the truth] and settling time [s], nan where there is none.
     """
-    lines: dict[str, list[list[float]]] = {}
-    for change, outcomes in groups:
-        points = [nan] * 4
-        if not all(outcome['problem'] for outcome in outcomes):
-            of = statistics(outcomes).values()
-            # The logarithm has no zero.
-            points = [max(s.rmse_percent, 1e-10) for s in of] + [max(
-                s.settling_median for s in of
-            )]
-        line = lines.setdefault(', '.join(batch.value_text(change[name]) for name in swept[1:]), [])
-        line.append([value if isfinite(value) else nan for value in points])
-    return {name: np.array(line).T for name, line in lines.items()}
+    if all(outcome['problem'] for outcome in outcomes):
+        return [*[NOTHING] * 3, 'broke off', NOTHING], [nan] * 4
+    of = statistics(outcomes).values()
+    settled = max(s.settling_median for s in of)
+    row = [*(f'{s.rmse:.3g}' for s in of), _seconds(settled),
+           f'{100.0 * min(s.within for s in of):.4g} %']
+    # The logarithm has no zero.
+    points = [*(max(s.rmse_percent, 1e-10) for s in of), settled]
+    return row, [value if isfinite(value) else nan for value in points]
 
 
 def _print_shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
     """Name the runs that broke off or did not end within 1 %."""
-    broken, missed, why = [], [], ''
-    for job, outcome in zip(jobs, outcomes, strict=True):
-        if outcome['problem']:
-            broken.append(job)
-            why = why or str(outcome['problem'])
-        elif any(outcome[f'settling_{name}'] is None for name in BACKLASH):
-            missed.append(job)
-    for what, of, further in (
-        ('broke off', broken, f', the first one with: {why}'),
-        ('not within 1 % at the end', missed, ''),
-    ):
-        seeds = list(dict.fromkeys(str(job.values['seed']) for job in of))
-        named = ', '.join(seeds[:10]) + (', ...' if len(seeds) > 10 else '')
+    done = list(zip(jobs, outcomes, strict=True))
+    broken = [(job, outcome['problem']) for job, outcome in done if outcome['problem']]
+    missed = [(job, '') for job, outcome in done if not outcome['problem']
+              and any(outcome[f'settling_{name}'] is None for name in BACKLASH)]
+    for what, of in (('broke off', broken), ('not within 1 % at the end', missed)):
         if of:
-            print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {named}{further}')
+            seeds = list(dict.fromkeys(str(job.values['seed']) for job, _ in of))
+            named = ', '.join(seeds[:10]) + (', ...' if len(seeds) > 10 else '')
+            why = f', the first one with: {of[0][1]}' if of[0][1] else ''
+            print(f'{what}: {len(of)} run{"s" if len(of) > 1 else ""}, seed {named}{why}')
 
 
 def _seconds(time: float) -> str:
     return f'{time:.4g} s' if isfinite(time) else 'never'
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Entry point of `simulate`."""
+    return cli.run_tool('simulate', lambda: _simulate(args))
 
 
 if __name__ == '__main__':

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from math import sqrt
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Run = TypeVar('Run')
 Better = Literal['less', 'more', 'one']  # one: the nearer to 1 on a logarithmic scale
 
 RESAMPLED, SEED = 400, 1
@@ -91,6 +92,18 @@ def upper(values: Array) -> float:
 
 
 Row = Mapping[str, Figure]
+
+
+def by_group(
+    runs: Sequence[Run], figures: Callable[[Sequence[Run]], Row],
+    group: Callable[[Run], str] = lambda run: run.group,  # type: ignore[attr-defined]
+) -> dict[str, Figure]:
+    """The figures of each group of runs, named after it."""
+    found: dict[str, list[Run]] = {}
+    for run in runs:
+        found.setdefault(group(run), []).append(run)
+    return {f'{name}: {what}': one for name, of in found.items()
+            for what, one in figures(of).items()}
 
 
 def as_json(rows: Mapping[str, Row]) -> dict[str, dict[str, dict[str, Any]]]:

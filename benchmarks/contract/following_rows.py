@@ -21,7 +21,7 @@ from scipy.signal import lfilter
 
 from backlash_ros.core import Parameters, build_closed_loop
 from backlash_ros.core.simulation.metrics import gap_crossings_per_reversal
-from contract.figures import Figure, figure, rms, share, upper
+from contract.figures import Figure, by_group, figure, rms, share, upper
 
 Array = NDArray[np.float64]
 Changes = dict[str, Any]
@@ -146,17 +146,12 @@ def _run(case: Case, change: Mapping[str, Any]) -> tuple[float, Any, Array] | No
 
 def following_figures(found: Sequence[Followed]) -> dict[str, Figure]:
     """Figures of every reference."""
-    figures: dict[str, Figure] = {}
-    for name in dict.fromkeys(one.group for one in found):
-        of = [one for one in found if one.group == name]
-        figures |= {f'{name}: {what}': one for what, one in {
-            'error / without backlash, median': figure([f.over_gapless for f in of]),
-            'error / without backlash, 90 %': figure([f.over_gapless for f in of], upper),
-            'a tenth of the cost left, or less': share([f.cancelled for f in of], 'more'),
-            'crossings of the gap for each reversal': figure(
-                [f.crossings for f in of if f.crossings is not None]),
-            'largest |y| / uncompensated': figure([f.peak for f in of]),
-        }.items()}
-        if name == 'rest':
-            figures['rest: share of samples in which v moves'] = share([f.moves for f in of])
-    return figures
+    return by_group(found, lambda of: {
+        'error / without backlash, median': figure([f.over_gapless for f in of]),
+        'error / without backlash, 90 %': figure([f.over_gapless for f in of], upper),
+        'a tenth of the cost left, or less': share([f.cancelled for f in of], 'more'),
+        'crossings of the gap for each reversal': figure([f.crossings for f in of]),
+        'largest |y| / uncompensated': figure([f.peak for f in of]),
+        **({'share of samples in which v moves': share([f.moves for f in of])}
+           if of[0].group == 'rest' else {}),
+    })

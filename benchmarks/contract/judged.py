@@ -95,7 +95,7 @@ def judged(run: Record, shift: float | Array = 0.0) -> Judged:
 
 
 def figures_of(
-    runs: Sequence[Judged | None], marks_s: Sequence[float], prefix: str = '',
+    runs: Sequence[Judged | None], marks_s: Sequence[float],
 ) -> dict[str, Figure]:
     """The figures that every row of simulated runs has; None for a run that broke off."""
     whole = [run for run in runs if run is not None]
@@ -103,7 +103,7 @@ def figures_of(
     def of(value: Callable[[Judged], float | None], broken: float) -> list[float | None]:
         return [broken if run is None else value(run) for run in runs]
 
-    return {prefix + what: one for what, one in {
+    return {
         **{f'error at {mark:g} s, median [gap]': figure(of(lambda r, s=mark: r.at(s), 1e3))
            for mark in marks_s},
         **{f'error at {mark:g} s, 90 % [gap]': figure(of(lambda r, s=mark: r.at(s), 1e3), upper)
@@ -112,4 +112,4 @@ def figures_of(
         'error / deviation, RMS': figure([r.rms for r in whole], rms, 'one'),
         'beyond five deviations': share([r.beyond for r in whole]),
         'wrong while tracking': share(of(lambda r: r.wrong, 1.0)),
-    }.items()}
+    }

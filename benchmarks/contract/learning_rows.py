@@ -15,7 +15,7 @@ from cases.random_cases import Case, bound_of, random_case, uncertain_case
 from numpy.typing import NDArray
 
 from backlash_ros.core import Parameters, Status, build_closed_loop, build_plant
-from contract.figures import Figure, figure, rms, share, upper
+from contract.figures import Figure, by_group, figure, rms, share, upper
 from contract.judged import Judged, figures_of, judged
 
 Array = NDArray[np.float64]
@@ -109,14 +109,6 @@ def _beside_bound(p: Parameters, run: Any, marks_s: Sequence[float]) -> tuple[Ar
     return np.array(errors).reshape(-1, 3), np.array(bounds).reshape(-1, 3)
 
 
-def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
-    """Outcomes by group."""
-    found: dict[str, list[Outcome]] = {}
-    for one in outcomes:
-        found.setdefault(one.group, []).append(one)
-    return found
-
-
 # The paper's example with exact G, beside the Cramér-Rao bound; and with samples that are lost.
 
 BOUND_MARKS_S = (1.0, 2.0, 6.0)
@@ -146,13 +138,14 @@ def losses_jobs(scale: float) -> list[Job]:
 
 def bound_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
     """Errors over the bound where there is one, in quadratic mean over seeds and parameters."""
-    found: dict[str, Figure] = {}
-    for name, of in groups(outcomes).items():
-        found |= figures_of([one.judged for one in of], (0.5, 2.0, 6.0), f'{name}: ')
+    def of_group(of: Sequence[Outcome]) -> dict[str, Figure]:
+        found = figures_of([one.judged for one in of], (0.5, 2.0, 6.0))
         for i, mark in enumerate(BOUND_MARKS_S if len(of[0].bound) else ()):
             ratios = [rms(one.error[i] / one.bound[i]) if len(one.bound) else 1e3 for one in of]
-            found[f'{name}: error / bound at {mark:g} s, RMS'] = figure(ratios, rms)
-    return found
+            found[f'error / bound at {mark:g} s, RMS'] = figure(ratios, rms)
+        return found
+
+    return by_group(outcomes, of_group)
 
 
 # The geared motor with plants that are not the nominal one.
@@ -179,7 +172,6 @@ OTHERWISE: dict[str, Changes] = {
     'noise told × 10': {'estimator.output_noise_std': 1.1e-3},
     'coarse encoder': {'output_quantum': 8e-3, 'estimator.output_noise_std': 2.3e-3},
 }
-PLANT_MARKS_S = (0.5, 2.0, 10.0)
 
 
 def plants_jobs(structure: str, scale: float) -> list[Job]:
@@ -201,12 +193,11 @@ def plants_jobs(structure: str, scale: float) -> list[Job]:
 
 def plants_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
     """Figures of each group, and how well y follows."""
-    found: dict[str, Figure] = {}
-    for name, of in groups(outcomes).items():
-        found |= figures_of([one.judged for one in of], PLANT_MARKS_S, f'{name}: ')
-        found[f'{name}: y follows, median'] = figure([one.follows for one in of])
-        found[f'{name}: y follows, 90 %'] = figure([one.follows for one in of], upper)
-    return found
+    return by_group(outcomes, lambda of: {
+        **figures_of([one.judged for one in of], (0.5, 2.0, 10.0)),
+        'y follows, median': figure([one.follows for one in of]),
+        'y follows, 90 %': figure([one.follows for one in of], upper),
+    })
 
 
 # Random plants, gaps, first guesses and references, three periods each.
@@ -254,15 +245,11 @@ def run_random(job: tuple[str, int]) -> RandomOutcome:
 
 def random_figures(outcomes: Sequence[RandomOutcome]) -> dict[str, Figure]:
     """Figures of each kind."""
-    found: dict[str, Figure] = {}
-    for kind in RANDOM_KINDS:
-        of = [one for one in outcomes if one.kind == kind]
-        found |= {f'{kind}: {what}': one for what, one in {
-            'error / bound, median': figure([r.over_bound for r in of]),
-            'beyond 3 % of error': share([r.relative > 0.03 for r in of]),
-            **figures_of([r.judged for r in of], ()),
-        }.items()}
-    return found
+    return by_group(outcomes, lambda of: {
+        'error / bound, median': figure([r.over_bound for r in of]),
+        'beyond 3 % of error': share([r.relative > 0.03 for r in of]),
+        **figures_of([r.judged for r in of], ()),
+    }, lambda one: one.kind)
 
 
 # Backlashes that change, physics that is none of the model, rest.
@@ -272,7 +259,6 @@ COASTING: dict[str, list[dict[str, float]]] = {
     'lightly damped': [{'damping': 0.1}, {'damping': 0.02}, {'damping': 0.1, 'dry': 20.0}],
 }
 JUMP_S = 4.0
-CHANGED_MARKS_S = (5.0, 10.0)
 
 
 def changes_jobs(scale: float) -> list[Job]:
@@ -303,20 +289,19 @@ def changes_jobs(scale: float) -> list[Job]:
 
 def changes_figures(outcomes: Sequence[Outcome]) -> dict[str, Figure]:
     """Figures of each group, and after a jump the time until it is learned again."""
-    found: dict[str, Figure] = {}
-    for name, of in groups(outcomes).items():
-        runs = [one.judged for one in of]
-        figures = figures_of(runs, CHANGED_MARKS_S, f'{name}: ')
-        if name == 'wrong sign' or name.startswith('coasting'):
+    def of_group(of: Sequence[Outcome]) -> dict[str, Figure]:
+        name, runs = of[0].group, [one.judged for one in of]
+        found = figures_of(runs, (5.0, 10.0))
+        if name == 'wrong sign' or (name.startswith('coasting') and name != 'coasting, d = 0.5'):
             # No gap is right there: what counts is that none is said to be.
-            figures = {what: one for what, one in figures.items()
-                       if 'wrong' in what or name == 'coasting, d = 0.5'}
-        found |= figures
+            return {what: one for what, one in found.items() if 'wrong' in what}
         if name == 'jump':
             again = [None if run is None else learned_again_s(run) for run in runs]
-            found['jump: seconds until within 0.5 % again, median'] = figure(again)
-            found['jump: seconds until within 0.5 % again, 90 %'] = figure(again, upper)
-    return found
+            found['seconds until within 0.5 % again, median'] = figure(again)
+            found['seconds until within 0.5 % again, 90 %'] = figure(again, upper)
+        return found
+
+    return by_group(outcomes, of_group)
 
 
 def learned_again_s(run: Judged) -> float:

@@ -16,7 +16,7 @@ import yaml
 from cases.geared_motor import flat, motor
 from cases.held_up import HeldUpProcesses
 from cases.identification_cases import NO_PLAYS, random_case, without_play
-from faults import Result, play
+from faults import Result
 from gears.gear_runs import (
     PRESETS,
     Gear,
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core import Estimate, Parameters, Status, build_controller, fit_record
 from backlash_ros.tools.identify.command import main as identify
-from contract.figures import Figure, figure, share, upper
+from contract.figures import Figure, by_group, figure, share, upper
 
 Array = NDArray[np.float64]
 
@@ -68,16 +68,12 @@ def run_late(job: tuple[float, str, int]) -> HeldUp:
 
 def late_figures(runs: Sequence[HeldUp]) -> dict[str, Figure]:
     """Figures of each group."""
-    found: dict[str, Figure] = {}
-    for name in dict.fromkeys(run.group for run in runs):
-        of = [run for run in runs if run.group == name]
-        found |= {
-            f'{name}: error at {HELD_UP_S:g} s, median': figure([r.at_end for r in of]),
-            f'{name}: error at {HELD_UP_S:g} s, 90 %': figure([r.at_end for r in of], upper),
-            f'{name}: seconds until within 1 %, median': figure([r.settled_s for r in of]),
-            f'{name}: wrong while tracking': share([r.wrong for r in of]),
-        }
-    return found
+    return by_group(runs, lambda of: {
+        f'error at {HELD_UP_S:g} s, median': figure([r.at_end for r in of]),
+        f'error at {HELD_UP_S:g} s, 90 %': figure([r.at_end for r in of], upper),
+        'seconds until within 1 %, median': figure([r.settled_s for r in of]),
+        'wrong while tracking': share([r.wrong for r in of]),
+    })
 
 
 # Sequences of faults.
@@ -223,23 +219,21 @@ def _fitted(case: Any) -> tuple[float, float]:
 
 def identification_figures(runs: Sequence[Identified]) -> dict[str, Figure]:
     """What was promised, and what came out."""
-    figures: dict[str, Figure] = {}
-    for name in dict.fromkeys(run.group for run in runs):
-        of = [run for run in runs if run.group == name]
-        if name == NONE:
-            figures[f'{name}: a gap is promised'] = share([run.usable for run in of])
-            continue
+    def of_group(of: Sequence[Identified]) -> dict[str, Figure]:
+        if of[0].group == NONE:
+            return {'a gap is promised': share([run.usable for run in of])}
         good = [run for run in of if run.usable]
-        figures |= {f'{name}: {what}': one for what, one in {
+        return {
             'called of use': share([run.usable for run in of], 'more'),
             'error, median [gap]': figure([run.error for run in good]),
             'error, 90 % [gap]': figure([run.error for run in good], upper),
             'beyond 2 % of error': share([run.error > 0.02 for run in good]),
             'promised wrongly': share([run.deviations > 5.0 for run in good]),
             'delay right': share([run.delay_right for run in good], 'more'),
-        }.items()}
+        }
+
     fitted = [run.fitted for run in runs if run.fitted is not None]
-    return figures | {
+    return by_group(runs, of_group) | {
         'fit_record, G given: error, median [gap]': figure([error for error, _ in fitted]),
         'fit_record, G given: error, 90 % [gap]': figure([error for error, _ in fitted], upper),
         'fit_record, G given: beyond five deviations': share([z > 5.0 for _, z in fitted]),
@@ -316,26 +310,14 @@ def _identified_gear(gear: Gear) -> Found:
 
 def gears_figures(gears: Sequence[Sequence[GearOutcome]]) -> dict[str, Figure]:
     """Figures of presets and map."""
-    found: dict[str, Figure] = {}
     runs = [run for gear in gears for run in gear]
-    for name in dict.fromkeys(run.group for run in runs):
-        of = [run for run in runs if run.group == name]
-        found |= {f'{name}: {what}': one for what, one in {
-            'called of use': share([r.usable for r in of], 'more'),
-            'gap identified, median error': figure([r.identified for r in of]),
-            'gap in the loop, median error': figure([r.at_end for r in of]),
-            'gap in the loop, 90 %': figure([r.at_end for r in of], upper),
-            'tracking': share([r.tracking for r in of], 'more'),
-            'wrong while tracking': share([r.wrong for r in of]),
-        }.items()}
-        if name == 'presets':
-            found['presets: share of the error of y removed, median'] = figure(
-                [r.removed for r in of], better='more')
-    return found
-
-
-__all__ = [
-    'faults_figures', 'faults_jobs', 'gears_figures', 'gears_jobs', 'identification_figures',
-    'identification_jobs', 'late_figures', 'late_jobs', 'play', 'run_gear', 'run_identification',
-    'run_late',
-]
+    return by_group(runs, lambda of: {
+        'called of use': share([r.usable for r in of], 'more'),
+        'gap identified, median error': figure([r.identified for r in of]),
+        'gap in the loop, median error': figure([r.at_end for r in of]),
+        'gap in the loop, 90 %': figure([r.at_end for r in of], upper),
+        'tracking': share([r.tracking for r in of], 'more'),
+        'wrong while tracking': share([r.wrong for r in of]),
+        **({'share of the error of y removed, median': figure(
+            [r.removed for r in of], better='more')} if of[0].group == 'presets' else {}),
+    })

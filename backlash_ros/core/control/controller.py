@@ -12,7 +12,7 @@ from backlash_ros.core.control.limits import LARGEST, Limits, at_rest
 from backlash_ros.core.control.protocol import ControlInput, Structure
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure, InlineExecutor
+from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure
 from backlash_ros.core.law import Interval, Law, StateSource
 from backlash_ros.core.plant.state_model import StateModel
 
@@ -60,7 +60,7 @@ class AdaptiveController:
         self._considered: StateModel | None = None  # the proposal that was designed for last
         self._designed: StateModel | None = None  # that, with the motor in front
         self.failed_designs = 0
-        self._executor = executor or InlineExecutor()
+        self._executor = executor or Executor()
         self._channel: Channel | None = None  # for designs, from the first one on
         self._gains: object | None = None  # that were made, until they may take over
         self._waited = 0  # samples for which it could not

@@ -28,7 +28,7 @@ from backlash_ros.core.estimation.observer import Gains, gains_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Fit
 from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, LONGEST
-from backlash_ros.core.jobs.executor import Executor, Failure, InlineExecutor, Samples
+from backlash_ros.core.jobs.executor import Executor, Failure, Samples
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
@@ -128,7 +128,7 @@ class MovingHorizon(Law):
             initial.c_r - initial.c_l, walk_std * sample_period**0.5,
             np.array(drift_std) * sample_period**0.5,
         )
-        self._channel = (executor or InlineExecutor()).open(3, CAPACITY)
+        self._channel = (executor or Executor()).open(3, CAPACITY)
         self._end = 0  # samples so far
         self._newer: deque[tuple[float, float]] = deque(maxlen=CAPACITY)  # since the last fit
         self._belief = Belief(inherited=_inherited(initial), published=_values(initial))
@@ -290,7 +290,6 @@ class MovingHorizon(Law):
     def refine(self, budget_s: float = inf) -> None:
         """Take up a fit that is finished, and have the record fitted where that is due."""
         channel = self._channel
-        channel.tend()
         if channel.busy:
             self._take(channel.poll())
         due = self._end >= self._belief.next_at or self._following.surprised
@@ -302,7 +301,7 @@ class MovingHorizon(Law):
         proposed: Array = np.zeros(count) if proposal is None else proposal.xi
         channel.submit(
             fitted, self._setup, self._belief, self.model.transfer_function, proposed,
-            self._following.gains is None,
+            self._following.gains is None, since=self._belief.first,
         )
         self._take(channel.poll())
 

@@ -25,22 +25,16 @@ Array = NDArray[np.float64]
 # Square of a signal below which it counts as none. Its inverse, times the square of any
 # measurement, still is a number.
 LEAST_SQUARE = 1e-240
-MEMORY = 200  # samples over which the mean is taken, with weights that fade
+MEMORY = 200  # samples over which means are taken, with weights that fade
 LEAST_SAMPLES, EVERY = 100, 20  # before the first judgement, and from one to the next
-AGREED = 0.1  # largest error, as a share of what the crossings make of t
-# Smallest eigenvalue of R, as a share of the largest, that is more than the rounding of its sums:
-# below it the samples do not tell one theta from all others.
-LEAST_EIGENVALUE = 1e-12
-# Deviations by which the slope that fits best lies below 0 where y moves against v.
-NEGATIVE = 5.0
 
 
 class Agreement:
     """Means of the products of phi and t, by which estimates are judged.
 
-    status: TRACKING while no theta that explains the samples differs by more than AGREED from the
-    estimate that was judged last, nor this one from the newest; INCONSISTENT where the samples ask
-    for a negative slope; ACQUIRING otherwise.
+    status: TRACKING while no theta that explains the samples differs from the estimate that was
+    judged last, nor this one from the newest, by more than a tenth of what the crossings make of t;
+    INCONSISTENT where the samples ask for a negative slope; ACQUIRING otherwise.
     """
 
     def __init__(self) -> None:
@@ -75,25 +69,22 @@ class Agreement:
         scaled = self._products[:3, :3] / np.outer(size, size)
         eigenvalues, eigenvectors = np.linalg.eigh(scaled)
         least = float(eigenvalues[0])
-        if least <= LEAST_EIGENVALUE * float(eigenvalues[-1]):
+        # No more than the rounding of the sums: the samples do not tell one theta from all others.
+        if least <= 1e-12 * float(eigenvalues[-1]):
             return Status.ACQUIRING
-        most = AGREED**2 * float((theta[1] * size[1]) ** 2 + (theta[2] * size[2]) ** 2)
+        most = 0.1**2 * float((theta[1] * size[1]) ** 2 + (theta[2] * size[2]) ** 2)
         if self._mean_square(np.array(theta)) <= least * most:
             self._judged, self._most = theta, most
             self._weights = tuple(size.tolist())
             return Status.TRACKING
         # With R = Q diag(l) Q' this is R^-1, positive definite whatever rounding does to R.
         inverse = (eigenvectors / eigenvalues) @ eigenvectors.T
-        slope, deviation = self._best_slope(inverse, size)
-        return Status.INCONSISTENT if slope < -NEGATIVE * deviation else Status.ACQUIRING
+        best = inverse @ (self._products[:3, 3] / size) / size
+        variance = self._mean_square(best) * float(inverse[0, 0])
+        deviation = sqrt(variance / min(self._samples, MEMORY)) / float(size[0])
+        return Status.INCONSISTENT if float(best[0]) < -5.0 * deviation else Status.ACQUIRING
 
     def _mean_square(self, theta: Array) -> float:
         """Mean of (t - theta' phi)^2."""
         weights = np.append(-theta, 1.0)
         return max(float(weights @ self._products @ weights), 0.0)
-
-    def _best_slope(self, inverse: Array, size: Array) -> tuple[float, float]:
-        """The m that explains the samples best, and its standard deviation. inverse: of R."""
-        best = inverse @ (self._products[:3, 3] / size) / size
-        variance = self._mean_square(best) * float(inverse[0, 0])
-        return float(best[0]), sqrt(variance / min(self._samples, MEMORY)) / float(size[0])

@@ -20,8 +20,6 @@ from backlash_ros.core.plant.state_model import StateModel
 
 Array = NDArray[np.float64]
 
-STATE_SCALE = 1e3  # prior of x in units of the first output and of the noise
-
 
 class FixedBacklash(Law):
     """The estimates stay what they are given as; only the state of G is estimated.
@@ -92,7 +90,8 @@ class FixedBacklash(Law):
             self._innovation = nan
         else:
             if not self._started:
-                x_scale = STATE_SCALE * (abs(y) + self._noise_var**0.5)
+                # A prior that is wide beside the first output and the noise.
+                x_scale = 1e3 * (abs(y) + self._noise_var**0.5)
                 p[:-1, :-1] += x_scale**2 * np.eye(len(x) - 1)
                 self._started = True
             cross = self._c * p[:, 0]

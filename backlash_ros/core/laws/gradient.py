@@ -12,9 +12,9 @@ so that with zeta = W phi the estimation error is linear in the parameter error:
 
 xi = theta_hat' zeta - W u_d is the swapping term. P = diag(1/v_s^2, 1, 1) gives the slope and the
 crossings regressors of one size; v_s^2, u_s^2 and 10 a^2 are the means of v^2, u_d^2 and
-zeta' P zeta, so that no unit matters; a is larger where y is noisy. The side of phi is the one
-the inverse used, and that of a backlash theta_hat where v lies on no line of the inverse: limited,
-or not compensated. As long as the loop is that of pole_placement.py,
+zeta' P zeta, so that no unit matters; a is at least 10 deviations of the noise on y over u_s. The
+side of phi is the one the inverse used, and that of a backlash theta_hat where v lies on no line of
+the inverse: limited, or not compensated. As long as the loop is that of pole_placement.py,
 B R/(Lambda A_m) y = W u_d - y_ref with y_ref = theta_3 B/A_m y_m: then eps is what y differs from
 y_ref by, beyond the swapping term.
 
@@ -32,16 +32,10 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval, Law
-from backlash_ros.core.laws.agreement import LEAST_SQUARE, Agreement
+from backlash_ros.core.laws.agreement import LEAST_SQUARE, MEMORY, Agreement
 from backlash_ros.core.plant.four_blocks import FourBlocks
-from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
-
-ON_LINE = 1e-9  # relative distance of v from a line of the inverse that counts as none
-FLOOR = 0.1  # a^2, in units of the mean of zeta' P zeta
-NOISE_MARGIN = 10.0  # a is at least that many standard deviations of y, in units of u_s
-MEMORY = 200  # samples of the running means
 
 
 class GradientEstimator(Law):
@@ -56,11 +50,14 @@ class GradientEstimator(Law):
         self.estimate = initial
         self.step = step
         self._innovation, self._u_hat = nan, 0.0
-        self._bounds, self._noise_square = bounds, (NOISE_MARGIN * noise_std) ** 2
+        self._bounds, self._noise_square = bounds, (10.0 * noise_std) ** 2
         self._y = 0.0  # the newest one, or what was expected of it
         self._agreement = Agreement()
-        # W of phi and of u_d, and what returns of y, side by side.
-        self._filters = _Filters([*[blocks.disturbance] * 4, blocks.returned])
+        # W of phi and of u_d, and what returns of y, side by side in observer form.
+        models = [*[blocks.disturbance] * 4, blocks.returned]
+        self._a = models[0].state_space()[0]
+        self._b: Array = np.column_stack([model.state_space()[1] for model in models])
+        self._x: Array = np.zeros(self._b.shape)
         self._phi: Array = np.zeros(3)
         self._v_square = self._u_square = self._size = 0.0  # running means
         self._samples = 0
@@ -82,7 +79,8 @@ class GradientEstimator(Law):
         theta = np.array([old.m, old.m * old.c_r, old.m * old.c_l])
         self._u_hat = float(theta @ self._phi)
         inputs = np.concatenate((self._phi, (interval.u_d, self._y)))
-        filtered = self._filters.step(inputs)
+        self._x = self._a @ self._x + self._b * inputs
+        filtered = self._x[0]
         self._samples += 1
         share = 1.0 / min(self._samples, MEMORY)
         self._v_square += share * (interval.v**2 - self._v_square)
@@ -101,7 +99,7 @@ class GradientEstimator(Law):
         scaled = zeta * np.array([1.0 / self._v_square, 1.0, 1.0])
         size = float(zeta @ scaled)
         self._size += share * (size - self._size)
-        norm = size + max(FLOOR * self._size, self._noise_square / self._u_square)
+        norm = size + max(0.1 * self._size, self._noise_square / self._u_square)
         norm += xi**2 / self._u_square
         if norm == 0.0 or not self.adapting:
             return
@@ -120,7 +118,7 @@ class GradientEstimator(Law):
     def _engage(self, interval: Interval, used: Estimate) -> None:
         """Set phi for the line on which v lies; between lines the last one holds."""
         v, line = interval.v, interval.u_d / used.m
-        near = ON_LINE * (abs(v) + abs(line))
+        near = 1e-9 * (abs(v) + abs(line))
         right, left = abs(v - line - used.c_r) <= near, abs(v - line - used.c_l) <= near
         if not (right or left):
             right = self._u_hat < used.m * (v - used.c_r)
@@ -129,17 +127,3 @@ class GradientEstimator(Law):
             self._phi = np.array([v, -1.0, 0.0])
         elif left:
             self._phi = np.array([v, 0.0, -1.0])
-
-
-class _Filters:
-    """Strictly proper transfer functions with one denominator, each applied to its signal."""
-
-    def __init__(self, models: list[TransferFunction]) -> None:
-        self._a = models[0].state_space()[0]
-        self._b: Array = np.column_stack([model.state_space()[1] for model in models])
-        self._x: Array = np.zeros(self._b.shape)
-
-    def step(self, inputs: Array) -> Array:
-        """Take in u(k-1) of each signal and return y(k), shape (signals,)."""
-        self._x = self._a @ self._x + self._b * inputs
-        return np.asarray(self._x[0])

@@ -22,13 +22,6 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-# y is scaled so that a typical step of u, of size 1, shows in it with size 1. The floors say how
-# much noise the smoother assumes at least: this share of the weakest response, which counts as no
-# weaker than so much of the typical one.
-NOISE_FLOOR, WEAKEST = 1e-3, 1e-4
-# After a lost sample the covariance takes this many lags to become stationary again.
-LAGS_TO_STEADY = 4
-
 
 class InputReconstruction:
     """Fixed-lag smoother: u_hat(k - lag) from y(..k).
@@ -52,9 +45,15 @@ class InputReconstruction:
         self.samples = 0
         state = StateModel(model)
         n = self._n = state.order
-        self._scale, weakest = _typical_and_weakest(model)
+        # y is scaled so that a typical step of u, of size 1, shows in it with size 1: the median of
+        # |G W| on the unit circle, W = 1/(z - 1). The least noise that is assumed is a share of the
+        # weakest response, which counts as no weaker than 1e-4 of the typical one.
+        z = np.exp(1j * np.linspace(0.01, np.pi, 200))
+        response = np.abs(model.response(z) / (z - 1.0))
+        self._scale = float(np.median(response))
+        weakest = max(float(response.min()) / self._scale, 1e-4)
         self._c = state.c
-        noise = max(smoothed * noise_std / self._scale, NOISE_FLOOR * weakest)
+        noise = max(smoothed * noise_std / self._scale, 1e-3 * weakest)
         self._noise = noise * noise  # inf where ** would raise
         # z = [x(k), u(k), u(k-1) .. u(k-lag)], from k-1 to k before y(k).
         self._step = np.zeros((n + 1 + lag, n + 1 + lag))
@@ -79,7 +78,8 @@ class InputReconstruction:
         self._closed = self._step - np.outer(self._gain, self._seen)
         self.std = sqrt(variance)
         self._z: Array = np.zeros(n + 1 + lag)  # given y(..k)
-        self._steady_after = self._since_loss = LAGS_TO_STEADY * lag
+        # Samples after a lost one until the covariance is stationary again.
+        self._steady_after = self._since_loss = 4 * lag
 
     def _stationary(self) -> Array:
         """Covariance of z before a measurement when no sample was ever lost."""
@@ -151,11 +151,3 @@ class InputReconstruction:
         p = self._step @ p @ self._step.T
         p[self._n, self._n] += 1.0
         return np.asarray(0.5 * (p + p.T))
-
-
-def _typical_and_weakest(model: TransferFunction) -> tuple[float, float]:
-    """Median of |G W| on the unit circle, W = 1/(z - 1), and its minimum in units of that."""
-    z = np.exp(1j * np.linspace(0.01, np.pi, 200))
-    response = np.abs(model.response(z) / (z - 1.0))
-    typical = float(np.median(response))
-    return typical, max(float(response.min()) / typical, WEAKEST)

@@ -12,10 +12,7 @@ from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.agreement import Agreement
 from backlash_ros.core.laws.input_reconstruction import InputReconstruction
 
-# A side is engaged when the reconstructed u moves on in one direction over this many samples to
-# either side, by more than so many standard deviations of its error: smoothing rounds the corners.
-STROKE, MOTION_THRESHOLD = 8, 2.0
-LEAST_SHARE = 0.25  # of the mean motion of the stroke, below which the sample itself rests
+STROKE = 8  # samples to either side over which u moves on in one direction
 
 
 class LaggedLaw(Law):
@@ -24,7 +21,7 @@ class LaggedLaw(Law):
     def __init__(self, reconstruction: InputReconstruction) -> None:
         self._reconstruction = reconstruction
         self._applied: deque[Interval] = deque(maxlen=reconstruction.lag)
-        self._threshold = MOTION_THRESHOLD * reconstruction.std
+        self._threshold = 2.0 * reconstruction.std
         self._past: deque[float] = deque([0.0, 0.0], maxlen=STROKE + 1)
         self._agreement = Agreement()
 
@@ -59,7 +56,8 @@ class LaggedLaw(Law):
         """Whether u moves on the right line (True) or the left one; None where it may rest.
 
         u rises only on the right line and falls only on the left one, so that no wrong side can
-        lock in.
+        lock in. It counts as moving on by two deviations of its error, as smoothing rounds the
+        corners, and at no less than a quarter of the mean pace of the stroke.
         """
         ahead = self._reconstruction.newer(STROKE) - u
         behind = u - self._past[0]
@@ -68,7 +66,7 @@ class LaggedLaw(Law):
             ahead, behind, step = -ahead, -behind, -step
             rising = False
         slowest = min(ahead, behind)
-        if slowest <= self._threshold or step < LEAST_SHARE * slowest / STROKE:
+        if slowest <= self._threshold or step < 0.25 * slowest / STROKE:
             return None
         return rising
 

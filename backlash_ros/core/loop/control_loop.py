@@ -17,7 +17,7 @@ from backlash_ros.core.assembly import (
 from backlash_ros.core.control.controller import LONGEST_GAP, ControlStep
 from backlash_ros.core.control.limits import Motion, at_rest, last_commands, plausible
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.jobs.executor import Executor, InlineExecutor
+from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.loop.command_history import CommandHistory, report_use
 from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.phase import Event, Phase, after
@@ -65,7 +65,7 @@ class ControlLoop:
         self.phase = Phase.BEGINS
         self.heard_at: float | None = None
         self.referred_at: float | None = None
-        self.executor = executor or InlineExecutor()
+        self.executor = executor or Executor()
         self.core = build_controller(p, estimate, self.executor)
         self.knows_v = v is not None
         if v is not None:

@@ -9,9 +9,6 @@ from pathlib import Path
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
-HEADER = ['t', 'y_m']
-TIME_TOLERANCE = 1e-3  # of a sample period: what a file in decimals rounds away
-
 
 def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
     """Values of the CSV with the header t,y_m and a row per sample period, from t = 0 on.
@@ -28,7 +25,7 @@ def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
             header, *rows = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ParameterError('file', name, f'cannot be read: {error}') from None
-    if [cell.strip() for cell in header] != HEADER:
+    if [cell.strip() for cell in header] != ['t', 'y_m']:
         raise ParameterError('file', name, 'must begin with the header t,y_m')
     samples: list[float] = []
     for line, row in enumerate(rows, start=2):
@@ -37,7 +34,8 @@ def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
         except ValueError:
             raise ParameterError('file', name, f'line {line} must hold t,y_m') from None
         due = len(samples) * period
-        if not (abs(t - due) <= TIME_TOLERANCE * period and isfinite(y_m)):
+        # A file in decimals rounds a little away.
+        if not (abs(t - due) <= 1e-3 * period and isfinite(y_m)):
             raise ParameterError(
                 'file', name, f'line {line} must hold t={due:.9g} and a finite y_m',
                 f'one row per sample_period={period!r}',

@@ -24,7 +24,6 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_d
 Array = NDArray[np.float64]
 
 COMPARED = ('m', 'c_r', 'c_l')
-KEPT = ('u', 'true_m', 'true_c_r', 'true_c_l')  # what no controller can say, taken over
 
 
 class Parting(NamedTuple):
@@ -89,7 +88,7 @@ def replay(
         v_before, v_made = v, step.v
         if on_sample is not None:
             on_sample(k)
-    for name in KEPT:
+    for name in ('u', 'true_m', 'true_c_r', 'true_c_l'):  # what no controller can say
         rows[:, COLUMNS.index(name)] = recorded.column(name)
     return RunRecord(
         rows, recorded.sample_period, recorded.lost_samples,

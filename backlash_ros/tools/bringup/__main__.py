@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING
 from backlash_ros import topics
 from backlash_ros.options import DONE, FAILED, OptionParser
 from backlash_ros.tools import cli
-from backlash_ros.tools.cli import InputError, StopRequests
+from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests
 
 if TYPE_CHECKING:
     from backlash_ros.tools.bringup.plan import AxisPlan, RunPlan
+    from backlash_ros.tools.bringup.watch import RunWatch
 
 EPILOG = """
 driver: with --driver COMMAND that command runs in the place of the simulated plant, until the
@@ -91,96 +92,85 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nonlocal code
         options = parse_options(arguments)
         # Loading numpy and scipy takes a second, in which a Ctrl-C is to be heard already.
-        from backlash_ros.tools.bringup.plan import prepare
-        code = perform(prepare(options))
+        with StopRequests() as requests:
+            from backlash_ros.tools.bringup.plan import prepare
+            plan = prepare(options)
+            watch = run(plan, requests)
+        reported = [watch.has_samples(axis) and report(axis) for axis in plan.axes]
+        code = DONE if all(reported) and not watch.failure else FAILED
 
     return cli.run_tool('bringup', bringup) or code
 
 
-def perform(plan: RunPlan) -> int:
-    """Run and report; returns the exit code. Raises BrokenOffError where nothing can start."""
-    from backlash_ros.tools.bringup.plan import plan_processes
+def run(plan: RunPlan, requests: StopRequests) -> RunWatch:
+    """Run all processes to the end; raises BrokenOffError where nothing can start."""
+    from backlash_ros.tools.bringup.environment import free_domain
+    from backlash_ros.tools.bringup.plan import ELSEWHERE, plan_processes
     from backlash_ros.tools.bringup.supervisor import ProcessSupervisor
     from backlash_ros.tools.bringup.watch import RunWatch
+    if requests.count:
+        raise BrokenOffError(f'interrupted by {requests.last}')
+    discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    awaited = [axis.name for axis in plan.axes if axis.parameters.driver == ELSEWHERE]
+    said, domain = [], None
     with ExitStack() as stack:
-        requests = stack.enter_context(StopRequests())
-        stages = plan_processes(plan, _announced_domain(plan, stack))
-        _announce_others(plan)
-        supervisor = stack.enter_context(ProcessSupervisor(stages, requests.insist))
+        if awaited:
+            # Whoever started the driver did so in the domain that is set there, or in none.
+            of = f' of {", ".join(awaited)}' if awaited != [''] else ''
+            said.append(
+                f'waiting for the driver{of} as long as it takes: start it with ROS_DOMAIN_ID='
+                f'{os.environ.get("ROS_DOMAIN_ID") or 0} '
+                f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}'
+            )
+        elif not os.environ.get('ROS_DOMAIN_ID'):
+            domain = stack.enter_context(free_domain())
+            said.append(f'to listen in: export ROS_DOMAIN_ID={domain} '
+                        f'ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}')
+        managed = [
+            axis.process_name('controller') for axis in plan.axes if not axis.parameters.autostart
+        ]
+        if managed:
+            said.append(f'waiting until somebody activates {", ".join(managed)} (autostart: false)')
+        said += [
+            f'waiting for whoever plans the motion, on {axis.process_name(topics.ROBOT_COMMAND)}'
+            for axis in plan.axes if axis.parameters.joints
+        ]
+        for line in said:
+            print(line, flush=True)
+        stages = plan_processes(plan, domain)
+        supervisor = stack.enter_context(ProcessSupervisor(stages, lambda: requests.count > 1))
         watch = RunWatch(plan, supervisor, requests)
         watch.execute()
-    reported = [watch.has_samples(axis) and report(axis) for axis in plan.axes]
-    return DONE if all(reported) and not watch.failure else FAILED
-
-
-def _announced_domain(plan: RunPlan, stack: ExitStack) -> int | None:
-    """ROS_DOMAIN_ID to set, None to leave it alone; says where to listen or what is awaited."""
-    from backlash_ros.tools.bringup.environment import free_domain
-    from backlash_ros.tools.bringup.plan import ELSEWHERE
-    discovery = os.environ.get('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    awaited = [axis.name for axis in plan.axes if axis.driver == ELSEWHERE]
-    if awaited:
-        # Whoever started the driver did so in the domain that is set there, or in none.
-        domain = os.environ.get('ROS_DOMAIN_ID') or '0'
-        of = f' of {", ".join(awaited)}' if awaited != [''] else ''
-        print(
-            f'waiting for the driver{of} as long as it takes: start it with '
-            f'ROS_DOMAIN_ID={domain} ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}', flush=True,
-        )
-        return None
-    if os.environ.get('ROS_DOMAIN_ID'):
-        return None
-    free = stack.enter_context(free_domain())
-    print(
-        f'to listen in: export ROS_DOMAIN_ID={free} ROS_AUTOMATIC_DISCOVERY_RANGE={discovery}',
-        flush=True,
-    )
-    return free
-
-
-def _announce_others(plan: RunPlan) -> None:
-    """Say who besides the driver is waited for."""
-    managed = [axis.process_name('controller') for axis in plan.axes if axis.managed]
-    if managed:
-        print(f'waiting until somebody activates {", ".join(managed)} (autostart: false)',
-              flush=True)
-    for axis in plan.axes:
-        if axis.joints:
-            topic = axis.process_name(topics.ROBOT_COMMAND)
-            print(f'waiting for whoever plans the motion, on {topic}', flush=True)
+    return watch
 
 
 def report(axis: AxisPlan) -> bool:
     """Write and print what came out of an axis; returns whether that worked."""
-    if not axis.record:
-        print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
-        return True
-    reported = [_report(axis, joint) for joint in axis.joints or ('',)]
-    return all(reported)
-
-
-def _report(axis: AxisPlan, joint: str) -> bool:
-    """Report one joint, in a folder of its own, or the only one, which is nameless."""
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.bringup.watch import complain
     from backlash_ros.tools.report import REPORT_PAGE, write_report
     from backlash_ros.tools.runs.read_run import read_run
     from backlash_ros.tools.runs.summary import estimate_table
-    out = axis.out / joint
-    try:
-        out.mkdir(exist_ok=True)
-        summary = write_report(read_run(axis.bag, axis=joint), out)
-    except (InputError, OSError) as error:
-        complain(axis.titled(f'no report: {error}'))
-        return False
-    print(estimate_table(summary, '/'.join(filter(None, (axis.name, joint)))))
-    facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
-    latency = summary['loop_latency_ms']
-    if latency is not None:
-        facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
-    print(facts)
-    print(f'report: {out / REPORT_PAGE}')
-    return True
+    if not axis.record:
+        print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
+        return True
+    good = True
+    # Joints have a folder each.
+    for joint in axis.parameters.joint_names:
+        out = axis.out / joint
+        try:
+            out.mkdir(exist_ok=True)
+            summary = write_report(read_run(axis.bag, axis=joint), out)
+        except (InputError, OSError) as error:
+            complain(axis.titled(f'no report: {error}'))
+            good = False
+            continue
+        print(estimate_table(summary, '/'.join(filter(None, (axis.name, joint)))))
+        facts = f'{summary["samples"]} samples, {summary["lost_samples"]} lost'
+        if latency := summary['loop_latency_ms']:
+            facts += f', y to v within {latency["p50"]:.2f} ms (p50), {latency["p99"]:.2f} ms (p99)'
+        print(f'{facts}\nreport: {out / REPORT_PAGE}')
+    return good
 
 
 if __name__ == '__main__':

@@ -13,27 +13,22 @@ import backlash_ros
 from backlash_ros.middleware.loopback import prefer_loopback
 from backlash_ros.tools.cli import BrokenOffError
 
-# UDP ports of RTPS: domain d has those from 7400 + 250 d on, of which participant n takes 10 + 2 n
-# and 11 + 2 n.
-DOMAIN_0_PORT, PORTS_PER_DOMAIN = 7400, 250
-
 
 def child_environment(log_folder: Path, domain: int | None) -> dict[str, str]:
     """Environment of nodes that report events and are confined to this machine.
 
     What the user has set stays. domain: ROS_DOMAIN_ID to set, None to leave it alone.
     """
-    environment = with_source(os.environ)
-    environment['BACKLASH_ROS_EVENTS'] = '1'
-    environment['PYTHONUNBUFFERED'] = '1'
+    # The matrices are tiny: more threads would only take the processors from each other.
+    one_thread = dict.fromkeys(('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'), '1')
+    environment = {
+        'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST', 'ROS_LOG_DIR': str(log_folder / 'ros'),
+        **one_thread, **with_source(os.environ), 'BACKLASH_ROS_EVENTS': '1',
+        'PYTHONUNBUFFERED': '1',
+    }
     if domain is not None:
         environment['ROS_DOMAIN_ID'] = str(domain)
-    environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     prefer_loopback(environment)  # for drivers; the nodes of this package do so themselves
-    environment.setdefault('ROS_LOG_DIR', str(log_folder / 'ros'))
-    # The matrices are tiny: more threads would only take the processors from each other.
-    for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
-        environment.setdefault(name, '1')
     return environment
 
 
@@ -52,8 +47,7 @@ def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
     """
     foreign = dict(environment)
     foreign.pop('BACKLASH_ROS_EVENTS', None)
-    by_wheels = foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None) is not None
-    if by_wheels and 'LD_LIBRARY_PATH' in foreign:
+    if foreign.pop('_ROS_WHEELS_BOOTSTRAP_COMPLETE', None) and 'LD_LIBRARY_PATH' in foreign:
         folders = foreign.pop('LD_LIBRARY_PATH').split(os.pathsep)
         kept = [folder for folder in folders if not Path(folder).is_relative_to(sys.prefix)]
         if kept:
@@ -65,22 +59,22 @@ def foreign_environment(environment: Mapping[str, str]) -> dict[str, str]:
 def free_domain() -> Iterator[int]:
     """A ROS_DOMAIN_ID that nobody on this machine uses, reserved as long as the context lasts.
 
-    Every domain has UDP ports of its own (RTPS 2.5, 9.6.2). A domain is in use when the port of
-    a participant is taken; a port that no participant ever uses reserves it, and the kernel
-    gives that back whatever happens to this process. Raises BrokenOffError if all are in use.
+    Domain d has the UDP ports from 7400 + 250 d on, of which participant n takes 10 + 2 n and
+    11 + 2 n (RTPS 2.5, 9.6.2). A domain is in use when the port of a participant is taken; a port
+    that no participant ever uses reserves it, and the kernel gives that back whatever happens to
+    this process. Raises BrokenOffError if all are in use.
     """
     domains = 101  # those that lie below the ports that Linux hands out to others
-    # As many participants as the discovery range LOCALHOST looks for.
-    participants = range(10, 74, 2)
     # Starting at the process id spreads runs that start at the same moment.
     for i in range(domains):
         domain = 1 + (os.getpid() + i) % domains
-        ports = DOMAIN_0_PORT + PORTS_PER_DOMAIN * domain
+        port = 7400 + 250 * domain
         with ExitStack() as reservation:
             try:
-                reservation.enter_context(_bound(ports + 5))
-                for offset in participants:
-                    _bound(ports + offset).close()
+                reservation.enter_context(_bound(port + 5))
+                # As many participants as the discovery range LOCALHOST looks for.
+                for of_participant in range(port + 10, port + 74, 2):
+                    _bound(of_participant).close()
             except OSError:
                 continue
             yield domain

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -18,22 +18,19 @@ from backlash_ros.options import LARGEST_PORT
 from backlash_ros.tools.bringup.environment import child_environment, foreign_environment
 from backlash_ros.tools.bringup.supervisor import ProcessPlan
 from backlash_ros.tools.cli import BrokenOffError, InputError, number_of_samples, print_warnings
-from backlash_ros.tools.config import Configuration, read_configuration, write_config
+from backlash_ros.tools.config import read_configuration, write_config
 from backlash_ros.tools.runs.files import CONFIG_FILE, result_directory
 from backlash_ros.tools.runs.read_run import BAG
 
-ELSEWHERE = 'none'
+ELSEWHERE = 'none'  # the parameter driver where somebody else starts it
 
 
-@dataclass
+@dataclass(frozen=True)
 class AxisPlan:
     """One controller of a run; its parameters are complete and checked, its folder exists.
 
-    name: also its namespace, empty for a run without axes. samples: of the whole run, 0 for one
-    without end. sample_period: T [s]. joints: empty where the controller has a single, nameless
-    one. driver: command of what stands in the place of the simulated plant, empty for nothing,
-    ELSEWHERE where somebody else starts it. managed: whether somebody else activates the
-    controller. bag, logs: folders.
+    name: also its namespace, empty for a run without axes. Of the parameters, samples is the length
+    of the whole run, 0 without end, and driver a command, empty for the simulated plant.
     """
 
     name: str
@@ -41,21 +38,26 @@ class AxisPlan:
     out: Path
     record: bool
 
-    def __post_init__(self) -> None:
-        p = self.parameters
-        self.samples, self.sample_period = p.samples, p.sample_period
-        self.joints, self.driver = p.joints, p.driver
-        self.managed = not p.autostart
-        self.bag, self.logs = self.out / BAG, self.out / 'logs'
+    @property
+    def bag(self) -> Path:
+        """Folder of the bag."""
+        return self.out / BAG
+
+    @property
+    def logs(self) -> Path:
+        """Folder of the logs."""
+        return self.out / 'logs'
 
     def waits(self, process: str) -> bool:
         """Whether one of its processes waits for somebody who may come at any time."""
-        elsewhere = self.driver == ELSEWHERE
-        return process in map(self.process_name, (
-            *(['controller'] if elsewhere or self.managed else []),
-            *(['plant'] if self.managed else []),  # begins when the controller listens
-            *(['recorder'] if self.joints else []),  # begins when the motion is planned
-        ))
+        p, waiting = self.parameters, []
+        if p.driver == ELSEWHERE or not p.autostart:
+            waiting.append('controller')
+        if not p.autostart:
+            waiting.append('plant')  # begins when the controller listens
+        if p.joints:
+            waiting.append('recorder')  # begins when the motion is planned
+        return process in map(self.process_name, waiting)
 
     def titled(self, text: str) -> str:
         """The text, with the name of the axis where there are axes."""
@@ -80,7 +82,7 @@ class RunPlan:
     @property
     def endless(self) -> bool:
         """Whether only the user ends it."""
-        return any(axis.samples == 0 for axis in self.axes)
+        return any(axis.parameters.samples == 0 for axis in self.axes)
 
 
 def prepare(options: argparse.Namespace) -> RunPlan:
@@ -95,7 +97,13 @@ def prepare(options: argparse.Namespace) -> RunPlan:
     # Each node takes one of the places that discovery on one machine has; some stay for listeners.
     if len(names) > 7:
         raise InputError(f'{len(names)} axes are too many for one machine: at most 7')
-    parameters = {name: _parameters(configuration, name, options) for name in names}
+    parameters: dict[str, Parameters] = {}
+    for name in names:
+        try:
+            parameters[name] = _checked(configuration.of_controller(name), name, options)
+        except (ParameterError, InputError) as error:
+            error.args = (f'{name}: {error}' if name else str(error),)
+            raise
     if options.unlimited and not any(values.driver for values in parameters.values()):
         raise InputError('--unlimited is about a driver: give --driver as well')
     live_port = options.live_port if options.live_port is not None else 0 if options.live else None
@@ -110,81 +118,61 @@ def prepare(options: argparse.Namespace) -> RunPlan:
                 f'give each axis one of its own, like --set {name}/estimates.file=...',
             )
         for joint in values.joint_names:
-            where = ': '.join(filter(None, ('bringup', name, joint)))
-            print_warnings(where, values.of_joint(joint))
+            print_warnings(': '.join(filter(None, ('bringup', name, joint))),
+                           values.of_joint(joint))
         if options.out is not None and (options.out / name / BAG).exists():
             raise InputError(f'--out={options.out}: holds a bag already, choose another folder')
     # The nodes need a path that holds wherever it is read.
     out = result_directory(options.out).resolve()
-    plan = RunPlan(tuple(
+    axes = tuple(
         AxisPlan(name, values, out / name, options.record) for name, values in parameters.items()
-    ), out, live_port)
+    )
     try:
-        for axis in plan.axes:
+        for axis in axes:
             axis.logs.mkdir(parents=True, exist_ok=True)
             write_config(axis.parameters, axis.out / CONFIG_FILE)
     except OSError as error:
-        raise InputError(f'{plan.out}: cannot be written: {error.strerror}') from None
-    return plan
+        raise InputError(f'{out}: cannot be written: {error.strerror}') from None
+    return RunPlan(axes, out, live_port)
 
 
-def _parameters(
-    configuration: Configuration, axis: str, options: argparse.Namespace,
-) -> Parameters:
-    """The parameters of an axis, checked as far as that is possible without running."""
+def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameters:
+    """The parameters of an axis with the options, checked as far as is possible without running."""
+    driver = (p.driver if options.driver is None else options.driver).strip()
+    p = p.replaced({
+        'lockstep': options.lockstep or p.lockstep, 'driver': driver.replace('{axis}', axis),
+        'samples': 0 if options.duration == inf else number_of_samples(p, options.duration),
+    })
     try:
-        parameters = configuration.of_controller(axis)
-        endless = options.duration == inf
-        parameters = parameters.replaced({
-            'lockstep': options.lockstep or parameters.lockstep,
-            'samples': 0 if endless else number_of_samples(parameters, options.duration),
-            **({} if options.driver is None else {'driver': options.driver}),
-        })
-        parameters = _with_driver(axis, parameters)
-        driver = parameters.driver
-        for joint in parameters.joint_names if driver and not options.unlimited else ():
-            missing = parameters.of_joint(joint).missing_limits
-            if missing:
-                raise ParameterError(
-                    f'{joint}.{missing[0]}' if joint else missing[0],
-                    parameters.of_joint(joint)[missing[0]],
-                    'is no limit, and a driver moves an actuator',
-                    f'set {", ".join(missing)}, or give --unlimited',
-                )
-        if bag := parameters.bag:
-            raise ParameterError('bag', bag, 'is made by bringup', 'choose its folder with --out')
-        for joint in parameters.joint_names:
-            build_controller(parameters.of_joint(joint))
-        build_reference(parameters)
-        if not driver:
-            build_plant(parameters)
-    except (ParameterError, InputError) as error:
-        error.args = (f'{axis}: {error}' if axis else str(error),)
-        raise
-    return parameters
-
-
-def _with_driver(axis: str, parameters: Parameters) -> Parameters:
-    """The set with the name of the axis in the command of its driver; raises ParameterError."""
-    text = parameters.driver.strip()
-    mark = '{axis}'
-    try:
-        shlex.split(text)
+        shlex.split(driver)
     except ValueError as error:
-        raise ParameterError('driver', text, 'is not a command', str(error)) from None
-    if text and parameters.lockstep:
-        raise ParameterError(
-            'driver', text, 'excludes lockstep', 'a real plant does not wait for its control'
-        )
-    if mark in text and not axis:
-        raise ParameterError('driver', text, 'names an axis', 'list the axes in the parameter axes')
-    if parameters.joints and not text:
-        raise ParameterError(
-            'driver', text, 'is empty, and nothing here simulates several joints',
-            'give --driver COMMAND, or none for one that you start yourself; '
-            '`simulate --axis JOINT` simulates one of them',
-        )
-    return parameters.replaced({'driver': text.replace(mark, axis)})
+        raise ParameterError('driver', driver, 'is not a command', str(error)) from None
+    for wrong, rule, cure in (
+        (driver and p.lockstep, 'excludes lockstep',
+         'a real plant does not wait for its control'),
+        ('{axis}' in driver and not axis, 'names an axis', 'list the axes in the parameter axes'),
+        (p.joints and not driver, 'is empty, and nothing here simulates several joints',
+         'give --driver COMMAND, or none for one that you start yourself; '
+         '`simulate --axis JOINT` simulates one of them'),
+    ):
+        if wrong:
+            raise ParameterError('driver', driver, rule, cure)
+    for joint in p.joint_names:
+        own = p.of_joint(joint)
+        if driver and not options.unlimited and (missing := own.missing_limits):
+            raise ParameterError(
+                f'{joint}.{missing[0]}' if joint else missing[0], own[missing[0]],
+                'is no limit, and a driver moves an actuator',
+                f'set {", ".join(missing)}, or give --unlimited',
+            )
+        if not p.bag:
+            build_controller(own)
+    if p.bag:
+        raise ParameterError('bag', p.bag, 'is made by bringup', 'choose its folder with --out')
+    build_reference(p)
+    if not driver:
+        build_plant(p)
+    return p
 
 
 def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]:
@@ -196,17 +184,17 @@ def plan_processes(plan: RunPlan, domain: int | None) -> list[list[ProcessPlan]]
     their motion. domain: ROS_DOMAIN_ID to set, None to leave it alone.
     """
     stages: list[list[ProcessPlan]] = [[], [], [], []]
+    served: dict[str, list[AxisPlan]] = {}
     for axis in plan.axes:
-        order = ('controller', '', '' if axis.joints else 'reference', 'recorder') \
-            if axis.driver else ('plant', 'reference', 'controller', 'recorder')
+        p = axis.parameters
+        order = ('controller', '', '' if p.joints else 'reference', 'recorder') \
+            if p.driver else ('plant', 'reference', 'controller', 'recorder')
         for stage, node in zip(stages, order, strict=True):
             if node:
-                stage.append(_node(axis, node, child_environment(axis.logs, domain)))
+                stage.append(_node(axis, node, domain))
+        if p.driver and p.driver != ELSEWHERE:
+            served.setdefault(p.driver, []).append(axis)
     # Axes with the very same command have one driver together.
-    served: dict[tuple[str, ...], list[AxisPlan]] = {}
-    for axis in plan.axes:
-        if axis.driver and axis.driver != ELSEWHERE:
-            served.setdefault(tuple(shlex.split(axis.driver)), []).append(axis)
     stages[1] += [_driver(plan, command, axes, domain) for command, axes in served.items()]
     if plan.live_port is not None:
         first = plan.axes[0]
@@ -223,32 +211,33 @@ def _module(name: str) -> tuple[str, ...]:
     return sys.executable, '-m', f'backlash_ros.nodes.{name}'
 
 
-def _node(axis: AxisPlan, node: str, environment: Mapping[str, str]) -> ProcessPlan:
+def _node(axis: AxisPlan, node: str, domain: int | None) -> ProcessPlan:
     lockstep = axis.parameters.lockstep
     if node == 'recorder':
         # In YAML, whatever stands in the path.
         bag = str(axis.bag).replace("'", "''") if axis.record else ''
-        own = {'wait_for_publishers': 'true', 'bag': f"'{bag}'"}
+        own = ['wait_for_publishers:=true', f"bag:='{bag}'"]
     else:
         # The loop and the recorder; in real time the reference follows plant_output as well, in
         # lockstep it follows /clock.
-        own = {'wait_for_subscribers': '3' if node == 'plant' and not lockstep else '2'}
+        own = [f'wait_for_subscribers:={3 if node == "plant" and not lockstep else 2}']
     command = [*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG_FILE)]
-    for parameter, value in own.items():
-        command += ['-p', f'{parameter}:={value}']
+    for setting in own:
+        command += ['-p', setting]
     if axis.name:
         command += ['-r', f'__ns:=/{axis.name}']
         if lockstep:
             command += ['-r', '/clock:=clock']  # each axis has a time of its own
     return ProcessPlan(
-        axis.process_name(node), tuple(command), axis.logs / f'{node}.log', environment, axis.name,
+        axis.process_name(node), tuple(command), axis.logs / f'{node}.log',
+        child_environment(axis.logs, domain), axis.name,
         # The controller may end with a ramp, and then saves what it has learned.
         grace_s=axis.parameters.timeout.ramp if node == 'controller' else 0.0,
     )
 
 
 def _driver(
-    plan: RunPlan, command: tuple[str, ...], axes: Sequence[AxisPlan], domain: int | None,
+    plan: RunPlan, command: str, axes: Sequence[AxisPlan], domain: int | None,
 ) -> ProcessPlan:
     name, log = axes[0].process_name('driver'), axes[0].logs / 'driver.log'
     if len(axes) > 1:
@@ -256,6 +245,8 @@ def _driver(
         name, log = f'driver of {", ".join(names)}', plan.out / 'logs' / f'{"_".join(names)}.log'
         log.parent.mkdir(exist_ok=True)
     # The last command of the controller acts from the next sample of the driver on.
-    settle_s = min(2.0 * max(axis.sample_period for axis in axes), 1.0)
+    settle_s = min(2.0 * max(axis.parameters.sample_period for axis in axes), 1.0)
     environment = foreign_environment(child_environment(log.parent, domain))
-    return ProcessPlan(name, command, log, environment, foreign=True, settle_s=settle_s)
+    return ProcessPlan(
+        name, tuple(shlex.split(command)), log, environment, foreign=True, settle_s=settle_s
+    )

@@ -3,8 +3,8 @@
 Every child leads a process group of its own, so that a Ctrl-C of the terminal reaches the
 supervisor alone, which then stops the children in order, grandchildren included. A guardian, this
 module as a program, holds the other end of a pipe: when the supervisor dies of whatever cause, the
-pipe closes and the guardian stops what is left.
-Nothing here starts a thread: forking stays safe and a signal finds one loop to wake.
+pipe closes and the guardian stops what is left. Nothing here starts a thread: forking stays safe
+and a signal finds one loop to wake.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.cli import BrokenOffError
 
-NUM_THREADS = 14  # of the fields behind the process group in /proc/PID/stat
 # SIGINT lets a node end as by Ctrl-C; a recorder may need a while to close a large bag.
 ESCALATION = ((signal.SIGINT, 10.0), (signal.SIGTERM, 3.0), (signal.SIGKILL, 3.0))
 
@@ -50,44 +50,41 @@ class ProcessPlan:
     grace_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class Event:
-    """A JSON object that a process printed as a line of its stdout."""
+class Event(NamedTuple):
+    """A JSON object that a process printed as a line of its stdout; kind: what happened."""
 
     plan: ProcessPlan
+    kind: str
     content: Mapping[str, object]
-
-    @property
-    def kind(self) -> str:
-        """The word that says what happened: ready, progress, done, closed."""
-        return str(self.content['event'])
 
 
 @dataclass
 class Child:
-    """A started process; what it prints besides events goes to its log."""
+    """A started process. What it prints besides events goes to its log."""
 
     plan: ProcessPlan
     process: subprocess.Popen[bytes]
-    unfinished_line: bytes = field(default=b'', repr=False)
+    unfinished_line: bytes = b''
 
     def take(self, chunk: bytes) -> list[Event]:
         """Events of the lines that end in this chunk of stdout."""
         *lines, self.unfinished_line = (self.unfinished_line + chunk).split(b'\n')
         events = []
         for line in lines:
-            with contextlib.suppress(ValueError):
+            try:
                 content = json.loads(line)
-                if isinstance(content, dict) and 'event' in content:
-                    events.append(Event(self.plan, content))
-                    continue
-            with self.plan.log.open('ab') as log:
-                log.write(line + b'\n')
+                events.append(Event(self.plan, str(content['event']), content))
+            except (ValueError, TypeError, KeyError):
+                with self.plan.log.open('ab') as log:
+                    log.write(line + b'\n')
         return events
 
     def describe_end(self, what: str, further: str = '') -> str:
         """What became of it, how it exited, and the end of its log."""
-        return f'{self.plan.name} {what} ({self.exit}){further}, the end of {self.end_of_log()}'
+        code, end = self.process.returncode, f'exit code {self.process.returncode}'
+        if code is not None and code < 0:
+            end = f'killed by {signal.Signals(-code).name}'
+        return f'{self.plan.name} {what} ({end}){further}, the end of {self.end_of_log()}'
 
     def end_of_log(self) -> str:
         """The last ten lines of the log, indented."""
@@ -95,14 +92,6 @@ class Child:
         lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
         quoted = ''.join(f'\n    {line}' for line in lines[-10:])
         return f'{log}:{quoted}' if quoted else f'{log} is empty'
-
-    @property
-    def exit(self) -> str:
-        """How the process ended, in words."""
-        code = self.process.returncode
-        if code is not None and code < 0:
-            return f'killed by {signal.Signals(-code).name}'
-        return f'exit code {code}'
 
 
 class ProcessSupervisor:
@@ -131,7 +120,7 @@ class ProcessSupervisor:
             for children, plans in zip(self._stages, self._plans, strict=True):
                 for plan in plans:
                     children.append(self._start(plan))
-                    self._tell_guardian(self._stages)
+                    self._tell_guardian(0)
         except BaseException:
             self.__exit__()
             raise
@@ -143,8 +132,7 @@ class ProcessSupervisor:
         for child in self.children:
             if child.process.stdout is not None:
                 child.process.stdout.close()
-        if self._guardian is not None:
-            assert self._guardian.stdin is not None
+        if self._guardian is not None and self._guardian.stdin is not None:
             self._guardian.stdin.close()
             self._guardian.wait()
 
@@ -182,7 +170,7 @@ class ProcessSupervisor:
             stop_groups(*_groups(children), listen, self._hurry)
             for child in children:
                 child.process.poll()
-            self._tell_guardian(self._stages[i + 1:])
+            self._tell_guardian(i + 1)
         while self._selector.select(0.0):
             listen()
         return last_words
@@ -209,9 +197,10 @@ class ProcessSupervisor:
             self._selector.register(process.stdout, selectors.EVENT_READ, child)
         return child
 
-    def _tell_guardian(self, stages: Sequence[Sequence[Child]]) -> None:
+    def _tell_guardian(self, first: int) -> None:
+        """Say that the stages from the first on are still to be stopped."""
         if self._guardian is not None and self._guardian.stdin is not None:
-            line = json.dumps([_groups(children) for children in stages]) + '\n'
+            line = json.dumps([_groups(children) for children in self._stages[first:]]) + '\n'
             with contextlib.suppress(BrokenPipeError):
                 self._guardian.stdin.write(line.encode())
 
@@ -230,19 +219,17 @@ def stop_groups(
     grace_s: how much longer the first signal may take than usual. wait: passes a moment. hurry: yes
     skips to SIGKILL.
     """
-    for number, patience in ESCALATION:
+    for number, patience_s in ESCALATION:
         last = number == signal.SIGKILL
-        if hurry() and not last:
-            continue
-        for group in filter(group_exists, groups):
-            with contextlib.suppress(ProcessLookupError, PermissionError):
-                os.killpg(group, number)
-        deadline = time.monotonic() + patience + grace_s
-        while any(map(group_exists, groups)) and time.monotonic() < deadline and (
-            last or not hurry()
-        ):
-            wait()
+        deadline = time.monotonic() + patience_s + grace_s
         grace_s = 0.0
+        if last or not hurry():
+            for group in filter(group_exists, groups):
+                with contextlib.suppress(ProcessLookupError, PermissionError):
+                    os.killpg(group, number)
+        while (last or not hurry()) and any(map(group_exists, groups)) \
+                and time.monotonic() < deadline:
+            wait()
 
 
 def group_exists(group: int) -> bool:
@@ -255,23 +242,22 @@ def group_exists(group: int) -> bool:
         return True
     processes = Path('/proc')
     # The leader first: only when it has gone all others must be looked through.
-    return not processes.is_dir() or any(
-        _lives_in(stat, group)
-        for stats in (processes.glob(f'{group}/stat'), processes.glob('[0-9]*/stat'))
-        for stat in stats
+    return not processes.is_dir() or _lives(processes / str(group), group) or any(
+        _lives(process, group) for process in processes.glob('[0-9]*')
     )
 
 
-def _lives_in(stat: Path, group: int) -> bool:
+def _lives(process: Path, group: int) -> bool:
+    """Whether a process is of this group and has not ended (proc_pid_stat(5))."""
     try:
-        text = stat.read_text(encoding='utf-8', errors='replace')
+        text = (process / 'stat').read_text(encoding='utf-8', errors='replace')
     except OSError:
         return False
     # The name of the program stands in parentheses and may hold anything.
     state, _, its_group, *others = text.rpartition(')')[2].split()
-    # A process whose main thread has ended is shown as a zombie while other threads still end.
-    has_ended = state == 'X' or (state == 'Z' and int(others[NUM_THREADS]) == 1)
-    return int(its_group) == group and not has_ended
+    # Where only the main thread has ended, the process is shown as a zombie with several threads.
+    ended = state == 'X' or (state == 'Z' and others[14] == '1')
+    return int(its_group) == group and not ended
 
 
 def guard(lines: Iterable[str]) -> None:
@@ -282,7 +268,7 @@ def guard(lines: Iterable[str]) -> None:
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    stages: Sequence[tuple[Sequence[int], float]] = []  # as _groups returns them
+    stages: Sequence[tuple[Sequence[int], float]] = []
     for line in lines:
         stages = json.loads(line)
     for groups, grace_s in stages:

@@ -6,8 +6,8 @@ import signal
 import sys
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from math import inf, isfinite, nan
-from typing import TextIO
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan
@@ -19,9 +19,9 @@ FIRST_SAMPLE_DEADLINE_S = 30.0  # of a driver that bringup has started
 LATE_DEADLINE_S = 10.0  # that a run in real time may take longer than it should
 
 
-def complain(message: str) -> None:
-    """Say on stderr what went wrong."""
-    print(f'bringup: {message}', file=sys.stderr, flush=True)
+def complain(message: str, name: str = 'bringup: ') -> None:
+    """Say on stderr what is going on, or wrong."""
+    print(f'{name}{message}', file=sys.stderr, flush=True)
 
 
 def describe(progress: Mapping[str, object]) -> str:
@@ -32,8 +32,7 @@ def describe(progress: Mapping[str, object]) -> str:
         words.append(f'{name} {estimate:.4g}')
         if isfinite(truth) and truth != 0.0:
             words[-1] += f' ({100.0 * (estimate - truth) / abs(truth):+.1f} %)'
-    words.append(f'lost {_number(progress, "lost"):.0f}')
-    return '  '.join(words)
+    return '  '.join([*words, f'lost {_number(progress, "lost"):.0f}'])
 
 
 def _number(values: Mapping[str, object], name: str) -> float:
@@ -48,49 +47,42 @@ def _counts(values: Mapping[str, object], name: str) -> dict[str, int]:
     return value if isinstance(value, dict) else {}
 
 
+@dataclass
 class AxisProgress:
     """How far an axis has come, said now and then, and how long to wait for its next sample.
 
-    made: samples so far. first: number of the one that counts as the first. began, moved: when the
-    run began, and when the newest sample was heard of, on the monotonic clock [s]. published:
-    samples and messages by topic that can have been heard of a simulated plant, once it is done.
+    made: samples so far. first: number of the one that counts as the first. began, moved,
+    next_line: when the run began, when the newest sample was heard of, when the next line is due,
+    on the monotonic clock [s]. published: samples and messages by topic that can have been heard of
+    a simulated plant, once it is done; heard: those that were. silent: whether that was said.
     """
 
-    def __init__(self, plan: AxisPlan, stream: TextIO) -> None:
-        self.plan, self._stream = plan, stream
-        self.made = self.first = 0
-        self.began = self.moved = time.monotonic()
-        self.published: Mapping[str, int] | None = None
-        self._heard: dict[str, int] = {}
-        self._says_silence = True
-        self._next_line = 0.0  # on the monotonic clock [s]
+    plan: AxisPlan
+    made: int = 0
+    first: int = 0
+    began: float = field(default_factory=time.monotonic)
+    moved: float = field(default_factory=time.monotonic)
+    next_line: float = 0.0
+    published: Mapping[str, int] | None = None
+    heard: Mapping[str, int] = field(default_factory=dict)
+    silent: bool = False
 
     @property
     def patience(self) -> float:
         """How long to wait for a new sample [s]: a plant of long periods may take its time."""
-        return 10.0 + 2.0 * self.plan.sample_period
-
-    @property
-    def deadline(self) -> float:
-        """When the last sample must have come, on the monotonic clock [s]."""
-        if self.plan.samples == 0 or self.plan.parameters.lockstep:
-            return inf
-        return self.began + self.plan.samples * self.plan.sample_period + LATE_DEADLINE_S
+        return 10.0 + 2.0 * self.plan.parameters.sample_period
 
     @property
     def complete(self) -> bool:
         """Whether all samples were made; a driver does not say so, the recorder hears it."""
-        if self.plan.driver:
-            return 0 < self.plan.samples <= self.made
-        return self.published is not None
+        p = self.plan.parameters
+        return 0 < p.samples <= self.made if p.driver else self.published is not None
 
     @property
     def unheard(self) -> dict[str, int]:
         """What is missing of the published ones."""
-        return {
-            what: count - self._heard.get(what, 0)
-            for what, count in (self.published or {}).items() if count > self._heard.get(what, 0)
-        }
+        missing = {what: n - self.heard.get(what, 0) for what, n in (self.published or {}).items()}
+        return {what: n for what, n in missing.items() if n > 0}
 
     def begin(self) -> None:
         """The time starts to run."""
@@ -98,53 +90,49 @@ class AxisProgress:
 
     def take(self, progress: Mapping[str, object]) -> None:
         """Take in what the recorder says."""
-        sample = _number(progress, 'sample')
+        sample, p = _number(progress, 'sample'), self.plan.parameters
         if not isfinite(sample):
             return
         if self.made == 0:
             self.begin()
             # A driver may have been running before; a simulated plant begins with sample 0.
-            self.first = int(sample) if self.plan.driver else 0
+            self.first = int(sample) if p.driver else 0
         made = int(sample) + 1 - self.first
-        self._heard = {'samples': made, **_counts(progress, 'received')}
+        self.heard = {'samples': made, **_counts(progress, 'received')}
         if made > self.made:
-            self.made, self.moved, self._says_silence = made, time.monotonic(), True
-            if self.moved >= self._next_line:
+            self.made, self.moved, self.silent = made, time.monotonic(), False
+            if self.moved >= self.next_line:
                 # Every 2 s, and ever more seldom, so that a run of days does not fill the disk.
-                self._next_line = self.moved + max(2.0, 0.05 * (self.moved - self.began))
-                of_all = f'/{self.plan.samples}' if self.plan.samples else ''
-                t = made * self.plan.sample_period
-                self._say(self.plan.titled(f'{t:7.2f} s  {made}{of_all}  {describe(progress)}'))
+                self.next_line = self.moved + max(2.0, 0.05 * (self.moved - self.began))
+                count = f'{made}/{p.samples}' if p.samples else f'{made}'
+                text = f'{made * p.sample_period:7.2f} s  {count}  {describe(progress)}'
+                complain(self.plan.titled(text), '')
 
     def check_pace(self) -> None:
         """Raise BrokenOffError for samples that do not come."""
-        now, plan = time.monotonic(), self.plan
-        if plan.driver and self.made == 0:
-            if plan.driver != ELSEWHERE and now > self.began + FIRST_SAMPLE_DEADLINE_S:
+        now, plan, p = time.monotonic(), self.plan, self.plan.parameters
+        due = inf if p.samples == 0 or p.lockstep else \
+            self.began + p.samples * p.sample_period + LATE_DEADLINE_S
+        if p.driver and self.made == 0:
+            if p.driver != ELSEWHERE and now > self.began + FIRST_SAMPLE_DEADLINE_S:
                 raise BrokenOffError(plan.titled(
                     f'no sample within {FIRST_SAMPLE_DEADLINE_S:g} s: does the driver publish its '
                     f'output? See {plan.logs}; where it needs longer, start it yourself '
                     '(--driver none)'
                 ))
-        elif self.complete:
-            return
-        elif now > self.deadline:
+        elif now > due and not self.complete:
             raise BrokenOffError(plan.titled(
-                f'only {self.made} of {plan.samples} samples, {LATE_DEADLINE_S:g} s after the end '
+                f'only {self.made} of {p.samples} samples, {LATE_DEADLINE_S:g} s after the end '
                 f'was due, see {plan.logs}'
             ))
-        elif now > self.moved + self.patience:
+        elif now > self.moved + self.patience and not self.complete and not self.silent:
             at = f' after sample {self.first + self.made - 1}' if self.made else ''
-            silence = f'no new sample for {self.patience:g} s{at}'
-            if not plan.driver:
-                raise BrokenOffError(plan.titled(f'{silence}, see {plan.logs}'))
+            silence = plan.titled(f'no new sample for {self.patience:g} s{at}')
+            if not p.driver:
+                raise BrokenOffError(f'{silence}, see {plan.logs}')
             # The controller knows what to do when a real plant falls silent.
-            if self._says_silence:
-                self._says_silence = False
-                self._say(f'bringup: {plan.titled(silence)}, waiting for the driver')
-
-    def _say(self, text: str) -> None:
-        print(text, file=self._stream, flush=True)
+            self.silent = True
+            complain(f'{silence}, waiting for the driver')
 
 
 class RunWatch:
@@ -155,10 +143,9 @@ class RunWatch:
 
     def __init__(
         self, plan: RunPlan, supervisor: ProcessSupervisor, requests: StopRequests,
-        stream: TextIO = sys.stderr,
     ) -> None:
         self._plan, self._supervisor, self._requests = plan, supervisor, requests
-        self._axes = {axis.name: AxisProgress(axis, stream) for axis in plan.axes}
+        self._axes = {axis.name: AxisProgress(axis) for axis in plan.axes}
         self._ready: set[str] = set()
         self._gone: set[str] = set()  # spectators that have died
         self.failure = ''
@@ -169,21 +156,23 @@ class RunWatch:
 
     def execute(self) -> None:
         """Wait until all samples are made, then stop everything; sets failure."""
+        axes = self._axes.values()
         try:
             self._wait_until_ready()
-            for axis in self._axes.values():
+            for axis in axes:
                 if axis.made == 0:
                     axis.begin()
-            while not (self._over or all(axis.complete for axis in self._axes.values())):
+            while not (self._over or all(axis.complete for axis in axes)):
                 self._listen()
-                for axis in self._axes.values():
+                for axis in axes:
                     axis.check_pace()
             self._catch_up()
             if self._over:
                 complain(f'{self._requests.last} ends the run')
         except BrokenOffError as error:
             # Said before the processes are stopped, which may take a while.
-            self._fail(str(error))
+            self.failure = str(error)
+            complain(self.failure)
         for event in self._supervisor.stop():
             self._note(event)
         if not self.failure:
@@ -192,30 +181,24 @@ class RunWatch:
     @property
     def _over(self) -> bool:
         """Whether the user ends a run that has no other end."""
-        return (
-            self._requests.count > 0 and self._plan.endless
-            and all(axis.made > 0 for axis in self._axes.values())
-        )
-
-    def _fail(self, message: str) -> None:
-        self.failure = message
-        complain(message)
+        return self._requests.count > 0 and self._plan.endless and \
+            all(axis.made > 0 for axis in self._axes.values())
 
     def _wait_until_ready(self) -> None:
         deadline = time.monotonic() + READY_DEADLINE_S
-        while missing := [
-            child for child in self._supervisor.children
-            if not child.plan.foreign and child.plan.name not in self._ready
-        ]:
+
+        def missing() -> list[Child]:
+            return [child for child in self._supervisor.children
+                    if not child.plan.foreign and child.plan.name not in self._ready]
+
+        while missing():
             self._listen()
-            late = [
-                child for child in missing if child.plan.name not in self._ready
-                and not self._axes[child.plan.axis].plan.waits(child.plan.name)
-            ]
+            late = [child for child in missing()
+                    if not self._axes[child.plan.axis].plan.waits(child.plan.name)]
             if late and time.monotonic() > deadline:
                 names = ', '.join(child.plan.name for child in late)
                 hint = ' (a controller waits until the driver subscribes to its command)' \
-                    if any(axis.driver for axis in self._plan.axes) else ''
+                    if any(axis.parameters.driver for axis in self._plan.axes) else ''
                 logs = '\n'.join(f'the end of {child.end_of_log()}' for child in late)
                 raise BrokenOffError(
                     f'not ready within {READY_DEADLINE_S:g} s: {names}{hint}\n{logs}'
@@ -242,35 +225,39 @@ class RunWatch:
             self._note(event)
         if self._requests.count and not self._over:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
-        dead = [child for child in self._supervisor.ended() if not self._may_end(child)]
+        dead = []
+        for child in self._supervisor.ended():
+            name = child.plan.name
+            if not (child.plan.spectator and name in self._ready):
+                dead.append(child.describe_end('died'))
+            elif name not in self._gone:
+                self._gone.add(name)
+                complain(child.describe_end('died', ', the run goes on without it'))
         if dead:
-            raise BrokenOffError('\n'.join(child.describe_end('died') for child in dead))
-
-    def _may_end(self, child: Child) -> bool:
-        """Whether the run goes on without it, which is said once."""
-        name = child.plan.name
-        if not child.plan.spectator or name not in self._ready:
-            return False
-        if name not in self._gone:
-            self._gone.add(name)
-            complain(child.describe_end('died', ', the run goes on without it'))
-        return True
+            raise BrokenOffError('\n'.join(dead))
 
     def _note(self, event: Event) -> None:
-        axis = self._axes[event.plan.axis]
+        axis, content = self._axes[event.plan.axis], event.content
         if event.kind == 'ready':
             self._ready.add(event.plan.name)
-            if 'address' in event.content:
-                print(f'{event.plan.name}: {event.content["address"]}', flush=True)
+            if 'address' in content:
+                print(f'{event.plan.name}: {content["address"]}', flush=True)
         elif event.kind == 'done':
-            axis.published = _counts(event.content, 'published')
+            axis.published = _counts(content, 'published')
         elif event.kind == 'progress':
-            axis.take(event.content)
+            axis.take(content)
         elif event.kind == 'recording_stopped':
             # The log may lie on the very disk that is full.
-            complain(str(event.content.get('reason', '')))
+            complain(str(content.get('reason', '')))
         elif event.kind == 'closed' and axis.plan.record and axis.made:
-            _complain_of_missing_output(event.content)
+            outputs = topics.PLANT_OUTPUT, topics.JOINT_STATES, topics.ROBOT_STATES
+            for topic, count in _counts(content, 'messages').items():
+                if not content.get('failure') and topic.rpartition('/')[2] in outputs and not count:
+                    complain(
+                        f'the bag holds no message of {topic}, which the controller has heard: the '
+                        'recorder did not discover its publisher before the end of the run; let '
+                        f'the driver wait until {topic} has two subscribers, or run longer'
+                    )
 
     def _judge_exits(self) -> None:
         """Check the exit codes of the processes that were asked to end."""
@@ -287,16 +274,5 @@ class RunWatch:
                 # How a program of the user says good-bye is its own affair.
                 complain(child.describe_end('was stopped'))
         if bad:
-            self._fail('\n'.join(bad))
-
-
-def _complain_of_missing_output(closed: Mapping[str, object]) -> None:
-    """Say so where a bag that was closed holds what the controller made of y, but no y."""
-    outputs = topics.PLANT_OUTPUT, topics.JOINT_STATES, topics.ROBOT_STATES
-    for topic, count in _counts(closed, 'messages').items():
-        if not closed.get('failure') and topic.rpartition('/')[2] in outputs and count == 0:
-            complain(
-                f'the bag holds no message of {topic}, which the controller has heard: the '
-                'recorder did not discover its publisher before the end of the run; let the '
-                f'driver wait until {topic} has two subscribers, or run longer'
-            )
+            self.failure = '\n'.join(bad)
+            complain(self.failure)

@@ -132,9 +132,6 @@ def _given_values(config: Path | None, axis: str) -> Mapping[str, Value]:
     """What the user's file holds for the axis; nothing without a file."""
     if config is None:
         return {}
-    from backlash_ros.tools.config import check_axis, find_config, read_parameter_file
-    file = read_parameter_file(find_config(config))
-    file.check_axes(file.axes)
-    if file.axes:
-        check_axis(file, axis, file.axes)
-    return file.values(axis)
+    from backlash_ros.tools.config import read_configuration
+    configuration = read_configuration(config)
+    return configuration.given(axis if configuration.axes else '')

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.assembly import LAWS, law_fits
-from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash
@@ -24,18 +23,15 @@ from backlash_ros.tools.runs.summary import reference_delay
 Array = NDArray[np.float64]
 
 
-
-@dataclass(frozen=True)
-class Part:
+class Part(NamedTuple):
     """A stretch of a run with a name for it."""
 
     name: str
     rows: slice
 
 
-@dataclass(frozen=True)
-class LawTrace:
-    """Control error e = u - u_d (3.4) of one law.
+class LawTrace(NamedTuple):
+    """Control error e = u - u_d (3.4) of one law, shape (N,).
 
     rms: over the period of y_m before each time. recorded: whether it comes from the run itself;
     the others are simulated. note: why there is no curve, if there is none.
@@ -45,12 +41,23 @@ class LawTrace:
     t: Array
     e: Array
     rms: Array
-    recorded: bool
+    recorded: bool = False
     note: str = ''
 
 
-@dataclass(frozen=True)
-class FollowedReference:
+class ErrorCurves(NamedTuple):
+    """Moving RMS of the control error and of the tracking error of a loop, shape (N,) each.
+
+    tracking: None where y is not meant to follow y_m.
+    """
+
+    name: str
+    t: Array
+    control: Array
+    tracking: Array | None
+
+
+class FollowedReference(NamedTuple):
     """values: the reference at each sample, shape (N,), delay [s] late.
 
     followed: whether y comes close enough to it for both to be drawn on one scale.
@@ -61,26 +68,12 @@ class FollowedReference:
     followed: bool
 
 
-@dataclass(frozen=True)
-class ErrorCurves:
-    """Moving RMS of the control error and of the tracking error of a loop, shape (N,) each.
-
-    tracking: None where y is not meant to follow y_m. width: of the line.
-    """
-
-    name: str
-    t: Array
-    control: Array
-    tracking: Array | None
-    width: float = 1.7
-
-
 def control_error(run: RunRecord) -> Array:
     """e = u - u_d (3.4) of each sample, shape (N,); nan where u is unknown."""
     return run.column('u') - run.column('u_d')
 
 
-def reference_period(parameters: Parameters | None) -> float | None:
+def _reference_period(parameters: Parameters | None) -> float | None:
     """Period of y_m [s]; None where it has none or is not known."""
     if parameters is None or parameters.waveform not in PERIODIC:
         return None
@@ -89,7 +82,7 @@ def reference_period(parameters: Parameters | None) -> float | None:
 
 def interesting_parts(run: RunRecord, parameters: Parameters | None) -> tuple[Part, Part]:
     """Start and end of a run: two periods of y_m each, or a tenth of the run."""
-    period = reference_period(parameters)
+    period = _reference_period(parameters)
     samples = round(2.0 * period / run.sample_period) if period else run.samples // 10
     samples = min(max(samples, 2), run.samples)
     return Part('Start', slice(0, samples)), Part('End', slice(run.samples - samples, None))
@@ -110,44 +103,38 @@ def moving_rms(values: Array, samples: int) -> Array:
 
 def compared_samples(run: RunRecord) -> int:
     """For how many samples the laws are compared: the run with its lost ones, 10,000 at most."""
-    length = round(float(run.column('t')[-1]) / run.sample_period) + 1
-    return min(length, 10_000)
+    return min(round(float(run.column('t')[-1]) / run.sample_period) + 1, 10_000)
 
 
 def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
     """The run's law beside every other one, simulated with the same parameters (Figure 5)."""
     samples = compared_samples(run)
-    compared = run.column('t') < (samples - 0.5) * run.sample_period
-    window = max(round((reference_period(parameters) or 1.0) / run.sample_period), 1)
+    window = max(round((_reference_period(parameters) or 1.0) / run.sample_period), 1)
     own = parameters.estimator.law
-    e = control_error(run)[compared]
-    traces = [LawTrace(own, run.column('t')[compared], e, moving_rms(e, window), True)]
+    compared = run.column('t') < (samples - 0.5) * run.sample_period
+    t, e = run.column('t')[compared], control_error(run)[compared]
+    traces = [LawTrace(own, t, e, moving_rms(e, window), recorded=True)]
     for law in LAWS:
         if law == own or not law_fits(law, parameters.structure):
             continue
+        t, e, note = np.empty(0), np.empty(0), ''
         try:
-            loop = build_closed_loop(parameters.replaced({
+            simulated = run_loop(build_closed_loop(parameters.replaced({
                 'estimator.law': law, 'estimates.load': False,
-            }))
-            simulated = run_loop(loop, samples)
+            })), samples)
+            t, e = simulated.column('t'), control_error(simulated)
         except (ParameterError, InputError, BrokenOffError) as error:
-            nothing = np.empty(0)
-            traces.append(LawTrace(law, nothing, nothing, nothing, False, str(error)))
-            continue
-        e = control_error(simulated)
-        traces.append(LawTrace(law, simulated.column('t'), e, moving_rms(e, window), False))
+            note = str(error)
+        traces.append(LawTrace(law, t, e, moving_rms(e, window), note=note))
     return traces
 
 
 def followed_reference(run: RunRecord, parameters: Parameters | None) -> FollowedReference:
     """What y is to follow: y_m, as late as the structure makes it."""
     delay = reference_delay(parameters)
-    half = float(run.column('t')[run.samples // 2])
-    error = delayed_tracking_error_rms(run, delay, half)
-    return FollowedReference(
-        delayed_reference(run, delay), delay * run.sample_period,
-        error is not None and error < 0.5,  # of the RMS of the reference
-    )
+    error = delayed_tracking_error_rms(run, delay, float(run.column('t')[run.samples // 2]))
+    followed = error is not None and error < 0.5  # of the RMS of the reference
+    return FollowedReference(delayed_reference(run, delay), delay * run.sample_period, followed)
 
 
 def estimated_loop(run: RunRecord) -> Array:
@@ -156,9 +143,4 @@ def estimated_loop(run: RunRecord) -> Array:
     if c_l >= c_r:
         return m * (run.column('v') - c_r)  # no gap left, and then no backlash to simulate
     backlash = Backlash(m, c_r, c_l)
-    return np.array([backlash.step(float(v)) for v in run.column('v')])
-
-
-def frozen(run: RunRecord) -> NDArray[np.bool_]:
-    """Whether the estimates were frozen at each sample, shape (N,)."""
-    return run.column('status') >= float(Status.NOT_EXCITED)
+    return np.array([backlash.step(v) for v in run.column('v').tolist()])

@@ -21,7 +21,7 @@ from backlash_ros.atomic_file import point_link, write_atomically
 from backlash_ros.core.loop.learned_model import from_fields
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
-from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
+from backlash_ros.tools.cli import InputError
 
 SAMPLES_FILE, RECORD_FILE, SUMMARY_FILE = 'samples.csv', 'record.npz', 'summary.json'
 CONFIG_FILE = 'parameters.yaml'
@@ -46,48 +46,28 @@ class Run:
     notes: tuple[str, ...] = ()
 
 
-def cut(record: RunRecord, span: Span) -> RunRecord:
-    """The rows within the span, their time counted from the first one; raises InputError."""
-    if span == WHOLE_SPAN:
-        return record
-    t = record.column('t')
-    rows = record.rows[(t >= span.from_s) & (t < span.to_s)].copy()
-    if not len(rows):
-        raise InputError('there is no sample between --from and --to')
-    rows[:, COLUMNS.index('t')] -= rows[0, COLUMNS.index('t')]
-    # G is recorded as it was believed at the end.
-    learned = record.learned if t[-1] < span.to_s else None
-    return RunRecord(rows, record.sample_period, record.lost_samples, learned)
-
-
 def result_directory(out: Path | None) -> Path:
     """Create and return the folder of the results: out, or results/<UTC time>.
 
     Only the latter is what results/latest then points at. Raises InputError.
     """
+    results = Path('results') if out is None else out
+    try:
+        results.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f'{results}: cannot be made a folder: {error.strerror}') from None
     if out is not None:
-        _make(out)
         return out
-    results = Path('results')
-    _make(results)
-    # Two runs within one second need two names.
     name = datetime.now(timezone.utc).strftime('%Y-%m-%dT%H-%M-%SZ')
-    for number in count(1):
-        directory = results / (name if number == 1 else f'{name}-{number}')
+    # Two runs within one second need two names.
+    for directory in (results / (f'{name}-{n}' if n else name) for n in count()):
         try:
             directory.mkdir()
         except FileExistsError:
             continue
-        point_link(results / 'latest', directory.name)
         break
+    point_link(results / 'latest', directory.name)
     return directory
-
-
-def _make(directory: Path) -> None:
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f'{directory}: cannot be made a folder: {error.strerror}') from None
 
 
 def write_summary(summary: Mapping[str, Any], path: Path) -> None:
@@ -109,14 +89,8 @@ def write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[objec
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator='\n')
     writer.writerow(header)
-    writer.writerows([_cell(value) for value in row] for row in rows)
+    writer.writerows([None if value != value else value for value in row] for row in rows)
     write_atomically(path, buffer.getvalue())
-
-
-def _cell(value: object) -> str:
-    if value is None or value != value:
-        return ''
-    return repr(value) if isinstance(value, float) else str(value)
 
 
 def write_run(run: RunRecord, directory: Path) -> None:
@@ -124,9 +98,7 @@ def write_run(run: RunRecord, directory: Path) -> None:
     columns = [run.column(name) for name in SAMPLE_COLUMNS]
     write_table(directory / SAMPLES_FILE, SAMPLE_COLUMNS, np.column_stack(columns).tolist())
     learned = run.learned.fields() if run.learned is not None else {}
-    arrays: dict[str, Any] = {
-        f'learned.{label}': np.array(values) for label, values in learned.items()
-    }
+    arrays: dict[str, Any] = {f'learned.{label}': values for label, values in learned.items()}
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer, columns=np.array(COLUMNS), rows=run.rows, sample_period=run.sample_period,
@@ -179,9 +151,8 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
             raise InputError(f'{path}: line {i + 2}: must hold {len(header)} numbers') from None
     t = rows[:, COLUMNS.index('t')]
     steps = np.diff(t)
-    if not np.all(steps > 0.0):
-        line_number = int(np.flatnonzero(~(steps > 0.0))[0]) + 3
-        raise InputError(f'{path}: line {line_number}: t must rise from row to row')
+    if falls := np.flatnonzero(~(steps > 0.0)).tolist():
+        raise InputError(f'{path}: line {falls[0] + 3}: t must rise from row to row')
     if sample_period is None:
         if not len(steps):
             raise InputError(f'{path}: needs two samples to tell the sample period')

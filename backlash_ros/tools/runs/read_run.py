@@ -11,7 +11,7 @@ import numpy as np
 from backlash_ros.bags.reader import is_bag
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import ClosedLoop
-from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
 from backlash_ros.tools.config import read_configuration
 from backlash_ros.tools.runs.bag import read_bag
@@ -20,7 +20,6 @@ from backlash_ros.tools.runs.files import (
     RECORD_FILE,
     SAMPLES_FILE,
     Run,
-    cut,
     read_record,
     read_samples,
 )
@@ -41,22 +40,33 @@ def read_run(
         raise InputError(f'{path}: does not exist')
     parameters = _parameters(path, config, axis)
     period = parameters.sample_period if parameters else None
-    bag = find_bag(path)
-    if bag is not None:
+    if bag := find_bag(path):
         return replace(read_bag(bag, period, span, axis), parameters=parameters)
+    file = path
     if path.is_dir():
         files = [path / name for name in (RECORD_FILE, SAMPLES_FILE) if (path / name).is_file()]
         if not files:
             raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
-        path = files[0]
-    if path.suffix == '.npz':
-        return Run(cut(read_record(path), span), parameters)
-    if path.suffix == '.csv':
-        return Run(cut(read_samples(path, period), span), parameters)
-    raise InputError(
-        f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of results, '
-        f'{RECORD_FILE} or {SAMPLES_FILE}'
-    )
+        file = files[0]
+    if file.suffix not in ('.npz', '.csv'):
+        raise InputError(
+            f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of results, '
+            f'{RECORD_FILE} or {SAMPLES_FILE}'
+        )
+    record = read_record(file) if file.suffix == '.npz' else read_samples(file, period)
+    return Run(record if span == WHOLE_SPAN else _cut(record, span), parameters)
+
+
+def _cut(record: RunRecord, span: Span) -> RunRecord:
+    """The rows within the span, their time counted from the first one; raises InputError."""
+    t = record.column('t')
+    rows = record.rows[(t >= span.from_s) & (t < span.to_s)]
+    if not len(rows):
+        raise InputError('there is no sample between --from and --to')
+    rows[:, COLUMNS.index('t')] -= rows[0, COLUMNS.index('t')]
+    # G is recorded as it was believed at the end.
+    learned = record.learned if t[-1] < span.to_s else None
+    return RunRecord(rows, record.sample_period, record.lost_samples, learned)
 
 
 def find_bag(path: Path) -> Path | None:
@@ -70,13 +80,12 @@ def _parameters(path: Path, config: Path | None, axis: str) -> Parameters | None
     if is_bag(path):
         # A bag lies in the folder of the results to which the parameters belong.
         places.append(places[0].parent)
-    files = [config] if config else [place / CONFIG_FILE for place in places]
-    file = next((file for file in files if config or file.is_file()), None)
+    beside = (place / CONFIG_FILE for place in places if (place / CONFIG_FILE).is_file())
+    file = config or next(beside, None)
     if file is None:
         return None
     configuration = read_configuration(file)
-    known = configuration.axes or configuration.joints
-    if axis not in known:
+    if axis not in (configuration.axes or configuration.joints):
         axis = configuration.joints[0] if configuration.joints else ''
     return configuration.parameters(axis)
 

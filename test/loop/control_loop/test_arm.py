@@ -8,11 +8,11 @@ from arm_of_physics import move, rms, with_gaps
 from places import ROOT
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.tools.config import load_config
+from backlash_ros.tools.config import read_configuration
 
 
 def test_the_tip_goes_where_it_belongs_once_all_gaps_are_known() -> None:
-    values = load_config(ROOT / 'config' / 'arm.yaml')
+    values = read_configuration(ROOT / 'config' / 'arm.yaml').given()
     tips = [move(Parameters(with_gaps(values, share)), 2).tip for share in (0.0, 1.0)]
     without, compensated = (rms(tip[len(tip) // 2:]) for tip in tips)  # once all joints swing
     assert without > 5e-3

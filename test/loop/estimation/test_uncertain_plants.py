@@ -8,7 +8,7 @@ from places import ROOT
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.tools.config import load_config
+from backlash_ros.tools.config import read_configuration
 
 SHIPPED = ROOT / 'config'
 
@@ -17,7 +17,7 @@ SHIPPED = ROOT / 'config'
 def test_a_triangle_read_by_an_encoder_is_learned_from(amplitude: float) -> None:
     # One speed tells a lag from a gap at the turns alone. At the amplitude of the file, 1, y moves
     # by 26.08 steps of the encoder per sample: rounding that repeats is too coloured to learn from.
-    p = load_config(SHIPPED / 'geared_motor.yaml')
+    p = read_configuration(SHIPPED / 'geared_motor.yaml').given()
     changed = Parameters({**p, 'waveform': 'triangle', 'amplitude': amplitude})
     record = build_closed_loop(changed).run(1600)
     later = slice(1000, None)
@@ -30,7 +30,7 @@ def test_a_triangle_read_by_an_encoder_is_learned_from(amplitude: float) -> None
 def test_where_the_play_began_does_not_contradict_readings_that_were_rounded() -> None:
     # Labels before the first engagement are the least sure ones, and intervals the sharpest data.
     p = Parameters({
-        **load_config(SHIPPED / 'geared_motor.yaml'), 'structure': 'proportional',
+        **read_configuration(SHIPPED / 'geared_motor.yaml').given(), 'structure': 'proportional',
         'truth.scale_frequency': 0.8,
     })
     record = build_closed_loop(p).run(900)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from waiting import DEADLINE_S, wait_until
 
-from backlash_ros.tools import cluster as tools_cluster
+from backlash_ros.tools import batch
 from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.simulate import main
 
@@ -91,7 +91,7 @@ def test_a_killed_worker_loses_no_run_and_no_bit_and_another_numpy_is_refused(
 ) -> None:
     wait_until(cluster.is_whole, 'the workers')  # simulate does so for 10 s only
     with monkeypatch.context() as other:
-        other.setattr(tools_cluster, 'version', lambda name: '0.1')
+        other.setattr(batch, 'version', lambda name: '0.1')
         assert main([*RUNS, '--cluster', cluster.address]) == 2
     assert 'install the same versions' in capsys.readouterr().err
     remote, local = tmp_path / 'remote', tmp_path / 'local'

@@ -63,9 +63,7 @@ def watch(
             )] for name, program in programs.items()
         ]
         with ProcessSupervisor(stages, lambda: hurry) as supervisor:
-            run = watching.RunWatch(
-                RunPlan((axis,), tmp_path), supervisor, StopRequests(), sys.stderr
-            )
+            run = watching.RunWatch(RunPlan((axis,), tmp_path), supervisor, StopRequests())
             run.execute()
         return Watched(run.failure, capsys.readouterr().err, mark)
 

@@ -20,7 +20,6 @@ from backlash_ros.core.jobs.executor import (
     LOST,
     Channel,
     Failure,
-    Record,
     Samples,
 )
 from backlash_ros.core.jobs.worker import NICENESS, WorkerExecutor
@@ -130,15 +129,14 @@ def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(executor, t
     begun = tmp_path / 'begun'
     sleeper, channel, third = executor.open(), executor.open(1, 3000), executor.open()
     rng = np.random.default_rng(2)
-    record = Record(1, 3000)
-    samples = 0
+    values: list[float] = []
     for count in range(1, KILLED + 1):
         begin(sleeper, begun)
         rows = rng.standard_normal(rng.integers(0, 400))
         for value in rows.tolist():
             channel.append(value)
-        record.extend(rows.tobytes())
-        samples += len(rows)
+        values += rows.tolist()
+        expected = Samples(max(len(values) - 3000, 0), np.array([values[-3000:]]))
         assert channel.submit(checksum, 1.0)
         assert third.submit(operator.neg, count)
         assert executor.pid is not None
@@ -149,9 +147,8 @@ def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(executor, t
         # What is appended while there is no worker belongs to the record, not to the job before.
         channel.append(7.0)
         assert result_of(third) == -count
-        assert result_of(channel) == checksum(record.until(samples), 1.0)
-        record.extend(np.array([7.0]).tobytes())
-        samples += 1
+        assert result_of(channel) == checksum(expected, 1.0)
+        values.append(7.0)
         assert executor.restarts == count
         assert executor.alive
 

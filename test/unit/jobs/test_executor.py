@@ -2,16 +2,12 @@
 
 import operator
 
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.jobs.executor import (
-    BLOCK,
+    Executor,
     Failure,
-    InlineExecutor,
-    Record,
     Samples,
 )
 
@@ -20,24 +16,33 @@ def everything(samples: Samples, *more: object) -> tuple[object, ...]:
     return samples.first, samples.columns.tolist(), *more
 
 
-@given(
-    blocks=st.lists(st.integers(0, 700), max_size=12), capacity=st.integers(1, 1500),
-    held_back=st.integers(0, 50),
-)
-def test_record_holds_the_newest_samples_with_their_numbers(blocks, capacity, held_back):
-    record = Record(2, capacity)
-    rows = np.arange(2.0 * sum(blocks)).reshape(-1, 2)
-    for part in np.split(rows, np.cumsum(blocks)[:-1]) if blocks else []:
-        record.extend(part.tobytes())
-    end = max(len(rows) - held_back, 0)
-    first, columns = record.until(end)
-    # Of what is older than the newest `capacity` of all, some may be gone.
-    assert max(end - capacity, 0) <= first <= max(end - capacity, len(rows) - capacity, 0)
-    np.testing.assert_array_equal(columns.T, rows[first:end])
+@given(counts=st.lists(st.integers(0, 300), max_size=12), capacity=st.integers(1, 500))
+def test_a_job_sees_the_newest_samples_with_their_numbers(counts, capacity):
+    channel = Executor().open(2, capacity)
+    end = 0
+    for count in counts:
+        for k in range(end, end + count):
+            channel.append(k, -k)
+        end += count
+        assert channel.submit(everything, 'x')
+        channel.append(end, -end)
+        begin = max(end - capacity, 0)
+        numbers = range(begin, end)
+        assert channel.poll() == (begin, [[*numbers], [-k for k in numbers]], 'x')
+        end += 1
+
+
+def test_a_job_sees_no_samples_before_those_it_needs() -> None:
+    channel = Executor().open(1, 1000)
+    for k in range(20):
+        channel.append(k)
+    for since in (15, 19, 20):
+        channel.submit(everything, since=since)
+        assert channel.poll() == (since, [[*range(since, 20)]])
 
 
 def test_samples_cannot_be_changed_by_a_job() -> None:
-    channel = InlineExecutor().open(1, 10)
+    channel = Executor().open(1, 10)
     channel.append(1.0)
     channel.submit(overwrite)
     failure = channel.poll()
@@ -51,19 +56,8 @@ def overwrite(samples: Samples) -> None:
     samples.columns[:] = 0.0
 
 
-@pytest.mark.parametrize('count', [0, 1, BLOCK, BLOCK + 1, 3 * BLOCK])
-def test_a_job_gets_all_samples_up_to_its_submission(count: int) -> None:
-    channel = InlineExecutor().open(2, 10_000)
-    for k in range(count):
-        channel.append(k, -k)
-        channel.tend()
-    assert channel.submit(everything, 'x')
-    channel.append(7.0, 7.0)
-    assert channel.poll() == (0, [[*range(count)], [-k for k in range(count)]], 'x')
-
-
 def test_one_job_at_a_time_whose_result_is_told_once() -> None:
-    channel = InlineExecutor().open()
+    channel = Executor().open()
     assert channel.submit(operator.add, 2, 3)
     assert not channel.submit(operator.add, 4, 5)
     assert channel.busy

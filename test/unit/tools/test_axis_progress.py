@@ -1,6 +1,5 @@
 """How long bringup waits for the samples of an axis, and what it says of those that do not come."""
 
-import io
 from pathlib import Path
 
 import pytest
@@ -15,13 +14,10 @@ from backlash_ros.tools.cli import BrokenOffError
 from backlash_ros.tools.config import effective_parameters
 
 
-def begun(folder: Path, driver: str = '', **values: object) -> tuple[AxisProgress, io.StringIO]:
-    """An axis whose run of 100 samples has just begun, and what is said of it."""
+def begun(folder: Path, driver: str = '', **values: object) -> AxisProgress:
+    """An axis whose run of 100 samples has just begun."""
     p = effective_parameters(None).replaced({'samples': 100, 'driver': driver, **values})
-    said = io.StringIO()
-    axis = AxisProgress(AxisPlan('', p, folder, record=True), said)
-    axis.begin()
-    return axis, said
+    return AxisProgress(AxisPlan('', p, folder, record=True))
 
 
 def let_pass(axis: AxisProgress, seconds: float) -> None:
@@ -30,7 +26,7 @@ def let_pass(axis: AxisProgress, seconds: float) -> None:
 
 
 def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(tmp_path):
-    axis, _ = begun(tmp_path, 'some command')
+    axis = begun(tmp_path, 'some command')
     axis.take({'sample': 5000})
     assert not axis.complete
     axis.take({'sample': 5099})
@@ -38,7 +34,7 @@ def test_samples_of_a_driver_that_ran_before_count_from_the_first_one_heard(tmp_
 
 
 def test_a_plant_is_complete_once_it_says_so_and_what_is_unheard_is_counted(tmp_path):
-    axis, _ = begun(tmp_path)
+    axis = begun(tmp_path)
     axis.take({'sample': 41, 'received': {'plant_output': 42}})
     assert not axis.complete
     axis.published = {'samples': 100, 'plant_output': 42}
@@ -49,7 +45,7 @@ def test_a_plant_is_complete_once_it_says_so_and_what_is_unheard_is_counted(tmp_
 
 
 def test_a_plant_that_stands_still_is_an_error_that_names_the_last_sample(tmp_path: Path) -> None:
-    axis, _ = begun(tmp_path, lockstep=True)
+    axis = begun(tmp_path, lockstep=True)
     axis.take({'sample': 41})
     let_pass(axis, axis.patience - 1.0)
     axis.check_pace()
@@ -58,21 +54,21 @@ def test_a_plant_that_stands_still_is_an_error_that_names_the_last_sample(tmp_pa
         axis.check_pace()
 
 
-def test_a_driver_that_falls_silent_is_waited_for_and_named_once(tmp_path: Path) -> None:
-    axis, said = begun(tmp_path, 'some command', samples=0)
+def test_a_driver_that_falls_silent_is_waited_for_and_named_once(tmp_path, capsys):
+    axis = begun(tmp_path, 'some command', samples=0)
     axis.take({'sample': 7})
     let_pass(axis, axis.patience + 1.0)
     for _ in range(3):
         axis.check_pace()
-    assert said.getvalue().count('after sample 7, waiting for the driver') == 1
+    assert capsys.readouterr().err.count('after sample 7, waiting for the driver') == 1
     axis.take({'sample': 8})
     let_pass(axis, axis.patience + 1.0)
     axis.check_pace()
-    assert said.getvalue().count('waiting for the driver') == 2
+    assert capsys.readouterr().err.count('waiting for the driver') == 1
 
 
 def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> None:
-    axis, _ = begun(tmp_path, 'some command')
+    axis = begun(tmp_path, 'some command')
     for sample in (7, 48):
         axis.take({'sample': sample})
     axis.began -= 1.0 + LATE_DEADLINE_S - 0.5
@@ -84,7 +80,7 @@ def test_too_few_samples_are_an_error_when_the_time_is_over(tmp_path: Path) -> N
 
 def test_a_driver_without_a_first_sample_is_an_error_unless_somebody_else_starts_it(tmp_path):
     for driver in ('some command', 'none'):
-        axis, _ = begun(tmp_path, driver)
+        axis = begun(tmp_path, driver)
         let_pass(axis, FIRST_SAMPLE_DEADLINE_S - 1.0)
         axis.check_pace()
         let_pass(axis, 2.0)

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from backlash_ros.tools import cluster as tools_cluster
+from backlash_ros.tools import batch
 from backlash_ros.tools.simulate import main
 
 HERE = '127.0.0.1'
@@ -16,7 +16,7 @@ RUNS = ['--duration', '1', '--set', 'output_noise_std=1e-3', '--seeds', '6']
 ])
 def test_missing_scheduler_is_told_in_one_line(address, cure, monkeypatch, capsys):
     pytest.importorskip('distributed')
-    monkeypatch.setattr(tools_cluster, 'CLUSTER_ANSWER_S', 0.3)
+    monkeypatch.setattr(batch, 'CLUSTER_ANSWER_S', 0.3)
     assert main([*RUNS, '--cluster', address]) == 2
     said = capsys.readouterr().err
     assert said.count('\n') == 1

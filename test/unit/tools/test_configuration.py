@@ -12,8 +12,6 @@ from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import (
     Setting,
     effective_parameters,
-    find_config,
-    load_config,
     parse_setting,
     read_configuration,
     write_config,
@@ -33,7 +31,7 @@ def config(tmp_path: Path) -> Path:
 
 
 def test_paper_example_says_what_the_table_says_but_that_its_plant_is_exact() -> None:
-    example = load_config(find_config(None))
+    example = read_configuration(None).given()
     # The paper supposes G(z) exact, which the plant of a user never is.
     exact = Parameters().replaced({'plant.uncertainty': 0.0})
     assert example == {name: exact[name] for name in example}
@@ -86,15 +84,16 @@ def test_written_configuration_is_read_back_unchanged(config: Path) -> None:
         'actuator.numerator': [0.5], 'actuator.denominator': [1.0, -0.5],
     })
     write_config(parameters, config)
-    assert Parameters(load_config(config)) == parameters
+    again = read_configuration(config).given('x')
+    assert Parameters(again) == parameters
     # ROS 2 knows no empty list.
-    assert all(parameters[name] == () for name in set(parameters) - set(load_config(config)))
+    assert all(parameters[name] == () for name in set(parameters) - set(again))
 
 
 def test_misspelt_key_is_answered_with_the_nearest_one_and_the_file(config: Path) -> None:
     written(config, '/**: {ros__parameters: {estimator: {lwa: lms}}}')
     with pytest.raises(ParameterError) as caught:
-        load_config(config)
+        read_configuration(config).given()
     assert str(caught.value).startswith(f'{config}: estimator.lwa is not a parameter: ')
     assert 'did you mean estimator.law?' in str(caught.value)
 
@@ -102,7 +101,7 @@ def test_misspelt_key_is_answered_with_the_nearest_one_and_the_file(config: Path
 def test_bad_value_is_answered_with_rule_and_file(config: Path) -> None:
     written(config, '/**: {ros__parameters: {sample_period: -1}}')
     with pytest.raises(ParameterError, match=r'my\.yaml: sample_period=-1\.0 must be > 0 \[s\]'):
-        load_config(config)
+        read_configuration(config).given()
 
 
 @pytest.mark.parametrize(
@@ -130,7 +129,7 @@ def test_bad_value_is_answered_with_rule_and_file(config: Path) -> None:
 def test_mistake_in_a_file_is_one_line_that_names_the_file(config, text, message):
     written(config, text)
     with pytest.raises((InputError, ParameterError)) as caught:
-        load_config(config)
+        read_configuration(config).given()
     assert str(caught.value).startswith(f'{config}:')
     assert message in str(caught.value)
     assert '\n' not in str(caught.value)
@@ -138,11 +137,11 @@ def test_mistake_in_a_file_is_one_line_that_names_the_file(config, text, message
 
 def test_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r'nothing\.yaml: cannot be read: No such file'):
-        load_config(tmp_path / 'nothing.yaml')
+        read_configuration(tmp_path / 'nothing.yaml').given()
     binary = tmp_path / 'binary.yaml'
     binary.write_bytes(b'\xff\xfe\x00')
     with pytest.raises(InputError, match='not a text file'):
-        load_config(binary)
+        read_configuration(binary).given()
 
 
 @pytest.mark.parametrize(
