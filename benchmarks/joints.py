@@ -1,16 +1,22 @@
 """One controller with six joints beside six controllers with one each: time, memory, latency.
 
     python benchmarks/joints.py --law lms --rate 100 --seconds 20
+    python benchmarks/joints.py --bus --seconds 600
 
 A node of the benchmark is the driver of all joints: it publishes a message of outputs every period
 and waits for the commands that answer it. Processor time and memory are those of all processes of
 the controllers, workers included; ratios of them say more than the figures of a busy machine.
+--bus: the arm of physics instead, behind test/servo_bus.py, examples/bus_servo_driver.py and the
+trajectory of examples/joint_trajectory.py: cycles, and whether each that was lost was counted.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
+import sys
+import tempfile
 import time
 from collections.abc import Iterable
 from math import sin
@@ -20,12 +26,19 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.executors import SingleThreadedExecutor
-from real_time.node_processes import node_command, processes, wait_for_event
-from reporting import text_table
+from real_time.node_processes import (
+    node_command,
+    processes,
+    processes_in,
+    wait_for_event,
+)
+from reporting import ROOT, text_table
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, Header
 
 JOINTS = tuple(f'joint_{i}' for i in range(1, 7))
+# Joints of the arm of physics.
+SERVOS = ('waist', 'shoulder', 'elbow', 'forearm_roll', 'wrist_pitch', 'wrist_roll')
 WARM_UP = 0.25  # share of the samples before anything is measured
 MEETING_S = 60.0  # longest wait until all listen
 # A servo of 4 Hz at 100 Hz; at other rates it is another one, which costs the same.
@@ -161,6 +174,77 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
     ]
 
 
+class BusWatch:
+    """Counts what the driver of the bus publishes, and knows from its numbers what it missed."""
+
+    def __init__(self, domain: int) -> None:
+        rclpy.init(domain_id=domain)
+        self.node, self._executor = rclpy.create_node('watch'), SingleThreadedExecutor()
+        self._executor.add_node(self.node)
+        self.heard = self.incomplete = self.published = 0
+        self.node.create_subscription(JointState, 'robot_joint_states', self._count, 1000)
+
+    def _count(self, message: JointState, info: dict[str, int]) -> None:
+        self.heard += 1
+        self.incomplete += len(message.name) < len(SERVOS)
+        self.published = info['publication_sequence_number']
+
+    def spin(self, seconds: float) -> None:
+        """Listen for so long."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=left)
+
+    def close(self) -> None:
+        """Leave."""
+        self.node.destroy_node()
+        rclpy.shutdown()
+
+
+def soak(seconds: float, rate: float) -> str:
+    """The bus for so long; a table of what was counted."""
+    with tempfile.TemporaryDirectory() as folder:
+        port, python = str(Path(folder) / 'port'), [sys.executable]
+        servos = {'servos': [*python, str(ROOT / 'test' / 'servo_bus.py'), port]}
+        with processes({
+            'driver': [
+                *python, str(ROOT / 'examples' / 'bus_servo_driver.py'), '--port', port, '--rate',
+                str(rate), '--joints', *(f'{name}={i + 1}' for i, name in enumerate(SERVOS)),
+            ],
+            'controller': [*node_command('controller', {}), '--ros-args', '--params-file',
+                           str(ROOT / 'config' / 'arm.yaml')],
+            'trajectory': [*python, str(ROOT / 'examples' / 'joint_trajectory.py'), *SERVOS],
+        }) as (supervisor, domain):
+            watch, driver = BusWatch(domain), supervisor.children[0].process
+            try:
+                # Without a port the driver publishes nothing, so that nothing is missed here.
+                while not watch.node.count_publishers('robot_joint_states'):
+                    watch.spin(0.1)
+                watch.spin(1.0)
+                with processes_in(domain, servos):
+                    watch.spin(seconds)
+                    driver.terminate()
+                    while driver.poll() is None:
+                        watch.spin(0.1)
+                watch.spin(1.0)
+                supervisor.stop()
+            finally:
+                watch.close()
+            logs = {child.plan.name: child.plan.log.read_text() for child in supervisor.children}
+    found = re.search(r'(\d+) cycles, (\d+) of them lost', logs['driver'])
+    if found is None:
+        raise RuntimeError(logs['driver'])
+    cycles, lost = map(int, found.groups())
+    complete = watch.published - watch.incomplete
+    print(*(line for line in logs['controller'].splitlines() if 'samples: ' in line), sep='\n')
+    return text_table(('of the bus', 'number'), [[name, str(count)] for name, count in (
+        ('cycles', cycles), ('of them lost, as the driver says', lost),
+        ('messages with all joints', complete),
+        ('messages that were not heard here', watch.published - watch.heard),
+        ('lost and not counted', cycles - lost - complete),
+    )])
+
+
 def family(pids: Iterable[int]) -> list[int]:
     """These processes and all that they have started."""
     parents = {}
@@ -200,7 +284,11 @@ def main() -> None:
     parser.add_argument('--law', default='moving_horizon')
     parser.add_argument('--rate', type=float, default=100.0, help='[Hz]')
     parser.add_argument('--seconds', type=float, default=20.0)
+    parser.add_argument('--bus', action='store_true')
     options = parser.parse_args()
+    if options.bus:
+        print(soak(options.seconds, options.rate))
+        return
     header = ('', 'ready [s]', 'processor [%]', 'memory [MB]', 'p50 [ms]', 'p99 [ms]', 'late')
     print(text_table(header, [
         measure(together, options.law, options.rate, options.seconds) for together in (True, False)

@@ -22,7 +22,16 @@ def processes(
     commands: Mapping[str, Sequence[str]],
 ) -> Iterator[tuple[ProcessSupervisor, int]]:
     """The processes of one measurement in a domain of their own; all are gone afterwards."""
-    with free_domain() as domain, tempfile.TemporaryDirectory() as name:
+    with free_domain() as domain, processes_in(domain, commands) as supervisor:
+        yield supervisor, domain
+
+
+@contextmanager
+def processes_in(
+    domain: int, commands: Mapping[str, Sequence[str]],
+) -> Iterator[ProcessSupervisor]:
+    """Processes in this domain, by name; all are gone afterwards."""
+    with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         environment = child_environment(folder, domain)
         stages = [
@@ -31,7 +40,7 @@ def processes(
             for who, command in commands.items()
         ]
         with ProcessSupervisor(stages, lambda: False) as supervisor:
-            yield supervisor, domain
+            yield supervisor
 
 
 def node_command(name: str, values: Mapping[str, object]) -> list[str]:
