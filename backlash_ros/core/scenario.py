@@ -5,15 +5,11 @@ Apart from assembly.py, so that the nodes for these start without loading what l
 
 from __future__ import annotations
 
-import numpy as np
-
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.actuator import Actuator
-from backlash_ros.core.plant.backlash import Backlash
-from backlash_ros.core.plant.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.plant.true_plant import Alteration, altered_plant, delayed
-from backlash_ros.core.reference.file import read_reference_file
+from backlash_ros.core.plant.true_plant import altered_plant, delayed
 from backlash_ros.core.reference.signal import ReferenceSignal
 
 
@@ -39,29 +35,18 @@ def build_true_model(p: Parameters) -> TransferFunction:
         truth.numerator or plant.numerator, truth.denominator or plant.denominator,
         'truth' if truth.numerator or truth.denominator else 'plant',
     )
-    altered = altered_plant(base, Alteration(
-        truth.scale_frequency, truth.scale_damping, truth.extra_lag / p.sample_period
-    ))
+    altered = altered_plant(
+        base, truth.scale_frequency, truth.scale_damping, truth.extra_lag / p.sample_period
+    )
     samples = truth.delay_samples if truth.delay_samples >= 0 else p.control.delay_samples
     return delayed(altered, samples)
 
 
 def build_plant(p: Parameters) -> SimulatedPlant:
     """The simulated plant with its hidden backlash."""
-    hidden = p.backlash
-    imperfections = Imperfections(
-        p.output_noise_std, p.output_quantum, p.input_disturbance, p.truth.walk_std,
-        hidden.rate, hidden.jump_time, hidden.jump,
-    )
-    return SimulatedPlant(
-        build_true_model(p), Backlash(hidden.m, hidden.c_r, hidden.c_l, hidden.initial_u),
-        p.sample_period, np.random.default_rng(p.seed), imperfections, build_actuator(p),
-    )
+    return SimulatedPlant(p, build_true_model(p), build_actuator(p))
 
 
 def build_reference(p: Parameters) -> ReferenceSignal:
     """y_m(t); reads the file for waveform: file."""
-    return ReferenceSignal(
-        p.waveform, p.amplitude, p.frequency, p.bias, p.frequency_start, p.sweep_time,
-        p.sample_period, read_reference_file(p),
-    )
+    return ReferenceSignal(p)

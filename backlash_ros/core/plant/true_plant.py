@@ -14,8 +14,6 @@ so that the zeros are those of the altered G(s), sampled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,34 +24,25 @@ Array = NDArray[np.float64]
 Roots = NDArray[np.complex128]
 
 
-@dataclass(frozen=True)
-class Alteration:
-    """What sets the true G(z) apart from the known one; the defaults change nothing.
-
-    frequency: factor on the natural frequency of every pole, > 0. damping: factor on the damping
-    ratio of every complex pair of poles, > 0. lag: dead time of u [samples], >= 0.
-    """
-
-    frequency: float = 1.0
-    damping: float = 1.0
-    lag: float = 0.0
-
-
 def delayed(model: TransferFunction, samples: int) -> TransferFunction:
     """z^-samples G(z), the delay as poles at 0."""
     denominator = np.append(model.denominator, np.zeros(samples))
     return TransferFunction(model.numerator.tolist(), denominator.tolist())
 
 
-def altered_plant(model: TransferFunction, alteration: Alteration) -> TransferFunction:
+def altered_plant(
+    model: TransferFunction, frequency: float = 1.0, damping: float = 1.0, lag: float = 0.0,
+) -> TransferFunction:
     """The altered G(z); the same numbers where nothing but a whole delay is asked for.
 
-    Raises ParameterError for a pole on the negative real axis, which no G(s) of this order has,
-    and for a numerator that is not that of a delay by whole samples.
+    frequency: factor on the natural frequency of every pole, > 0. damping: factor on the damping
+    ratio of every complex pair of poles, > 0. lag: dead time of u [samples], >= 0. Raises
+    ParameterError for a pole on the negative real axis, which no G(s) of this order has, and for a
+    numerator that is not that of a delay by whole samples.
     """
-    whole = int(alteration.lag + 1e-9)
-    part = max(alteration.lag - whole, 0.0)
-    if alteration.frequency == 1.0 and alteration.damping == 1.0 and part <= 1e-9:
+    whole = int(lag + 1e-9)
+    part = max(lag - whole, 0.0)
+    if frequency == 1.0 and damping == 1.0 and part <= 1e-9:
         return delayed(model, whole)
     from scipy.linalg import expm, logm  # takes long to load, and few plants need it
 
@@ -64,8 +53,8 @@ def altered_plant(model: TransferFunction, alteration: Alteration) -> TransferFu
     sampled[n, n] = 1.0
     block = np.real(logm(sampled))
     numerator = _numerator(block[:n, :n], block[:n, n], np.real(np.poly(poles)))
-    poles = _damped(poles, alteration.damping) * alteration.frequency
-    numerator *= alteration.frequency**(np.arange(1, n + 1) - np.count_nonzero(poles == 0.0))
+    poles = _damped(poles, damping) * frequency
+    numerator *= frequency**(np.arange(1, n + 1) - np.count_nonzero(poles == 0.0))
     altered = TransferFunction(numerator.tolist(), np.real(np.poly(poles)).tolist())
     a, b = altered.state_space()[:2]
     over, over_part = expm(_block(a, b) * (1.0 - part)), expm(_block(a, b) * part)

@@ -1,44 +1,35 @@
-"""Reference signals y_m(t)."""
+"""Reference signals y_m(t), from a formula or from a file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import asin, floor, pi, sin
+import csv
+from math import asin, floor, isfinite, pi, sin
+from pathlib import Path
 
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
 # Shapes of the phase alone, which go on where they are if the frequency changes.
 PERIODIC = ('sine', 'square', 'triangle', 'multisine')
-SHAPES = (*PERIODIC, 'step', 'chirp', 'file')
 
 
-@dataclass(frozen=True)
 class ReferenceSignal:
-    """y_m(t) = bias + amplitude * shape(t).
+    """y_m(t) = bias + amplitude * shape(t), by the parameters of the reference.
 
-    waveform: sine, step, square, triangle, multisine, chirp or file. frequency [rad/s]; a step
-    rises after half a period. chirp: from frequency_start to frequency within sweep_time [s],
-    linear, and again. samples: the values for `file`, one per sample period, the last one held.
+    frequency [rad/s]; a step rises after half a period; chirp: from frequency_start to frequency
+    within sweep_time [s], linear, and again. samples: for waveform: file instead of those of the
+    file, one per sample period, the last one held. Raises ParameterError.
     """
 
-    waveform: str = 'sine'
-    amplitude: float = 1.0
-    frequency: float = 1.0
-    bias: float = 0.0
-    frequency_start: float = 0.63
-    sweep_time: float = 10.0
-    sample_period: float = 0.01
-    samples: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.waveform not in SHAPES:
-            raise ParameterError('waveform', self.waveform, 'must be one of ' + ', '.join(SHAPES))
-        if self.waveform == 'file' and not self.samples:
-            raise ParameterError('file', '', 'must hold at least one sample for waveform: file')
+    def __init__(self, p: Parameters, samples: tuple[float, ...] = ()) -> None:
+        self._p, self.waveform, self.frequency = p, p.waveform, p.frequency
+        self._samples = samples or read_reference_file(p)
+        if self.waveform == 'file' and not self._samples:
+            raise ParameterError('file', p.file, 'must hold at least one sample for waveform: file')
 
     def __call__(self, t: float) -> float:
         """y_m at time t >= 0 [s]."""
-        return self.bias + self.amplitude * self._shape(t)
+        return self._p.bias + self._p.amplitude * self._shape(t)
 
     def _shape(self, t: float) -> float:
         phase = self.frequency * t
@@ -57,9 +48,43 @@ class ReferenceSignal:
                 sin(h * self.frequency * t - pi * i * (i + 1) / 4) for i, h in harmonics
             ) / 4
         if self.waveform == 'chirp':
-            within = t % self.sweep_time
-            slope = (self.frequency - self.frequency_start) / self.sweep_time
-            return sin(self.frequency_start * within + 0.5 * slope * within * within)
+            within, start = t % self._p.sweep_time, self._p.frequency_start
+            slope = (self.frequency - start) / self._p.sweep_time
+            return sin(start * within + 0.5 * slope * within * within)
         # Half a period of slack: t = k T in floating point may fall just short of sample k.
-        index = floor(t / self.sample_period + 0.5)
-        return self.samples[min(index, len(self.samples) - 1)]
+        index = floor(t / self._p.sample_period + 0.5)
+        return self._samples[min(index, len(self._samples) - 1)]
+
+
+def read_reference_file(parameters: Parameters) -> tuple[float, ...]:
+    """Values of the CSV with the header t,y_m and a row per sample period, from t = 0 on.
+
+    Empty for any other waveform. Raises ParameterError, naming the line.
+    """
+    if parameters.waveform != 'file':
+        return ()
+    name, period = parameters.file, parameters.sample_period
+    if not name:
+        raise ParameterError('file', '', 'must name a CSV with rows t,y_m for waveform: file')
+    try:
+        with Path(name).open(newline='', encoding='utf-8') as file:
+            header, *rows = list(csv.reader(file)) or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ParameterError('file', name, f'cannot be read: {error}') from None
+    if [cell.strip() for cell in header] != ['t', 'y_m']:
+        raise ParameterError('file', name, 'must begin with the header t,y_m')
+    samples: list[float] = []
+    for line, row in enumerate(rows, start=2):
+        try:
+            t, y_m = (float(cell) for cell in row)
+        except ValueError:
+            raise ParameterError('file', name, f'line {line} must hold t,y_m') from None
+        due = len(samples) * period
+        # A file in decimals rounds a little away.
+        if not (abs(t - due) <= 1e-3 * period and isfinite(y_m)):
+            raise ParameterError(
+                'file', name, f'line {line} must hold t={due:.9g} and a finite y_m',
+                f'one row per sample_period={period!r}',
+            )
+        samples.append(y_m)
+    return tuple(samples)

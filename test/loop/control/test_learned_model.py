@@ -26,7 +26,7 @@ from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.fixed import FixedBacklash
-from backlash_ros.core.plant.backlash import Backlash
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -127,9 +127,11 @@ def run(
             while_designing()
         return not controller.designing
 
-    backlash = Backlash(TRUTH.m, TRUTH.c_r, TRUTH.c_l)
     rng = np.random.default_rng(1)
-    plant = SimulatedPlant(true, backlash, PERIOD, rng)
+    plant = SimulatedPlant(Parameters({
+        'backlash.m': TRUTH.m, 'backlash.c_r': TRUTH.c_r, 'backlash.c_l': TRUTH.c_l,
+        'sample_period': PERIOD,
+    }), true)
     rows = []
     for k in range(samples):
         y_m, y = reference(k), plant.measure()

@@ -45,7 +45,9 @@ def tracking(**changes: object) -> Parameters:
 def simulate(p: Parameters, samples: int, y_m: np.ndarray | None = None) -> RunRecord:
     loop = build_closed_loop(p)
     if y_m is not None:
-        loop.reference = ReferenceSignal('file', samples=tuple(y_m.tolist()))
+        loop.reference = ReferenceSignal(
+            Parameters({'waveform': 'file', 'amplitude': 1.0}), tuple(y_m.tolist())
+        )
     return loop.run(samples)
 
 

@@ -30,7 +30,9 @@ def moved(asked: Array, noise: float = 0.0, **changes: object) -> tuple[Array, f
     p = Parameters({**GEAR, **{name.replace('__', '.'): v for name, v in changes.items()}})
     heard = asked + noise * np.random.default_rng(1).standard_normal(len(asked))
     loop = build_closed_loop(p)
-    loop.reference = ReferenceSignal('file', sample_period=PERIOD, samples=tuple(heard.tolist()))
+    loop.reference = ReferenceSignal(Parameters({
+        'waveform': 'file', 'amplitude': 1.0, 'sample_period': PERIOD,
+    }), tuple(heard.tolist()))
     run, delay = loop.run(len(asked)), loop.controller.structure.delay
     model = build_model(p)
     y = signal.lfilter(model.numerator, model.denominator, run.column('u'))

@@ -7,7 +7,7 @@ import pytest
 from backlash_ros.core.assembly import build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.reference.file import read_reference_file
+from backlash_ros.core.reference.signal import read_reference_file
 
 
 @pytest.mark.parametrize(

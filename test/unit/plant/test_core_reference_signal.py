@@ -6,16 +6,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.reference.signal import SHAPES, ReferenceSignal
+from backlash_ros.core.parameters.table import BY_NAME
+from backlash_ros.core.reference.signal import ReferenceSignal
 
 OMEGA = 2.0 * pi  # a period of one second
 
 
+def signal(waveform: str, samples: tuple[float, ...] = (), **values: object) -> ReferenceSignal:
+    return ReferenceSignal(
+        Parameters({'waveform': waveform, 'amplitude': 1.0, 'frequency': OMEGA, **values}), samples
+    )
+
+
 @given(t=st.floats(0.0, 100.0), amplitude=st.floats(0.0, 10.0), bias=st.floats(-10.0, 10.0),
-       waveform=st.sampled_from([w for w in SHAPES if w != 'file']))
+       waveform=st.sampled_from([
+           w for w in BY_NAME['waveform'].choices if w != 'file'
+       ]))
 def test_every_waveform_stays_within_amplitude_around_bias(t, amplitude, bias, waveform):
-    y_m = ReferenceSignal(waveform, amplitude, OMEGA, bias)(t)
+    y_m = signal(waveform, amplitude=amplitude, bias=bias)(t)
     assert abs(y_m - bias) <= amplitude + 1e-9
 
 
@@ -30,11 +40,11 @@ def test_every_waveform_stays_within_amplitude_around_bias(t, amplitude, bias, w
     ],
 )
 def test_shape_of(waveform: str, t: float, value: float) -> None:
-    assert ReferenceSignal(waveform, 2.0, OMEGA, 1.0)(t) == pytest.approx(value)
+    assert signal(waveform, amplitude=2.0, bias=1.0)(t) == pytest.approx(value)
 
 
 def test_chirp_sweeps_its_frequency_and_starts_again() -> None:
-    chirp = ReferenceSignal('chirp', 1.0, 20.0, frequency_start=2.0, sweep_time=10.0)
+    chirp = signal('chirp', frequency=20.0, frequency_start=2.0, sweep_time=10.0)
     step = 1e-4
 
     def frequency(t: float) -> float:
@@ -48,12 +58,10 @@ def test_chirp_sweeps_its_frequency_and_starts_again() -> None:
 
 @given(k=st.integers(0, 20000), period=st.sampled_from([0.001, 0.01, 0.02, 0.1, 1.0 / 3.0]))
 def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(k, period):
-    reference = ReferenceSignal(
-        'file', sample_period=period, samples=tuple(float(i) for i in range(20001))
-    )
+    reference = signal('file', tuple(float(i) for i in range(20001)), sample_period=period)
     assert reference(k * period) == float(k)
 
 
 def test_unknown_waveform_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"waveform='sin' must be one of sine, "):
-        ReferenceSignal('sin')
+        signal('sin')

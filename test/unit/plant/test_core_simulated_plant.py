@@ -7,21 +7,17 @@ from hypothesis import strategies as st
 from strategies import output_of, paper_example, plants, signals, usual_plays
 
 from backlash_ros.core.assembly import build_plant
+from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash
-from backlash_ros.core.plant.simulated_plant import Imperfections, SimulatedPlant
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 SLOW = TransferFunction([0.1], [1.0, -0.9])
 
 
-def plant(
-    extra: Imperfections | None = None, model: TransferFunction = SLOW, seed: int = 1,
-    period: float = 0.01,
-) -> SimulatedPlant:
-    return SimulatedPlant(
-        model, Backlash(1.3, 3.0, -3.0), period, np.random.default_rng(seed), extra
-    )
+def plant(**values: object) -> SimulatedPlant:
+    return SimulatedPlant(Parameters(values), SLOW)
 
 
 def outputs(simulated: SimulatedPlant, control: list[float]) -> list[float]:
@@ -34,10 +30,10 @@ def outputs(simulated: SimulatedPlant, control: list[float]) -> list[float]:
 
 @given(model=plants(), play=usual_plays(), control=signals(), disturbance=st.floats(-5.0, 5.0))
 def test_y_is_g_of_the_backlash_output_plus_the_disturbance(model, play, control, disturbance):
-    simulated = SimulatedPlant(
-        model, Backlash(play.m, play.c_r, play.c_l), 0.01, np.random.default_rng(0),
-        Imperfections(input_disturbance=disturbance),
-    )
+    simulated = SimulatedPlant(Parameters({
+        'backlash.m': play.m, 'backlash.c_r': play.c_r, 'backlash.c_l': play.c_l,
+        'input_disturbance': disturbance,
+    }), model)
     backlash = Backlash(play.m, play.c_r, play.c_l)
     u = np.array([backlash.step(v) for v in control])
     expected = output_of(model, u + disturbance)
@@ -49,16 +45,17 @@ def test_y_is_g_of_the_backlash_output_plus_the_disturbance(model, play, control
 @given(control=signals(), quantum=st.floats(0.001, 1.0))
 def test_quantised_output_is_the_nearest_multiple(control: list[float], quantum: float) -> None:
     exact = outputs(plant(), control)
-    coarse = outputs(plant(Imperfections(output_quantum=quantum)), control)
+    coarse = outputs(plant(output_quantum=quantum), control)
     for y, shown in zip(exact, coarse, strict=True):
         assert abs(shown - y) <= 0.5 * quantum * (1.0 + 1e-9)
         assert shown / quantum == pytest.approx(round(shown / quantum), abs=1e-6)
 
 
 def test_wear_moves_the_backlash_with_time_and_the_jump_comes_at_its_time() -> None:
-    simulated = plant(
-        Imperfections(rate=(0.1, 1.0, -2.0), jump_time=0.5, jump=(0.0, 1.0, 0.0)), period=0.1
-    )
+    simulated = plant(**{
+        'backlash.rate': (0.1, 1.0, -2.0), 'backlash.jump_time': 0.5,
+        'backlash.jump': (0.0, 1.0, 0.0), 'sample_period': 0.1,
+    })
     seen = []
     for _ in range(11):
         simulated.step(0.0)

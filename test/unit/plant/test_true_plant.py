@@ -14,7 +14,7 @@ from backlash_ros.core.assembly import build_model, build_plant, build_true_mode
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.plant.true_plant import Alteration, altered_plant
+from backlash_ros.core.plant.true_plant import altered_plant
 
 PERIOD = 0.005
 
@@ -44,15 +44,15 @@ def continuous(model: TransferFunction) -> bool:
 
 @pytest.mark.parametrize('factor', [0.5, 0.8, 0.98, 1.02, 1.2, 1.5])
 def test_scaled_frequency_is_the_motor_at_that_frequency(factor: float) -> None:
-    assert_equal(altered_plant(motor(), Alteration(frequency=factor)), motor(20.0 * factor), 1e-12)
+    assert_equal(altered_plant(motor(), frequency=factor), motor(20.0 * factor), 1e-12)
 
 
 @given(plants(), st.integers(0, 2), st.integers(1, 3))
 def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(model, whole, quarters):
     assume(continuous(model))
-    lagging = step_response(altered_plant(model, Alteration(lag=whole + 0.25 * quarters)), 60)
+    lagging = step_response(altered_plant(model, lag=whole + 0.25 * quarters), 60)
     # A quarter of the frequency shows the response between the samples as well.
-    slow = step_response(altered_plant(model, Alteration(frequency=0.25)), 240)
+    slow = step_response(altered_plant(model, frequency=0.25), 240)
     if np.any(np.abs(model.poles - 1.0) < 1e-6):
         slow = slow * 0.25
     expected = np.append(np.zeros(whole + 1), slow[4 - quarters::4])[:60]
@@ -62,15 +62,15 @@ def test_lag_by_a_part_of_a_sample_shifts_the_response_by_that_part(model, whole
 def test_plant_that_no_continuous_one_has_is_refused_with_its_pole() -> None:
     ringing = TransferFunction([1.0], [1.0, 0.25])
     with pytest.raises(ParameterError, match=r'pole -0\.25.*negative real axis.*truth\.numerator'):
-        altered_plant(ringing, Alteration(frequency=1.2))
+        altered_plant(ringing, frequency=1.2)
     # Whole samples of dead time need no continuous plant.
-    assert altered_plant(ringing, Alteration(lag=2.0)).delay == 3
+    assert altered_plant(ringing, lag=2.0).delay == 3
 
 
 def test_taps_of_a_delay_by_part_of_a_sample_are_refused() -> None:
     taps = TransferFunction([0.07, 0.03], [1.0, -0.9, 0.0])
     with pytest.raises(ParameterError, match='1 poles at 0 that are no delay by whole samples'):
-        altered_plant(taps, Alteration(frequency=1.2))
+        altered_plant(taps, frequency=1.2)
 
 
 def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() -> None:
