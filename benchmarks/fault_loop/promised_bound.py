@@ -13,8 +13,8 @@ from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
 from backlash_ros.core.control.tracking.design import Weights, feedback_around
-from backlash_ros.core.control.tracking.handover import FADING
 from backlash_ros.core.control.tracking.rest import TOLERANCE
+from backlash_ros.core.control.tracking.tracking import FADING
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 

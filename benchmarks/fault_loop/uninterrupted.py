@@ -24,7 +24,7 @@ class Uninterrupted:
         """v instead of that of the step. core: for what may be set meanwhile, as band, too."""
         inverse, v_before = self._inverse, self._inverse.v
         inverse.take_up = core.inverse.take_up
-        inverse.set_band(band)
+        inverse.direction_band = band
         used = step.estimate if core.compensating else replace(step.estimate, c_r=0.0, c_l=0.0)
         inputs = ControlInput(step.y_m, step.y, used, core.estimator)
         return core.limits.apply(self._structure.control(inputs, inverse).v, at_rest(v_before)).v

@@ -45,6 +45,6 @@ def _simulate(duration: float, settings: tuple[tuple[str, str], ...], config: st
     )
     loop = build_closed_loop(parameters)
     record = run_loop(loop, round(duration / parameters.sample_period))
-    learned = loop.controller.adopted
+    learned = loop.controller.redesign.adopted
     model = build_model(parameters) if learned is None else learned.transfer_function
     return Run(parameters, record, loop.controller.structure.delay, model)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, nan
 
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.plant.backlash import Region
+from backlash_ros.core.plant.backlash import Region, clamp
 
 LEFT, GAP, RIGHT = Region.LEFT, Region.GAP, Region.RIGHT
 
@@ -22,6 +22,9 @@ class BacklashInverse:
         finite slope"), and over to a line that new estimates have moved by more than that, until
         u moves or, after slow_down, until it is there [unit of v]; inf jumps. From there on v goes
         as far as u_d does.
+    side: line in use; GAP until u_d moves for the first time. extreme: furthest u_d in the present
+        direction. taking_up: whether v is still on its way to the line. limited: whether the last
+        v could not be applied as it was.
     """
 
     def __init__(self, direction_band: float = 0.0, take_up: float = inf) -> None:
@@ -30,57 +33,38 @@ class BacklashInverse:
         if not take_up > 0.0:
             raise ParameterError('inverse.take_up_rate', take_up, 'must be > 0')
         self.direction_band, self.take_up = direction_band, take_up
-        self._least_band = direction_band
-        self.limited = False  # whether the last v could not be applied as it was
-        self.v = 0.0
-        self.side = GAP  # line in use; GAP until u_d moves for the first time
-        self.extreme = 0.0  # furthest u_d in the present direction: u_d(t-1) when the band is 0
-        self.taking_up = False  # whether v is still on its way to the line
-        self._slowed = False  # whether that counts for the whole way to where u_d wants v
+        self.v, self.side, self.extreme = 0.0, GAP, 0.0
+        self.taking_up = self.limited = False
+        self._slowed = False  # whether v is on its way until it is where u_d wants it
         self._play = nan, nan, nan  # m, c_r, c_l in use the sample before
         self._u = 0.0  # what they make of v, as long as v is on its way to a line
 
-    def set_band(self, band: float) -> None:
-        """Use this band, and none narrower from now on."""
-        self.direction_band = self._least_band = band
-
-    def widen_band(self, band: float) -> None:
-        """Use this band while it is wider than the one set: the noise of u_d may vary."""
-        least = self._least_band
-        self.direction_band = band if band > least else least
-
-    def go_on_from(self, other: BacklashInverse) -> None:
-        """Take over v and the line that is engaged."""
-        self.v, self.side, self.extreme = other.v, other.side, other.extreme
-        self.taking_up, self.limited = other.taking_up, other.limited
-        self._play, self._u, self._slowed = other._play, other._u, other._slowed
-
-    def direction(self, u_d: float) -> Region:
-        """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held.
-
-        Asking does not advance the state.
-        """
-        move, band = u_d - self.extreme, self.direction_band
+    def direction(self, u_d: float, band: float) -> Region:
+        """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held."""
+        move = u_d - self.extreme
+        side = RIGHT if move > 0.0 else LEFT if move < 0.0 else GAP
         # Only a turn has to leave the band; going on in the same direction is never noise.
-        if move > 0.0:
-            return RIGHT if band == 0.0 or self.side is RIGHT or move > band else GAP
-        if move < 0.0:
-            return LEFT if band == 0.0 or self.side is LEFT or move < -band else GAP
-        return GAP
+        return side if band == 0.0 or side is self.side or abs(move) > band else GAP
 
-    def step(self, u_d: float, m: float, c_r: float, c_l: float) -> float:
-        """Return v(t) for u_d(t) and the parameters in use, equation (2.3)."""
-        side = self.direction(u_d)
-        if not self.taking_up:
-            self._u = self.extreme
-        elif self.side is not GAP:
-            side = self._side_on_the_way(u_d, side)
-        if side is not GAP:
-            self.taking_up = self.taking_up or side is not self.side
-            self.side, self.extreme = side, u_d
-        elif not self.taking_up or self.side is GAP:
+    def step(
+        self, u_d: float, m: float, c_r: float, c_l: float, band: float | None = None,
+    ) -> float:
+        """Return v(t) for u_d(t) and the parameters in use, equation (2.3).
+
+        band: instead of direction_band.
+        """
+        if band is None:
+            band = self.direction_band
+        side = self.direction(u_d, band)
+        if self.taking_up and self.side is not GAP:
+            # u is held until v arrives: it turns only where u_d lies on the other side of that.
+            self._note_on_the_way()
+            side = Region(-self.side) if (self._u - u_d) * self.side > band else self.side
+        elif side is GAP:
             return self.v
-        return self._approach(m, c_r, c_l)
+        elif self.side is GAP:
+            self.side, self._u, self.taking_up = side, self.extreme, True
+        return self.follow(side, u_d, m, c_r, c_l)
 
     def follow(self, side: Region, u_d: float, m: float, c_r: float, c_l: float) -> float:
         """Return v for u_d on the line of a side; whoever calls this decides when u_d has turned.
@@ -102,54 +86,15 @@ class BacklashInverse:
         self.extreme = u_d if (u_d - self._u) * side > 0.0 else self._u
         return self._approach(m, c_r, c_l)
 
+    def aim(self, u_d: float, side: Region) -> None:
+        """Let the next step go to u_d on the line of this side, whatever it came from."""
+        if not self.taking_up:
+            self._u = self.extreme
+        self.side, self.extreme, self.taking_up = side, u_d, True
+
     def proceed(self, m: float, c_r: float, c_l: float) -> float:
         """Return v on its way to where `aim` says; else it stays."""
         return self._approach(m, c_r, c_l) if self.taking_up else self.v
-
-    @property
-    def held_u(self) -> float:
-        """The u that is held while v is on its way across the gap, else the newest."""
-        return self._u if self.taking_up else self.extreme
-
-    def samples_across(self, distance: float) -> float:
-        """Samples that v takes across a gap of this width."""
-        return distance / self.take_up if self.take_up < inf else 0.0
-
-    def _approach(self, m: float, c_r: float, c_l: float) -> float:
-        """Go to the line in use, no faster than the gap is crossed until v moves u."""
-        crossing = c_r if self.side is RIGHT else c_l
-        # Where v begins to move u, or would have stood if these parameters had been in use before.
-        until = self.extreme if self._slowed else self._u
-        way, take_up = until / m + crossing - self.v, self.take_up
-        if way > take_up or way < -take_up:
-            self.v += take_up if way > 0.0 else -take_up
-            self.taking_up = True
-        else:
-            self.v, self.taking_up = self.extreme / m + crossing, False
-            self._slowed = False
-        self._play = m, c_r, c_l
-        return self.v
-
-    def _side_on_the_way(self, u_d: float, side: Region) -> Region:
-        """The same as `direction` while v is on its way to a line.
-
-        u is held until v arrives: u_d has turned only when it lies on the other side of that.
-        """
-        self._note_on_the_way()
-        if side is GAP:
-            return GAP
-        if self.side is RIGHT:
-            return LEFT if u_d < self._u - self.direction_band else RIGHT
-        return RIGHT if u_d > self._u + self.direction_band else LEFT
-
-    def _note_on_the_way(self) -> None:
-        """Note what v has made of u since it left for its line."""
-        m, c_r, c_l = self._play
-        low, high = m * (self.v - c_r), m * (self.v - c_l)
-        if self._u < low:
-            self._u = low
-        elif self._u > high:
-            self._u = high
 
     def slow_down(self) -> None:
         """Let v go on to where u_d wants it like it crosses the gap, until it is there."""
@@ -167,30 +112,45 @@ class BacklashInverse:
             self._play = m, c_r, c_l
         return self.extreme
 
-    def aim(self, u_d: float, side: Region) -> None:
-        """Let the next step go to u_d on the line of this side, whatever it came from."""
-        if not self.taking_up:
-            self._u = self.extreme
-        self.side, self.extreme, self.taking_up = side, u_d, True
-
-    def hold(self, u_d: float) -> float:
-        """Keep v although u_d moved to where no line fits, and return v."""
-        if self.direction_band == 0.0:
-            self.extreme = u_d
-        return self.v
-
     def start_from(self, v: float) -> None:
         """Say which v acts before the next step, whatever was sent."""
         if v != self.v and self.side is not GAP:
-            slope, c_r, c_l = self._play
-            self.extreme = slope * (v - (c_r if self.side is RIGHT else c_l))
+            m, c_r, c_l = self._play
+            self.extreme = m * (v - (c_r if self.side is RIGHT else c_l))
         self.v = v
 
     def applied(self, v: float) -> None:
         """Say which v was really applied (limits), so that the next move starts from there."""
-        limited = v != self.v
-        self.limited = limited
-        if limited:
+        self.limited = v != self.v
+        if self.limited:
             # A v that was held back goes on its way although u_d rests.
+            self.v, self.taking_up = v, True
+
+    @property
+    def held_u(self) -> float:
+        """The u that is held while v is on its way across the gap, else the newest."""
+        return self._u if self.taking_up else self.extreme
+
+    def samples_across(self, distance: float) -> float:
+        """Samples that v takes across a gap of this width."""
+        return distance / self.take_up if self.take_up < inf else 0.0
+
+    def _approach(self, m: float, c_r: float, c_l: float) -> float:
+        """Go to the line in use, no faster than the gap is crossed until v moves u."""
+        crossing = c_r if self.side is RIGHT else c_l
+        # Where v begins to move u, or would have stood if these parameters had been in use before.
+        until = self.extreme if self._slowed else self._u
+        way = until / m + crossing - self.v
+        if abs(way) > self.take_up:
+            self.v += self.take_up if way > 0.0 else -self.take_up
             self.taking_up = True
-            self.v = v
+        else:
+            self.v = self.extreme / m + crossing
+            self.taking_up = self._slowed = False
+        self._play = m, c_r, c_l
+        return self.v
+
+    def _note_on_the_way(self) -> None:
+        """Note what v has made of u since it left for its line."""
+        m, c_r, c_l = self._play
+        self._u = clamp(self._u, m * (self.v - c_r), m * (self.v - c_l))

@@ -48,9 +48,7 @@ class Limits:
 
     def __post_init__(self) -> None:
         if not self.low < self.high:
-            raise ParameterError(
-                'control.min', self.low, f'must be < control.max={self.high!r}'
-            )
+            raise ParameterError('control.min', self.low, f'must be < control.max={self.high!r}')
 
     @property
     def zero(self) -> float:
@@ -108,16 +106,19 @@ class Limits:
         ahead = target - pace - v
         move = pace + (self._braking(ahead) if ahead > 0.0 else -self._braking(-ahead))
         move = min(max(move, -self.move), self.move)
-        # Beyond a bound, as after bounds were narrowed, v comes back likewise.
-        up, down = self.high - v, v - self.low
-        move = min(move, self._braking(up) if up >= 0.0 else -min(self._braking(-up), self.move))
-        move = max(move, -self._braking(down) if down >= 0.0
-                   else min(self._braking(-down), self.move))
+        move = min(move, self._most_towards(self.high - v))
+        move = max(move, -self._most_towards(v - self.low))
         move = min(max(move, before.move - most), before.move + most)
         sent = v + move
         if abs(sent - target) <= ROUNDING * (abs(v) + abs(target)):
             sent = target
         return Motion(sent, move, target, asked)
+
+    def _most_towards(self, distance: float) -> float:
+        """The largest move towards a bound; < 0 beyond it, as after bounds were narrowed."""
+        if distance >= 0.0:
+            return self._braking(distance)
+        return -min(self._braking(-distance), self.move)
 
     def _braking(self, distance: float) -> float:
         """The largest move now after which v can still come to rest within a distance >= 0.
@@ -136,11 +137,8 @@ def last_commands(
 ) -> Iterator[float]:
     """Commands that follow after a motion, one per sample; the last one stays in force.
 
-    action: hold (v comes to rest: no further command where any acceleration is allowed), zero or
-    ramp. Both go to the v nearest to 0 within the limits as fast as the limits allow; where they
-    allow any move, which ramp is refused for, that is one command.
-
-    limits: those that hold when the next command is made.
+    action: hold (v comes to rest), or zero and ramp, which go to the v nearest to 0 within the
+    limits as fast as these allow. limits: those that hold when the next command is made.
     """
     if action == 'hold':
         while (onward := limits().stop(motion)).v != motion.v:

@@ -5,8 +5,6 @@ The filters, the gains and what they make of the loop stand in four_blocks.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,20 +17,16 @@ from backlash_ros.core.control.protocol import (
     Structure,
 )
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.four_blocks import FourBlocks
-from backlash_ros.core.plant.state_model import StateModel
-from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
 
-class PolePlacement:
-    """u_d from the four blocks, v = BI(u_d).
+class PolePlacement(Structure):
+    """u_d from the four blocks, v = BI(u_d). The gains stay those of the nominal G.
 
     delay: what B/A_m delays a slow reference by, rounded to samples.
     """
-
 
     def __init__(self, blocks: FourBlocks) -> None:
         self._blocks = blocks
@@ -45,19 +39,10 @@ class PolePlacement:
         self._r: Array = np.zeros(len(blocks.demand[0]))
         self._asked: Array = np.zeros(len(blocks.demand[1]) - 1)
         self._largest_asked = 0.0  # largest of it so far
-        self.delay = round(_delay_of(blocks.reference))
-
-    @property
-    def may_change(self) -> bool:
-        """Nothing here changes with G."""
-        return True
-
-    def redesign(self, model: StateModel) -> Callable[[], object | None]:
-        """The gains stay those of the nominal G."""
-        return nothing
-
-    def adopt(self, gains: object, source: StateSource) -> None:
-        """Nothing is ever made to adopt."""
+        b, a = blocks.reference.numerator, blocks.reference.denominator
+        self.delay = round(float(  # the group delay at z = 1
+            np.polyval(np.polyder(a), 1.0) / a.sum() - np.polyval(np.polyder(b), 1.0) / b.sum()
+        ))
 
     def go_on_from(self, other: Structure, state_known: bool = True) -> None:
         """Take over what the filters hold."""
@@ -81,24 +66,10 @@ class PolePlacement:
     def _bounded(self, u_d: float, r: float, estimate: Estimate) -> float:
         """u_d, no further than feedback may go from what r asks for without disturbances."""
         numerator, denominator = self._blocks.demand
-        self._r[1:] = self._r[:-1]
-        self._r[0] = r
+        self._r = np.append(r, self._r[:-1])
         asked = float(numerator @ self._r - denominator[1:] @ self._asked)
-        self._asked[1:] = self._asked[:-1]
-        self._asked[0] = asked
+        self._asked = np.append(asked, self._asked)[:-1]
         self._largest_asked = max(self._largest_asked, abs(asked))
-        scale = max(self._largest_asked, estimate.m * (estimate.c_r - estimate.c_l))
         share = LARGEST_FEEDBACK if estimate.status is Status.TRACKING else LARGEST_IN_ACQUISITION
-        return min(max(u_d, asked - share * scale), asked + share * scale)
-
-
-def nothing() -> None:
-    """What a structure makes of a better G that does not adapt to it."""
-
-
-def _delay_of(model: TransferFunction) -> float:
-    """Group delay at z = 1 in samples."""
-    a, b = model.denominator, model.numerator
-    return float(
-        np.polyval(np.polyder(a), 1.0) / np.sum(a) - np.polyval(np.polyder(b), 1.0) / np.sum(b)
-    )
+        reach = share * max(self._largest_asked, estimate.m * (estimate.c_r - estimate.c_l))
+        return min(max(u_d, asked - reach), asked + reach)

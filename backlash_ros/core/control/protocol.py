@@ -1,10 +1,10 @@
-"""What every linear part of the controller offers: it turns y_m into u_d and v."""
+"""What every structure offers: it turns y_m into u_d and v."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from operator import mul
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,33 +58,34 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
     return product
 
 
-class Structure(Protocol):
-    """Makes u_d from the reference and drives the inverse with it."""
+class Structure:
+    """Makes u_d from the reference and drives the inverse with it.
 
-    @property
-    def delay(self) -> int:
-        """Samples by which y is meant to follow y_m."""
+    Structures inherit from here what a better G does not change. delay: samples by which y is
+    meant to follow y_m. may_change: whether gains for a better G may take over at this sample.
+    """
+
+    delay: int = 0
 
     @property
     def may_change(self) -> bool:
-        """Whether gains for a better model may take over at this sample."""
+        """See above."""
+        return True
 
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return the command of this sample; advances the inverse by one step."""
+        raise NotImplementedError
 
-    def redesign(self, model: StateModel) -> Callable[[], object | None]:
-        """What makes the gains for a better model of G, for `adopt`: it may be called elsewhere.
+    def redesign(self, model: StateModel) -> Callable[[], object | None] | None:
+        """What makes the gains for a better G, for `adopt`; None where there are none to make.
 
-        It depends on nothing but what it holds, and can be sent to another process. It returns
-        None where the result would be less safe than what is in use, or the structure does not
-        adapt to G.
+        It depends on nothing but what it holds, so that it can be called in another process. It
+        returns None where the result would be less safe than what is in use.
         """
+        return None
 
     def adopt(self, gains: object, source: StateSource) -> None:
-        """Use such gains from the next sample on, without a jump of v.
-
-        source: who knows the state of the better model.
-        """
+        """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""
 
     def go_on_from(self, other: Structure, state_known: bool = True) -> None:
         """Take over from a structure that has made v until now, so that v does not jump.

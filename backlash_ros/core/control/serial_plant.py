@@ -27,10 +27,8 @@ Array = NDArray[np.float64]
 
 # Share of the motion of u that may not be what the backlash says, before and after it was learned.
 DOUBT, LITTLE_DOUBT = 0.5, 0.1
-AVERAGED = 100  # innovations that say how large one may be
-# Of their rms, beyond which y is an outlier. They come in bursts, when v crosses the gap.
-GATE = 100.0
-KNOWN = Estimate(1.0, 0.0, 0.0, 0.0)  # for an observer that is told u: no backlash
+# Innovations of whose rms, beyond how much, y is an outlier: they come in bursts, when v crosses.
+GATE, AVERAGED = 100.0, 100
 
 
 class SerialPlant:
@@ -55,10 +53,12 @@ class SerialPlant:
     def adopt(self, model: StateModel) -> None:
         """Give x_hat for this L G from now on."""
         self.model = model
-        doubt = LITTLE_DOUBT if self._learned else DOUBT
-        self._observer = FixedBacklash(KNOWN, model, self._noise_std, doubt)
-        self._u = self._variance = 0.0
-        self._taken = self._refused = 0
+        # It is told u: to the observer there is no backlash.
+        self._observer = FixedBacklash(
+            Estimate(1.0, 0.0, 0.0, 0.0), model, self._noise_std,
+            LITTLE_DOUBT if self._learned else DOUBT,
+        )
+        self._variance, self._taken, self._refused = 0.0, 0, 0
         for u, y in self._newest:
             self._follow(y, u)
 
@@ -102,24 +102,20 @@ class SerialPlant:
         self._follow(y, u)
 
     def _follow(self, y: float | None, u: float) -> None:
-        observer, model = self._observer, self.model
-        disturbance = observer.u_hat - self._u
-        self._u = u
+        observer = self._observer
+        ahead = observer.predicted(u)
         if y is not None and self._taken >= AVERAGED:
-            x = model.a @ observer.x_hat + model.b * (u + disturbance)
-            square = (y - model.c * float(x[0])) ** 2
-            least = self._noise_std**2
+            least = max(self._variance, self._noise_std**2)
             # So many outliers in a row are none.
-            if square > GATE**2 * max(self._variance, least) and self._refused < OUTLIERS:
+            if (y - ahead) ** 2 > GATE**2 * least and self._refused < OUTLIERS:
                 self._refused += 1
                 y = None
         observer.update(y, Interval(u, nan, nan, nan))
         if y is not None:
             self._refused = 0
             self._taken += 1
-            self._variance += (
-                observer.innovation**2 - self._variance
-            ) / min(self._taken, AVERAGED)
+            change = observer.innovation**2 - self._variance
+            self._variance += change / min(self._taken, AVERAGED)
 
 
 def _played(held: float, v: float, estimate: Estimate) -> float:

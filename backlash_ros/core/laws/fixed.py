@@ -77,6 +77,10 @@ class FixedBacklash(Law):
         """Covariance of x_hat, shape (n, n)."""
         return self._p[:-1, :-1]
 
+    def predicted(self, u: float) -> float:
+        """y(k+1) with this u from the backlash."""
+        return self._c * float(self._transition[0] @ self._x + self._input[0] * u)
+
     def update(self, y: float | None, interval: Interval) -> None:
         """Take in y(k), None if it was lost, and v of the interval before it."""
         e = self.estimate

@@ -350,7 +350,7 @@ class ControlLoop:
         before, self._p = self._p, p
         core = self.core
         core.limits = build_limits(p)
-        core.inverse.set_band(p.inverse.direction_band)
+        core.inverse.direction_band = p.inverse.direction_band
         core.inverse.take_up = p.inverse.take_up_rate * p.sample_period
         core.estimator.retune(p)
         of_the_structure = (

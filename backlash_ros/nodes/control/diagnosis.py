@@ -162,7 +162,7 @@ def values_of(loop: ControlLoop, period: Period) -> dict[str, object]:
             'outliers': report.outliers,
             'commands found to be late': report.reattributed,
             'failed fits': report.failed_fits,
-            'failed designs': loop.core.failed_designs,
+            'failed designs': loop.core.redesign.failed if loop.core.redesign else 0,
             'processes for fits that died': loop.executor.restarts,
             'G(z)': 'as told' if same else 'learned',
         }

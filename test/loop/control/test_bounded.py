@@ -25,9 +25,8 @@ from backlash_ros.core.control.protocol import (
     Structure,
 )
 from backlash_ros.core.control.tracking.design import Weights, design, feedback_around
-from backlash_ros.core.control.tracking.handover import FADING
 from backlash_ros.core.control.tracking.rest import TOLERANCE
-from backlash_ros.core.control.tracking.tracking import Tracking
+from backlash_ros.core.control.tracking.tracking import FADING, Tracking
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.parameters import Parameters

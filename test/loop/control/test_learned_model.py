@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 from waiting import wait_until
 
-from backlash_ros.core.control.controller import LONGEST_WAIT, AdaptiveController
+from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.protocol import Structure
+from backlash_ros.core.control.redesign import LONGEST_WAIT
 from backlash_ros.core.control.tracking.design import (
     TrackingDesign,
     Weights,
@@ -123,9 +124,9 @@ def run(
 
     def refined() -> bool:
         controller.refine()
-        if controller.designing:
+        if controller.redesign.busy:
             while_designing()
-        return not controller.designing
+        return not controller.redesign.busy
 
     rng = np.random.default_rng(1)
     plant = SimulatedPlant(Parameters({

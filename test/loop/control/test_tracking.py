@@ -1,7 +1,5 @@
 """The tracking structure: y follows y_m as if there were no backlash."""
 
-from math import inf
-
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -11,10 +9,11 @@ from scipy import signal
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.tracking.design import Weights, design
+from backlash_ros.core.control.tracking.feedback import shrunk_crossings
 from backlash_ros.core.control.tracking.lq_preview import preview_gains
-from backlash_ros.core.control.tracking.margin import tolerates
+from backlash_ros.core.control.tracking.margin import Feedback, tolerates
 from backlash_ros.core.control.tracking.rest import SHORT, Mode, Rest
-from backlash_ros.core.control.tracking.trust import shrunk_crossings
+from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.state_model import StateModel
@@ -144,14 +143,15 @@ def test_v_comes_to_rest_after_a_motion_in_spite_of_noise(seed: int) -> None:
 def test_a_step_to_rest_stops_short_of_the_u_at_rest_by_what_is_uncertain() -> None:
     rest, inverse, estimate = resting(std=0.01)
     x = [0.0, 0.0]
-    assert rest.decide(0.0, np.zeros(1), x, x, x, 0.0, inverse.side, inf) is Mode.HOLD
-    rest.step(estimate, 0.0, x, inverse, begins=True)
+    plan = TrajectoryState(x, onward=x)
+    assert rest.decide(0.0, np.zeros(1), plan, x, 0.0, inverse.side, 0.0, False) is Mode.HOLD
+    rest.step(estimate, 0.0, 0.0, inverse, begins=True)
     # From u = 1 down to 0, where c_l = -1 may lie 0.01 higher or lower.
     assert stepped(rest, inverse, estimate) == pytest.approx(-1.0 + SHORT * 0.01)
-    rest.step(estimate, 0.0, x, inverse, begins=False)
+    rest.step(estimate, 0.0, 0.0, inverse, begins=False)
     assert not inverse.taking_up, 'nothing more is known, so nothing more is done'
     known = resting(std=0.001)[2]
-    rest.step(known, 0.0, x, inverse, begins=False)
+    rest.step(known, 0.0, 0.0, inverse, begins=False)
     assert stepped(rest, inverse, known) == pytest.approx(-1.0 + SHORT * 0.001)
 
 
@@ -187,8 +187,8 @@ def test_feedback_by_the_first_guess_is_left_out_where_a_wrong_slope_would_desta
     slow = StateModel(TransferFunction([1e-6], np.poly([1.0, 0.99, 0.985, 0.98]).tolist()))
     for model, bears in ((quick, True), (slow, False)):
         gain = preview_gains(model, 1.0, 0.0, 0).state
-        assert tolerates(model, gain, 1.0)
-        assert tolerates(model, gain, 3.0) is bears
+        assert tolerates(Feedback(model, gain), 1.0)
+        assert tolerates(Feedback(model, gain), 3.0) is bears
 
 
 @given(st.lists(st.floats(-1.0, 1.0), min_size=2, max_size=2))
@@ -197,7 +197,7 @@ def test_with_the_true_slope_the_observer_changes_no_pole_of_the_loop(gain: list
     k = np.array(gain)
     radius = np.abs(np.linalg.eigvals(model.a - np.outer(model.b, k))).max()
     assume(abs(radius - 1.0) > 1e-3)
-    assert tolerates(model, k, 1.0) == (radius < 1.0)
+    assert tolerates(Feedback(model, k), 1.0) == (radius < 1.0)
 
 
 @pytest.mark.parametrize('law', ['moving_horizon', 'fixed'])

@@ -44,7 +44,7 @@ def test_first_swap_waits_until_the_gap_was_crossed_with_the_first_estimate(seed
         'truth.scale_frequency': 0.8,
     }))
     models: list[object] = []
-    v = loop.run(800, lambda _: models.append(loop.controller.adopted)).column('v')
+    v = loop.run(800, lambda _: models.append(loop.controller.redesign.adopted)).column('v')
     moves = np.abs(np.diff(v, prepend=0.0))
     swaps = [k for k in range(1, 800) if models[k] is not models[k - 1]]
     assert swaps

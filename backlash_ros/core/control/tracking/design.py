@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +16,21 @@ from backlash_ros.core.plant.state_model import StateModel, powers
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
+Gain = list[float]
 
 # Times the input weight of the feedback while v meets its limits or the estimate is new; the last
 # one while the backlash is unknown.
 SCHEDULE = (1e1, 1e2, 1e3, 1e4)
-# Times the input weight with which feedback around a better G is tried in turn until its loop is
+# Times the input weight with which feedback around a better G is tried in turn, until its loop is
 # as safe as the one it replaces. The trajectory keeps the weight that was asked for.
-SAFER = (1.0, 1.1, 1.4, 2.0, 4.0, 10.0, 30.0, 100.0)
-HALVINGS = 6  # of the ratio between the last weight that was not safe and the first one that is
-# Slope, in first guesses, that this last one has to bear to be used at all. Plants that bear less
-# are led astray by any feedback that would help, and learn faster than they go astray without.
+SAFER = (1.0, *np.geomspace(1.1, 100.0, 60).tolist())
+# Slope, in first guesses, that feedback has to bear to be used while the backlash is unknown.
+# Plants that bear less are led astray by any feedback that would help, and learn faster than they
+# go astray without.
 WRONG_SLOPE = 1.35
 REST_BANDWIDTH = 1.0 / 80.0  # rad per sample, up to which y is corrected while the reference rests
-REST_HORIZON = 300  # samples within which a wrong u at rest must matter to be worth a step
+HORIZON = 300  # samples within which a wrong u must matter, and u* answers to a reference
 LOOK_AHEAD = 20  # samples, at most, for which u* is known ahead
-RESPONSE = 300  # samples within which u* answers to a reference
 SAFE_MARGIN = 0.5  # modulus margin that is safe in any case: no sensitivity above 2
 
 
@@ -51,11 +50,11 @@ class Weights:
 class TrackingDesign:
     """Gains of one model of G.
 
-    gains: of the ideal trajectory. feedback: of the deviations from it. schedule: gains (n,), each
-    with less feedback than the one before, for the time while v meets its limits, where full
-    feedback would cycle between them, and while the estimate is new.
+    gains: of the ideal trajectory. feedback: of the deviations from it. schedule: gains (n,), that
+    of full feedback first, each with less than the one before, for the time while v meets its
+    limits, where full feedback would cycle between them, and while the estimate is new.
     acquisition: gain (n,) while the backlash is unknown; None where no feedback is better.
-    gentle: gain (n,) that leads y back while the reference rests. push: |x| after REST_HORIZON
+    gentle: gain (n,) that leads y back while the reference rests. push: |x| after HORIZON
     samples of u = 1; push_ahead: |y| after LOOK_AHEAD. plan_states (L, n + 1), plan_references
     (L, N + 1): u* of the next L samples of [x*; q*] and the references. noise_gains: see
     ReferenceWindow.
@@ -64,9 +63,9 @@ class TrackingDesign:
     model: StateModel
     gains: PreviewGains
     feedback: Feedback
-    schedule: tuple[Array, ...]
-    acquisition: Array | None
-    gentle: Array
+    schedule: tuple[Gain, ...]
+    acquisition: Gain | None
+    gentle: Gain
     push: float
     push_ahead: float
     plan_states: Array
@@ -79,8 +78,8 @@ class TrackingDesign:
         With z = [x*; q*] and u_p = -sum f_j r(k+j) it is z(k+1) = F z(k) + [B; 0] u_p + [0; 1] r.
         history: for how many samples at most.
         """
-        n, closed, inputs = self.model.order, _closed(self.model, self.gains), np.zeros(
-            (self.model.order + 1, 2))
+        n, closed = self.model.order, _closed(self.model, self.gains)
+        inputs = np.zeros((n + 1, 2))
         inputs[:n, 0], inputs[n, 1] = self.model.b, 1.0
         by_preview = -np.convolve(references, self.gains.preview[::-1], 'valid')
         steps = len(by_preview) - 1  # the newest one makes the next state
@@ -99,16 +98,17 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
     """
     rho = input_weight(model, weights)
     gains = lq_gains(model, rho, weights.integral_weight, weights.preview)
-    schedule = tuple(
-        lq_gains(model, max(more, weight_factor) * rho).state for more in SCHEDULE
-    )
+    feedback = feedback_around(model, weights, weight_factor)
+    schedule = [feedback.gain.tolist(), *(
+        lq_gains(model, max(more, weight_factor) * rho).state.tolist() for more in SCHEDULE
+    )]
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
     gentle = lq_gains(model, power_gain(model.transfer_function, REST_BANDWIDTH)).state
+    ahead, later = (powers(model.a, model.b, k).sum(axis=0) for k in (LOOK_AHEAD, HORIZON))
     return TrackingDesign(
-        model, gains, feedback_around(model, weights, weight_factor), schedule,
-        schedule[-1] if _bears_wrong_slope(model, SCHEDULE[-1] * rho) else None, gentle,
-        float(np.linalg.norm(_step(model, REST_HORIZON))),
-        model.c * abs(float(_step(model, LOOK_AHEAD)[0])),
+        model, gains, feedback, tuple(schedule),
+        schedule[-1] if _bears_wrong_slope(model, SCHEDULE[-1] * rho) else None, gentle.tolist(),
+        float(np.linalg.norm(later)), model.c * abs(float(ahead[0])),
         *_plan(model, gains), _noise_gains(model, gains),
     )
 
@@ -120,41 +120,58 @@ def better_design(
 
     It replaces the present one where its loop around the better G keeps a modulus margin that is
     usual (SAFE_MARGIN), or at least as large as that of the present loop around the G it was made
-    for or around the better one; the weight of its input is raised as far as this takes. A loop
-    that is unstable around the better G is replaced by any stable one; an unstable one replaces
-    none.
+    for or around the better one; the weight of its input is raised as far as this takes, and no
+    further: what is weaker than it has to be is the measure for the next G, and so lost for good.
+    A loop that is unstable around the better G is replaced by any stable one; an unstable one
+    replaces none.
     """
-    def margin(weight_factor: float) -> float:
-        return modulus_margin(model, feedback_around(model, weights, weight_factor))
-
-    needed, unsafe = SAFE_MARGIN, 0.0
+    needed = SAFE_MARGIN
     try:
         for weight_factor in SAFER:
-            reached = margin(weight_factor)
-            if reached < needed and unsafe == 0.0:
+            reached = modulus_margin(model, feedback_around(model, weights, weight_factor))
+            if reached < needed and weight_factor == SAFER[0]:
                 needed = min(needed, *(
                     modulus_margin(plant, present.feedback) for plant in (present.model, model)
                 ))
             if 0.0 < reached >= needed:
-                break
-            unsafe = weight_factor
-        else:
-            return None
-        # What is weaker than it has to be is the measure for the next G, and so lost for good.
-        for _ in range(HALVINGS if unsafe > 0.0 else 0):
-            between = sqrt(unsafe * weight_factor)
-            if 0.0 < margin(between) >= needed:
-                weight_factor = between
-            else:
-                unsafe = between
-        return design(model, weights, weight_factor)
+                return design(model, weights, weight_factor)
     except ParameterError:
-        return None
+        pass
+    return None
 
 
-def _step(model: StateModel, samples: int) -> Array:
-    """x after so many samples of u = 1, shape (n,)."""
-    return np.asarray(powers(model.a, model.b, samples).sum(axis=0))
+def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> Feedback:
+    """Of deviations from the trajectory, as if the input weighed `weight_factor` times as much.
+
+    Raises ParameterError where no gains exist.
+    """
+    rho = weight_factor * input_weight(model, weights)
+    gains = lq_gains(model, rho, weights.integral_weight)
+    return Feedback(model, gains.state, gains.integral)
+
+
+def input_weight(model: StateModel, weights: Weights) -> float:
+    """rho of the trajectory."""
+    return weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
+
+
+def power_gain(model: TransferFunction, frequency: float) -> float:
+    """|G|^2 at so many rad per sample."""
+    return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
+
+
+# What follows is cached: a controller restarts in the middle of a loop.
+@lru_cache(maxsize=64)
+def lq_gains(
+    model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,
+) -> PreviewGains:
+    """The gains of `preview_gains`."""
+    return preview_gains(model, input_weight, integral_weight, window)
+
+
+@lru_cache(maxsize=16)
+def _bears_wrong_slope(model: StateModel, input_weight: float) -> bool:
+    return tolerates(Feedback(model, lq_gains(model, input_weight).state), WRONG_SLOPE)
 
 
 def _closed(model: StateModel, gains: PreviewGains) -> Array:
@@ -192,43 +209,8 @@ def _plan(model: StateModel, gains: PreviewGains) -> tuple[Array, Array]:
 def _noise_gains(model: StateModel, gains: PreviewGains) -> Array:
     """Standard deviation of u* for noise of 1 on the references, for each of their averages."""
     closed = model.a - np.outer(model.b, gains.state)
-    response = np.append(1.0, -powers(closed, model.b, RESPONSE) @ gains.state)
+    response = np.append(1.0, -powers(closed, model.b, HORIZON) @ gains.state)
     to_u = np.convolve(gains.preview[::-1], response)
     return np.array([
-        np.linalg.norm(np.convolve(kernel, to_u))
-        for kernel in averages(len(gains.preview) - 1)
+        np.linalg.norm(np.convolve(kernel, to_u)) for kernel in averages(len(gains.preview) - 1)
     ])
-
-
-def feedback_around(model: StateModel, weights: Weights, weight_factor: float) -> Feedback:
-    """Of deviations from the trajectory, as if the input weighed `weight_factor` times as much.
-
-    Raises ParameterError where no gains exist.
-    """
-    rho = weight_factor * input_weight(model, weights)
-    gains = lq_gains(model, rho, weights.integral_weight)
-    return Feedback(model, gains.state, gains.integral)
-
-
-def input_weight(model: StateModel, weights: Weights) -> float:
-    """rho of the trajectory."""
-    return weights.input_weight * power_gain(model.transfer_function, np.pi / 10.0)
-
-
-def power_gain(model: TransferFunction, frequency: float) -> float:
-    """|G|^2 at so many rad per sample."""
-    return float(abs(model.response(np.array([np.exp(1j * frequency)]))[0])) ** 2
-
-
-# What follows is cached: a controller restarts in the middle of a loop.
-@lru_cache(maxsize=64)
-def lq_gains(
-    model: StateModel, input_weight: float, integral_weight: float = 0.0, window: int = 0,
-) -> PreviewGains:
-    """The gains of `preview_gains`."""
-    return preview_gains(model, input_weight, integral_weight, window)
-
-
-@lru_cache(maxsize=16)
-def _bears_wrong_slope(model: StateModel, input_weight: float) -> bool:
-    return tolerates(model, lq_gains(model, input_weight).state, WRONG_SLOPE)

@@ -1,27 +1,58 @@
-"""Feedback that holds x on the ideal trajectory: K (x_hat - x*) + K_q (q - q*), within bounds."""
+"""Feedback that holds x on the ideal trajectory: K (x_hat - x*) + K_q (q - q*), within bounds.
+
+It is as hard as the estimate of the backlash is trusted. The first estimate may be confidently
+wrong, which the samples after it contradict; so feedback hardens step by step as it holds, and
+softens while v does not follow.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import sqrt
+from math import hypot, isnan, nan, sqrt
 from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, dot
-from backlash_ros.core.control.tracking.design import TrackingDesign
+from backlash_ros.core.control.tracking.design import Gain, TrackingDesign
 from backlash_ros.core.control.tracking.rest import TOLERANCE
-from backlash_ros.core.control.tracking.trust import Trust
-from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.plant.noise_level import NoiseLevel
 
-Array = NDArray[np.float64]
-
+TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
+# An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
+SHARP, SHARP_COUNTS = 0.01, 17
 STIFFEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
-LEAST_NOISE = 0.5  # of x_hat, in units of the noise on y, that may always be in it
 WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is unknown
+
+
+@dataclass
+class Trust:
+    """What was made of the estimates so far.
+
+    known: whether the newest comes from data of this loop. slope: that is inverted. crossings: that
+    are inverted, shrunk by their uncertainty. held_for: samples for which estimates have held,
+    sharp ones counted more. in_use_for: samples since there is one. sharp_counts: see above.
+    """
+
+    known: bool = False
+    slope: float = nan
+    crossings: tuple[float, float] = (0.0, 0.0)
+    held_for: int = 0
+    in_use_for: int = 0
+    sharp_counts: int = SHARP_COUNTS
+
+    @property
+    def begun(self) -> bool:
+        """Whether an estimate is relied on at all."""
+        return self.held_for > 0
+
+    @property
+    def full(self) -> bool:
+        """Whether it has held for long enough."""
+        return self.held_for >= TRUSTED_AFTER
 
 
 @dataclass
@@ -47,137 +78,171 @@ class StateFeedback:
     """Gains of a design, used as far as the estimate is trusted.
 
     While nothing is known the acquisition gain replaces K, and the trajectory itself excites the
-    backlash. From the first estimate on the gains are those of the schedule, up to K. noise_std:
-    of y.
+    backlash. shrinkage: standard deviations by which crossings are shrunk. noise_std: of y.
     """
 
-    def __init__(self, design: TrackingDesign, trust: Trust, noise_std: float) -> None:
-        self.state = FeedbackState()
-        self._trust, self._noise_std = trust, noise_std
+    def __init__(self, design: TrackingDesign, shrinkage: float, noise_std: float) -> None:
+        self.trust, self.state = Trust(), FeedbackState()
+        self._shrinkage, self._noise_std = shrinkage, noise_std
+        self._newest: Estimate | None = None
         self._scale = 0.0  # largest |u*| so far, or the u that the gap takes
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
         """Use these gains."""
-        gain = design.feedback.gain
-        self._integral_gain = design.feedback.integral
-        self._schedule: list[list[float]] = [g.tolist() for g in (gain, *design.schedule)]
-        # What an error of y calls for that would not matter at rest: never too much feedback.
-        by_noise = self._noise_std * float(np.linalg.norm(gain))
-        self._tolerated, self._least_noise = TOLERANCE * by_noise, LEAST_NOISE * by_noise
-        self._acquisition = None if design.acquisition is None else design.acquisition.tolist()
-        self._level = NoiseLevel()
-        self._x_cov: Array | None = None
+        self._design = design
+        self._level = NoiseLevel()  # of feedback itself
+        self._x_cov: NDArray[np.float64] | None = None
         self.x_std = self._u_std = 0.0  # deviations of x_hat and of K x_hat
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
-        """Go on where another one is."""
-        self.state = replace(other.state)
-        if not state_known:
-            self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
-                                 blind_for=len(self._schedule[0]))
+        """Go on where another one is; from the softest, where x_hat begins anew and full of noise.
 
-    def deviation(self, x_hat: Sequence[float], x: Sequence[float]) -> list[float]:
-        """x_hat - x*; 0 while x_hat cannot be known."""
+        state_known: whether it does not.
+        """
+        self.trust, self.state = replace(other.trust), replace(other.state)
+        if not state_known:
+            self.trust = Trust(sharp_counts=1)
+            self.state = replace(self.state, width=1.0, asked=0.0, bounded=False,
+                                 blind_for=self._design.model.order)
+
+    def take_estimate(self, estimate: Estimate) -> bool:
+        """Take in the estimate of this sample; returns whether it is another one."""
+        if estimate is self._newest:
+            return False
+        self._newest, trust, status = estimate, self.trust, estimate.status
+        # What was learned before a restart says nothing yet about the state of G. A law without
+        # deviations says by its status alone that it has learned, and holds that later.
+        trust.known = status not in (Status.ACQUIRING, Status.INCONSISTENT) and (
+            trust.known or estimate.learned or status is Status.TRACKING)
+        trust.crossings = shrunk_crossings(estimate, self._shrinkage, trust.known)
+        # On the way to its first agreement with the data the m of a law without deviations may be
+        # anywhere within its bounds.
+        if isnan(trust.slope) or estimate.learned or status is Status.TRACKING:
+            trust.slope = estimate.m
+        return True
+
+    def begin(self, ideal: float, estimate: Estimate, first: bool) -> None:
+        """Note u* of this sample, the scale of what is allowed, and count it for the estimate.
+
+        first: of this loop; an estimate was known before then.
+        """
+        trust, gap = self.trust, estimate.c_r - estimate.c_l
+        self.state.asked = max(self.state.asked, abs(ideal))
+        self._scale = max(self.state.asked, estimate.m * gap)
+        if not (trust.known and estimate.learned):
+            # Without deviations nobody knows how far it may be relied on.
+            trust.held_for = trust.in_use_for = 0
+            return
+        trust.in_use_for += 1
+        if first:
+            trust.held_for = TRUSTED_AFTER
+        elif not trust.full:
+            # Beside far larger u even a gap that is hardly known makes little difference.
+            large = max(gap, self.state.width * self._scale / estimate.m)
+            sharp = (estimate.std_m < SHARP * estimate.m
+                     and estimate.std_c_r + estimate.std_c_l < SHARP * large)
+            trust.held_for += trust.sharp_counts if sharp else 1
+
+    def deviation(
+        self, x_hat: Sequence[float], x_cov: NDArray[np.float64] | None, x: Sequence[float],
+    ) -> list[float]:
+        """x_hat - x*; 0 while x_hat cannot be known. x_cov: of x_hat, None where it is unknown."""
+        if x_cov is not self._x_cov:
+            self._x_cov, gain = x_cov, self._design.schedule[0]
+            rows: list[list[float]] = [] if x_cov is None else x_cov.tolist()
+            self._u_std = sqrt(max(dot(gain, [dot(row, gain) for row in rows]), 0.0))
+            self.x_std = sqrt(max(sum(row[i] for i, row in enumerate(rows)), 0.0))
         if self.state.blind_for:
             self.state.blind_for -= 1
             return [0.0] * len(x)
         return list(map(sub, x_hat, x))
-
-    def take_covariance(self, x_cov: Array | None) -> None:
-        """Take in the covariance of x_hat; looked into when it is another array than before."""
-        if x_cov is self._x_cov:
-            return
-        self._x_cov = x_cov
-        if x_cov is None:
-            self.x_std = self._u_std = 0.0
-            return
-        rows: list[list[float]] = x_cov.tolist()
-        gain = self._schedule[0]
-        self._u_std = sqrt(max(dot(gain, [dot(row, gain) for row in rows]), 0.0))
-        self.x_std = sqrt(max(sum(row[i] for i, row in enumerate(rows)), 0.0))
-
-    @property
-    def noise(self) -> float:
-        """Standard deviation of what full feedback makes of noise.
-
-        As the covariance of x_hat says; as feedback itself shows, where the noise of y is told
-        wrongly; and at least for errors of y beside its noise.
-        """
-        return max(self._u_std, self._level.std, self._least_noise)
-
-    def ask(self, ideal: float, estimate: Estimate) -> None:
-        """Note what the trajectory asks for at this sample: the scale of what is allowed."""
-        self.state.asked = max(self.state.asked, abs(ideal))
-        self._scale = max(self.state.asked, estimate.m * (estimate.c_r - estimate.c_l))
 
     def u(self, deviation: Sequence[float], held_back: bool) -> float:
         """What is taken from u*.
 
         held_back: whether v met its limits, or is on its way across the gap.
         """
-        state, trust = self.state, self._trust
-        if trust.begun:
+        state, most = self.state, self.most
+        if self.trust.begun:
             feedback = dot(self._gain(held_back or state.bounded), deviation)
             self._level.take(feedback)
         else:
-            feedback = self._in_acquisition(deviation)
-            if abs(feedback) == self.acquisition_bound:
+            feedback = dot(self._design.acquisition or (), deviation)
+            if not -most < feedback < most:
                 # A gap wider than the first guess has to be crossed some day.
                 state.width = min(WIDENING * state.width, LARGEST_IN_ACQUISITION)
-        if trust.full:
-            feedback += self._integral_gain * state.integral
-        state.bounded = not -self.most <= feedback <= self.most
-        if state.bounded:
-            feedback = min(max(feedback, -self.most), self.most) if feedback == feedback else 0.0
-        return feedback
-
-    def peek(self, deviation: Sequence[float]) -> float:
-        """The same, which changes nothing."""
-        before = self.state
-        self.state = replace(before)
-        feedback = self.u(deviation, held_back=False)
-        self.state = before
+        if self.trust.full:
+            feedback += self._design.feedback.integral * state.integral
+        within = -most <= feedback <= most
+        state.bounded = self.trust.begun and not within
+        if not within:
+            feedback = min(max(feedback, -most), most) if feedback == feedback else 0.0
         return feedback
 
     def integrate(self, difference: float, limited: bool) -> None:
         """Take in y* - y; a saturated actuator cannot follow: going on would only wind up."""
-        if not self._trust.full:
+        if not self.trust.full:
             self.state.integral = 0.0
         elif not (limited or self.state.bounded):
             self.state.integral += difference
 
     @property
+    def noise(self) -> float:
+        """Standard deviation of what full feedback makes of noise.
+
+        As the covariance of x_hat says; as feedback itself shows, where the noise of y is told
+        wrongly; and at least for errors of y of half its noise.
+        """
+        return max(self._u_std, self._level.std, 0.5 * self._noise_std * self._size)
+
+    @property
     def most(self) -> float:
-        """Largest feedback once an estimate is known."""
-        return LARGEST_FEEDBACK * max(self._scale, self._tolerated)
+        """Largest feedback.
+
+        While the backlash is unknown a wrong slope may make the loop unstable, which bounded
+        feedback slows down. Once it is known no error of y that would not matter at rest calls for
+        too much.
+        """
+        if not self.trust.begun:
+            return self.state.width * self._scale
+        return LARGEST_FEEDBACK * max(self._scale, TOLERANCE * self._noise_std * self._size)
 
     @property
     def reach(self) -> float:
         """Largest |u_d - u*|, whatever makes u_d."""
-        return self.most if self._trust.begun else LARGEST_IN_ACQUISITION * self._scale
+        return self.most if self.trust.begun else LARGEST_IN_ACQUISITION * self._scale
 
     @property
-    def acquisition_bound(self) -> float:
-        """Largest feedback while the backlash is unknown.
+    def _size(self) -> float:
+        """|K|: what full feedback makes of an error of y."""
+        return hypot(*self._design.schedule[0])
 
-        A wrong slope may make the loop unstable, which bounded feedback slows down.
-        """
-        return self.state.width * self._scale
-
-    def _in_acquisition(self, deviation: Sequence[float]) -> float:
-        if self._acquisition is None:
-            return 0.0
-        bound = self.acquisition_bound
-        return min(max(dot(self._acquisition, deviation), -bound), bound)
-
-    def _gain(self, held_back: bool) -> list[float]:
+    def _gain(self, held_back: bool) -> Gain:
         """K, or the less of it the longer v does not follow, and the newer the estimate."""
-        state, levels = self.state, len(self._schedule)
+        state, schedule = self.state, self._design.schedule
         state.free = 0 if held_back else state.free + 1
         if held_back:
-            state.level = min(state.level + 1, levels - 1)
+            state.level = min(state.level + 1, len(schedule) - 1)
         elif state.level > 0 and state.free % STIFFEN_AFTER == 0:
             state.level -= 1
-        unproven = levels - 1 - self._trust.share(levels)
-        return self._schedule[max(state.level, unproven)]
+        unproven = len(schedule) - 1 - self.trust.held_for * len(schedule) // TRUSTED_AFTER
+        return schedule[max(state.level, unproven)]
+
+
+def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:
+    """Crossings shrunk towards each other by their uncertainty; both 0 while nothing is known.
+
+    Over-compensation drives past the gap and starts a limit cycle, under-compensation only
+    leaves a rest of the backlash: in a loop around y the smaller gap is the safe one. Where a law
+    knows no uncertainty there is nothing to shrink by once the crossings are known.
+    """
+    if deviations == 0.0:
+        return estimate.c_r, estimate.c_l
+    if isnan(estimate.std_c_r):
+        return (estimate.c_r, estimate.c_l) if known else (0.0, 0.0)
+    middle = 0.5 * (estimate.c_r + estimate.c_l)
+    return (
+        max(estimate.c_r - deviations * estimate.std_c_r, middle),
+        min(estimate.c_l + deviations * estimate.std_c_l, middle),
+    )

@@ -26,8 +26,6 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-ROUNDING = 1e-9  # of G at z = 1, relative to the coefficients: less is a pole or zero there
-
 
 @dataclass(frozen=True)
 class PreviewGains:
@@ -48,37 +46,33 @@ def preview_gains(
     n = model.order
     integrates = integral_weight > 0.0
     size = n + 1 if integrates else n
-    a, b, c, e = (
-        np.zeros((size, size)), np.zeros((size, 1)), np.zeros(size), np.zeros(size),
-    )
+    a, b, c, e = np.zeros((size, size)), np.zeros(size), np.zeros(size), np.zeros(size)
     # u in units of 1/sqrt(rho): the Riccati equation is then solved with weights of one size.
     unit = input_weight**-0.5
-    a[:n, :n], b[:n, 0], c[0] = model.a, model.b * unit, model.c
-    q: Array = np.outer(c, c).astype(np.float64)
+    a[:n, :n], b[:n], c[0] = model.a, model.b * unit, model.c
+    q: Array = np.asarray(np.outer(c, c), np.float64)
     if integrates:
         a[n, 0], a[n, n], e[n] = -model.c, 1.0, 1.0
         q[n, n] = integral_weight
     try:
-        p = riccati(a, b[:, 0], q)
+        p = riccati(a, b, q)
     except np.linalg.LinAlgError:
         raise ParameterError(
             'plant.numerator', 'G(z)', 'cannot be stabilised by feedback of its state',
             'a pole on or outside the unit circle is cancelled, or tracking.integral_weight > 0 '
             'meets a zero at z = 1',
         ) from None
-    share = b[:, 0] / (1.0 + float(b[:, 0] @ p @ b[:, 0]))  # (R + B'PB)^-1 B'
+    share = b / (1.0 + float(b @ p @ b))  # (R + B'PB)^-1 B'
     gain = share @ p @ a
-    closed = a - b @ gain[None, :]
+    closed = a - np.outer(b, gain)
     preview = _preview(share, closed, p @ e, c, window) * unit
     # u = u_r + u': what is weighed is u', and u_r drives G besides.
-    by_u_r = _preview(share, closed, p @ b[:, 0], np.zeros(size), window)
+    by_u_r = _preview(share, closed, p @ b, np.zeros(size), window)
     by_u_r[0] -= 1.0
     of_each = np.convolve(by_u_r, _holding(model.transfer_function, window))
     preview += of_each[:window + 1]
     preview[window] += of_each[window + 1:].sum()
-    return PreviewGains(
-        gain[:n] * unit, float(gain[n] * unit) if integrates else 0.0, preview
-    )
+    return PreviewGains(gain[:n] * unit, float(gain[n] * unit) if integrates else 0.0, preview)
 
 
 def _preview(share: Array, closed: Array, first: Array, c: Array, window: int) -> Array:
@@ -102,7 +96,8 @@ def _holding(model: TransferFunction, window: int) -> Array:
     taps = np.zeros(window + 1)
     b, a = model.numerator, model.denominator
     b_1, a_1 = float(b.sum()), float(a.sum())
-    if abs(b_1) <= ROUNDING * np.abs(b).sum() or abs(a_1) <= ROUNDING * np.abs(a).sum():
+    # Less than rounding of the coefficients is a zero or a pole at z = 1.
+    if abs(b_1) <= 1e-9 * np.abs(b).sum() or abs(a_1) <= 1e-9 * np.abs(a).sum():
         return taps  # nothing holds y, or u = 0 does
     delay = float(np.polyval(np.polyder(a), 1.0) / a_1 - np.polyval(np.polyder(b), 1.0) / b_1)
     whole, part = divmod(min(max(delay, 0.0), float(window)), 1.0)

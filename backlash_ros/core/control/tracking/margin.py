@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +31,13 @@ class Feedback:
     integral: float = 0.0
 
 
-def tolerates(model: StateModel, gain: Array, factor: float) -> bool:
-    """Whether u = -gain x_hat keeps G stable although u acts `factor` times as strongly.
+def tolerates(feedback: Feedback, factor: float) -> bool:
+    """Whether feedback keeps its G stable although u acts `factor` times as strongly.
 
-    x_hat comes from an observer of [x; d] that does not know of the factor, d being a slow
-    disturbance of u (FixedBacklash). gain: shape (n,). The gap itself is left out: it limits what
-    u can do wrong, but not for ever.
+    The observer does not know of the factor. The gap itself is left out: it limits what u can do
+    wrong, but not for ever.
     """
-    feedback = Feedback(model, gain)
-    return all(_is_stable(model, feedback, trust, factor) for trust in CONFIDENCES)
+    return all(_is_stable(feedback.model, feedback, each, factor) for each in CONFIDENCES)
 
 
 def modulus_margin(plant: StateModel, feedback: Feedback) -> float:
@@ -48,12 +45,9 @@ def modulus_margin(plant: StateModel, feedback: Feedback) -> float:
 
     For the worst of the observers; 0 where the loop is unstable with one of them.
     """
-    margin = inf
-    for confidence in CONFIDENCES:
-        if not _is_stable(plant, feedback, confidence):
-            return 0.0
-        margin = min(margin, _distance(plant, feedback, confidence))
-    return margin
+    if not all(_is_stable(plant, feedback, each) for each in CONFIDENCES):
+        return 0.0
+    return min(_distance(plant, feedback, each) for each in CONFIDENCES)
 
 
 def _is_stable(
@@ -106,13 +100,12 @@ def _believed(model: StateModel) -> tuple[Array, Array, Array]:
 @lru_cache(maxsize=16)
 def _correction(model: StateModel, confidence: float) -> Array | None:
     """Gain of the observer of [x; d], shape (n + 1,); None where none exists."""
-    n = model.order
     a, _, c = _believed(model)
-    # In units in which one sample of d moves y like its noise does.
-    drift = np.zeros((n + 1, n + 1))
-    drift[n, n] = confidence / (float(np.linalg.norm(model.b)) * model.c) ** 2
-    # A trace of noise on x keeps the equation regular.
-    drift += 1e-12 * drift[n, n] * np.eye(n + 1)
+    # In units in which one sample of d moves y like its noise does; a trace of noise on x keeps
+    # the equation regular.
+    drift = 1e-12 * np.eye(len(c))
+    drift[-1, -1] += 1.0
+    drift *= confidence / (float(np.linalg.norm(model.b)) * model.c) ** 2
     try:
         p = riccati(a.T, c, drift)
     except np.linalg.LinAlgError:

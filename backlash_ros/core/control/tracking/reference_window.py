@@ -11,7 +11,6 @@ from backlash_ros.core.plant.noise_level import NoiseLevel
 
 Array = NDArray[np.float64]
 
-SMOOTHED_SHARE = 3  # of the preview window, by which references are averaged to either side
 WIDTHS = (3, 8, 20)  # samples to either side, of the averages to choose from
 # Mean square of what is left of the references beside a parabola, in those of the noise, up to
 # which they are taken for one, and from which on they are not: at a step, or a sharp turn.
@@ -22,11 +21,12 @@ PARABOLA, NO_PARABOLA = 1.8, 3.0
 def parabolas(preview: int) -> tuple[Array, ...]:
     """For each width w, what a parabola takes from 2 w + 1 references: (2 w + 1, 2 w + 1).
 
-    The fit is weighted by a Hann window. The middle row says what an average changes.
+    No width is more than a third of the preview. The fit is weighted by a Hann window. The middle
+    row says what an average changes.
     """
     found = []
     for w in WIDTHS:
-        if SMOOTHED_SHARE * w <= preview:
+        if 3 * w <= preview:
             powers = np.arange(-w, w + 1.0)[:, None] ** np.arange(3)
             weighted = powers * np.hanning(2 * w + 3)[1:-1, None]
             fit = powers @ np.linalg.solve(weighted.T @ powers, weighted.T)
@@ -58,11 +58,8 @@ class ReferenceWindow:
     """
 
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
-        self.history = history
-        self.noise_gains = noise_gains
+        self.history, self.noise_gains = history, noise_gains
         self._preview, self._kept = preview, history + preview + 1
-        self._parabolas = parabolas(preview)
-        self._half = len(self._parabolas[-1]) // 2 if self._parabolas else 0
         # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
         # left to the right; when they are full their end moves to the front.
         self._rows: Array = np.zeros((3, 2 * self._kept))
@@ -73,6 +70,15 @@ class ReferenceWindow:
     def empty(self) -> bool:
         """Whether no reference has come yet."""
         return self._end == 0
+
+    @property
+    def window(self) -> Array:
+        """r(k) .. r(k + N), shape (N + 1,)."""
+        return self._rows[1, self._end - self._preview - 1:self._end]
+
+    def all(self) -> Array:
+        """Everything that is kept, the newest last, shape (up to history + N + 1,)."""
+        return self._rows[1, max(self._start, self._end - self._kept):self._end]
 
     def fill(self, value: float) -> None:
         """Let the window begin with this value everywhere."""
@@ -101,43 +107,30 @@ class ReferenceWindow:
         self._rows[2, end] = self.noise_gains[0]
         self._end = end + 1
         self._noise.take(value)
-        if self._half and self._end - self._start > 2 * self._half:
-            self._average(self._end - 1 - self._half)
+        fits = parabolas(self._preview)
+        if fits and self._noise.std > 0.0 and end - self._start >= len(fits[-1]) - 1:
+            self._average(end - len(fits[-1]) // 2, fits)
         return self.window
-
-    @property
-    def window(self) -> Array:
-        """r(k) .. r(k + N) once more, shape (N + 1,)."""
-        return self._rows[1, self._end - self._preview - 1:self._end]
-
-    def all(self) -> Array:
-        """Everything that is kept, the newest last, shape (up to history + N + 1,)."""
-        return self._rows[1, max(self._start, self._end - self._kept):self._end]
 
     @property
     def u_noise_std(self) -> float:
         """Standard deviation of what is left of the noise in u*, at most within the window."""
-        noise = self._noise.std
-        if noise == 0.0:
-            return 0.0
-        first = self._end - self._preview - 1
-        return noise * float(self._rows[2, first:max(self._end - self._half, first + 1)].max())
+        fits, first = parabolas(self._preview), self._end - self._preview - 1
+        half = len(fits[-1]) // 2 if fits else 0
+        return self._noise.std * float(
+            self._rows[2, first:max(self._end - half, first + 1)].max())
 
-    def _average(self, at: int) -> None:
+    def _average(self, at: int, fits: tuple[Array, ...]) -> None:
         """Average one reference, now that as many after it are known."""
-        noise = self._noise.std
-        if noise == 0.0:
-            return
-        came = self._rows[0]
+        came, noise = self._rows[0], self._noise.std
         value, gain = came.item(at), float(self.noise_gains[0])
-        for i, fit in enumerate(self._parabolas):
+        for fit, averaged_gain in zip(fits, self.noise_gains[1:], strict=True):
             w = len(fit) // 2
             rest = fit @ came[at - w:at + w + 1]
             of_noise = rest / noise  # its square may be too small for a number
             mean_square = float(of_noise @ of_noise) / (2 * w - 2)
-            share = (NO_PARABOLA - mean_square) / (NO_PARABOLA - PARABOLA)
+            share = min((NO_PARABOLA - mean_square) / (NO_PARABOLA - PARABOLA), 1.0)
             if share > 0.0:
-                share = min(share, 1.0)
                 value += share * (came.item(at) - rest.item(w) - value)
-                gain += share * (float(self.noise_gains[i + 1]) - gain)
+                gain += share * (float(averaged_gain) - gain)
         self._rows[1, at], self._rows[2, at] = value, gain

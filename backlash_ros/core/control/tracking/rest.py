@@ -7,14 +7,17 @@ is within a tolerance of the trajectory, and otherwise moves in single steps:
   is left of u shows in y. Once it is known it is taken away by going on in the same direction,
   which crosses no gap;
 - where y has left the tolerance, to a u that brings it back, and then to rest again.
+
+Full feedback is for a y that is far away: it brings back all that is off, in as many moves as G has
+states, and one more. What is less it would leave to itself, as noise, until it is far away.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum, auto
-from math import dist, hypot, inf
+from math import dist, hypot
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +25,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.protocol import dot
 from backlash_ros.core.control.tracking.design import TrackingDesign
+from backlash_ros.core.control.tracking.trajectory import TrajectoryState
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
 
@@ -37,11 +41,9 @@ CLOSE, SETTLING = 7.0, 200
 UNCERTAIN = 5.0  # the same in standard deviations of x, where that is more
 SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
 ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
-TURNS = 2  # while the trajectory rests, after which feedback goes on in single steps
-ARRIVED = 0.5  # share of the tolerance within which v comes to rest after a motion
+ARRIVED = 0.5  # share of the tolerance within which v comes to rest after that
 STEADY = 0.004  # share of the tolerance by which x* may still move per sample
 OFF = 6.0  # standard deviations of y that mean a deviation while the state is unknown
-
 LED_BACK = 0.25  # share of what brings y back below which it is no longer needed
 TOO_WEAK = 0.5  # share of it with which y would not come back
 SHORT = 2.0  # standard deviations of the crossing by which v stops short of the u at rest
@@ -52,9 +54,15 @@ MATTERS = 0.25  # share of the tolerance that it must move x by
 class Mode(Enum):
     """What v does."""
 
-    FOLLOW = auto()  # the trajectory moves, or y is far from it
+    FOLLOW = auto()  # the trajectory moves
+    RETURN = auto()  # y is far away: full feedback brings it back
     HOLD = auto()  # u is to be that at rest
     LEAD_BACK = auto()  # u is to bring y back
+
+    @property
+    def steps(self) -> bool:
+        """Whether v moves in single steps only."""
+        return self in (Mode.HOLD, Mode.LEAD_BACK)
 
 
 @dataclass
@@ -63,8 +71,8 @@ class RestState:
 
     u_d: where v rests. shrinkage: standard deviations by which the crossings are shrunk for it.
     largest: |x*| so far. limit: tolerance in use. rested: samples for which the trajectory has.
-    turns, side: of v since then, and the newest line. near: samples since y was last away. pull:
-    u - u* with which leading back began.
+    turns, side: of v since then under full feedback, and the newest line. near: samples since y was
+    last away. pull: u - u* with which leading back began.
     """
 
     mode: Mode = Mode.HOLD
@@ -80,88 +88,78 @@ class RestState:
 
 
 class Rest:
-    """Decides whether v rests, and steps it there.
-
-    noise_std: of y.
-    """
+    """Decides whether v rests, and steps it there. noise_std: of y."""
 
     def __init__(self, design: TrackingDesign, noise_std: float) -> None:
         self.state = RestState()
         self._noise_std = noise_std
-        self._most = inf  # largest u - u*
         self.use(design)
 
     def use(self, design: TrackingDesign) -> None:
         """Rest as this design says."""
-        self._gain: list[float] = design.gentle.tolist()
-        self._push = design.push
-
-    def go_on_from(self, other: Rest) -> None:
-        """Take over where another one of the same model rests."""
-        self.state = replace(other.state)
+        self._design = design
 
     def decide(
-        self, y: float, window: Array, x: Sequence[float], onward: Sequence[float],
-        deviation: Sequence[float], x_std: float | None, side: Region, most: float,
+        self, y: float, window: Array, plan: TrajectoryState, deviation: Sequence[float],
+        x_std: float | None, side: Region, pull: float, acts: bool,
     ) -> Mode:
         """Set the mode for this sample.
 
-        window: r from now on. x, onward: x* now and at the next sample. deviation: x_hat - x*.
-        x_std: standard deviation of x_hat, None where it is unknown. side: line in use. most: u may
-        be no further than that from u*, whatever x_hat says.
+        window: r from now on. deviation: x_hat - x*. x_std: standard deviation of x_hat, None where
+        it is unknown. side: line in use. pull: see `pull_back`. acts: whether full feedback asks
+        for more than its noise.
         """
-        state, self._most = self.state, most
-        state.largest = max(state.largest, hypot(*x))
+        state, noise_std = self.state, self._noise_std
+        state.largest = max(state.largest, hypot(*plan.x))
         least = SHARE * state.largest
-        tolerance = max(TOLERANCE * self._noise_std, least)
-        if dist(x, onward) > STEADY * tolerance or float(np.ptp(window)) > self._noise_std:
+        steady = STEADY * max(TOLERANCE * noise_std, least)
+        if dist(plan.x, plan.onward) > steady or float(np.ptp(window)) > noise_std:
             state.mode, state.rested, state.turns = Mode.FOLLOW, 0, 0
         elif x_std is None:
-            off = abs(y - window.item(0)) > OFF * self._noise_std
-            state.mode = Mode.FOLLOW if off else Mode.HOLD
+            off = abs(y - window.item(0)) > OFF * noise_std
+            state.mode = Mode.RETURN if off else Mode.HOLD
         else:
             state.rested += 1
-            if state.rested < SETTLING:
-                tolerance = max(CLOSE * self._noise_std, least)
-            state.limit = max(tolerance, UNCERTAIN * x_std)
-            if state.mode is Mode.FOLLOW and side is not state.side:
+            width = CLOSE if state.rested < SETTLING else TOLERANCE
+            state.limit = max(width * noise_std, least, UNCERTAIN * x_std)
+            if state.mode is Mode.RETURN and side is not state.side:
                 state.turns += 1
-            state.mode = self._mode_for(deviation)
+            state.mode = self._mode_at_rest(hypot(*deviation), pull, acts)
         state.side = side
         return state.mode
 
-    def _mode_for(self, deviation: Sequence[float]) -> Mode:
-        state, size = self.state, hypot(*deviation)
+    def _mode_at_rest(self, size: float, pull: float, acts: bool) -> Mode:
+        """size: |x_hat - x*|. pull: what would bring y back gently."""
+        state = self.state
         # Crossing the gap takes time. Full feedback that turns again and again overshoots by that;
         # it is due again when y has stayed where it belongs for a while, and is pushed away.
         state.near = state.near + 1 if size <= state.limit else 0
         if state.near >= SETTLING:
             state.turns = 0
-        follows = state.turns < TURNS
-        if size > ASTRAY * state.limit and follows:
-            return Mode.FOLLOW
-        if state.mode is Mode.FOLLOW and follows:
-            return Mode.HOLD if size <= ARRIVED * state.limit else Mode.FOLLOW
-        pull = self._pull_back(deviation)
+        if state.turns <= self._design.model.order:
+            goes_on = not state.mode.steps and acts and size > ARRIVED * state.limit
+            if goes_on or size > ASTRAY * state.limit:
+                return Mode.RETURN
         if state.mode is Mode.LEAD_BACK:
             # As long as it pulls the same way, and hard, or y is not yet near.
             least = LED_BACK if size <= ARRIVED * state.limit else 0.0
-            if pull * state.pull > least * state.pull**2:
-                return Mode.LEAD_BACK
-            return Mode.HOLD
+            return Mode.LEAD_BACK if pull * state.pull > least * state.pull**2 else Mode.HOLD
         if size <= state.limit:
             return Mode.HOLD
         state.pull = pull
         return Mode.LEAD_BACK
 
+    def pull_back(self, deviation: Sequence[float], most: float) -> float:
+        """u - u* that brings y back gently; most: the largest there may be."""
+        pull = -dot(self._design.gentle, deviation)
+        return min(max(pull, -most), most) if pull == pull else 0.0
+
     def stay(self, inverse: BacklashInverse) -> None:
         """Rest where v is."""
-        self.state.u_d = inverse.extreme
-        self.state.shrinkage = 0.0
+        self.state.u_d, self.state.shrinkage = inverse.extreme, 0.0
 
     def step(
-        self, estimate: Estimate, ideal: float, deviation: Sequence[float],
-        inverse: BacklashInverse, begins: bool,
+        self, estimate: Estimate, ideal: float, pull: float, inverse: BacklashInverse, begins: bool,
     ) -> None:
         """Say where v is to rest, where that is better than to stay.
 
@@ -172,21 +170,16 @@ class Rest:
             self.stay(inverse)
         if inverse.taking_up or inverse.side is Region.GAP:
             return  # still on its way, or nobody knows what u is
-        engaged = estimate.c_l if inverse.side == Region.LEFT else estimate.c_r
+        engaged = estimate.c_l if inverse.side is Region.LEFT else estimate.c_r
         u = estimate.m * (inverse.v - engaged)
         if state.mode is Mode.LEAD_BACK:
-            pull = self._pull_back(deviation)
             if begins or (u - ideal) * pull < TOO_WEAK * pull * pull:
                 self._aim(ideal + pull, u, 0.0, inverse)
             return
         side_std = estimate.std_c_r if ideal > u else estimate.std_c_l
         away, uncertain = abs(ideal - u), SHORT * side_std * estimate.m
-        if away * self._push > MATTERS * state.limit and away > GAIN * uncertain:
+        if away * self._design.push > MATTERS * state.limit and away > GAIN * uncertain:
             self._aim(ideal, u, SHORT, inverse)
-
-    def _pull_back(self, deviation: Sequence[float]) -> float:
-        pull = -dot(self._gain, deviation)
-        return min(max(pull, -self._most), self._most) if pull == pull else 0.0
 
     def _aim(self, u_d: float, u: float, shrinkage: float, inverse: BacklashInverse) -> None:
         self.state.u_d, self.state.shrinkage = u_d, shrinkage

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from operator import sub
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.protocol import Command, ControlInput, Structure
@@ -16,11 +16,10 @@ from backlash_ros.core.control.tracking.design import (
     better_design,
     design,
 )
-from backlash_ros.core.control.tracking.feedback import StateFeedback
-from backlash_ros.core.control.tracking.handover import HandOver
-from backlash_ros.core.control.tracking.rest import OFF, Mode, Rest
-from backlash_ros.core.control.tracking.trajectory import IdealTrajectory
-from backlash_ros.core.control.tracking.trust import Trust, shrunk_crossings
+from backlash_ros.core.control.tracking.feedback import StateFeedback, shrunk_crossings
+from backlash_ros.core.control.tracking.rest import OFF, Rest
+from backlash_ros.core.control.tracking.trajectory import IdealTrajectory, TrajectoryState
+from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.law import StateSource
 from backlash_ros.core.plant.backlash import Region
 from backlash_ros.core.plant.noise_level import NoiseLevel
@@ -30,14 +29,38 @@ from backlash_ros.core.plant.state_model import StateModel
 # has crossed the gap with it; samples since the end of a crossing between which its last moves are
 # over and the next one is not yet to be expected; samples without any after which none is.
 SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, (5, 20), 100
+FORESEEN = 6  # samples in which u* is neither to turn nor to hurry when another design takes over
 BEYOND = 0.3  # deviations of noise in feedback, that u_d may go further onward than u* soon is
 IN_FEEDBACK = 4.0  # times the noise of u* that feedback makes of the same noise
-ROUNDING = 1e-9  # relative, of u*
 NOISE_BAND = 4.0  # deviations of the noise in feedback that are worth a crossing of the gap
-FORESEEN = 6  # samples in which u* is neither to turn nor to hurry when another design takes over
+FADING = 0.8  # per sample, of what is handed over
 
 
-class Tracking:
+@dataclass
+class HandOver:
+    """Whoever takes over v, and whatever it takes it over with, v goes on from where it is.
+
+    Controllers restart, a rival leaves, gains of a better G or of other weights and other estimates
+    take over: each time what v stands for differs from the u_d that would have led to it. That
+    difference is added to u_d, and fades.
+
+    added: to the next u_d. due: the u_d that would have led to v, where somebody takes over with
+    the next sample. widens: whether it may lead u_d further than feedback may. leading: whether
+    the reference may have gone on while nobody followed it.
+    """
+
+    added: float = 0.0
+    due: float | None = None
+    widens: bool = False
+    leading: bool = False
+
+    def fade(self) -> float:
+        """What is added to u_d at this sample."""
+        added, self.added = self.added, FADING * self.added
+        return added
+
+
+class Tracking(Structure):
     """u_d = u* - K (x - x*) - K_q (q - q*) around the ideal trajectory u*, x*, q* of G alone.
 
     The trajectory is what the LQ preview controller does without backlash, for the reference r,
@@ -47,15 +70,13 @@ class Tracking:
     crossings are shrunk before they are inverted. noise_std: of y.
     """
 
-
     def __init__(
         self, beginning: TrackingDesign, weights: Weights, shrinkage: float, noise_std: float = 0.0,
     ) -> None:
         self.delay = weights.preview
         self._weights, self._noise_std, self._design = weights, noise_std, beginning
-        self.trust = Trust(shrinkage)
-        self.trajectory = IdealTrajectory(beginning, noise_std)
-        self.feedback = StateFeedback(beginning, self.trust, noise_std)
+        self.trajectory = IdealTrajectory(beginning)
+        self.feedback = StateFeedback(beginning, shrinkage, noise_std)
         self.rest = Rest(beginning, noise_std)
         self.hand_over = HandOver()
         self._y_noise = NoiseLevel()
@@ -63,39 +84,36 @@ class Tracking:
         self._engaged_for = 0  # samples since v has crossed the gap
 
     @property
-    def model(self) -> StateModel:
-        """The model of G whose gains are in use."""
-        return self._design.model
-
-    @property
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
-        since, (first, last) = self._engaged_for, ENGAGED_SINCE
-        if self.trust.state.in_use_for < SETTLED_AFTER or not (
-            first <= since <= last or since >= NO_CROSSING
+        trust, plan, (first, last) = self.feedback.trust, self.trajectory.state, ENGAGED_SINCE
+        if trust.in_use_for < SETTLED_AFTER or not (
+            first <= self._engaged_for <= last or self._engaged_for >= NO_CROSSING
         ):
             return False
         # Neither a turn soon nor larger moves of v than those of late, as far as references say.
-        fastest = self.trust.state.slope * max(self._moves)
-        side, ahead = self.trajectory.state.side, self.trajectory.ahead[:FORESEEN + 1]
-        rounding = ROUNDING * max(map(abs, ahead))
+        fastest, ahead = trust.slope * max(self._moves), plan.ahead[:FORESEEN + 1]
+        rounding = 1e-9 * max(map(abs, ahead))
         return all(
-            -rounding <= (after - before) * side <= fastest + rounding
+            -rounding <= (after - before) * plan.side <= fastest + rounding
             for before, after in pairwise(ahead)
         )
+
+    # --- taking over ----------------------------------------------------------------------------
 
     def go_on_from(self, other: Structure, state_known: bool = True) -> None:
         """Take over the trajectory, and the model of G that it is one of."""
         if not isinstance(other, Tracking) or other.delay != self.delay:
             return
-        if other.model is not self.model:
-            self._use(design(other.model, self._weights))
-        self.trust.go_on_from(other.trust, state_known)
+        model = other._design.model
+        if model is not self._design.model:
+            self._use(design(model, self._weights))
         self.trajectory.go_on_from(other.trajectory)
         self.feedback.go_on_from(other.feedback, state_known)
-        self.rest.go_on_from(other.rest)
+        self.rest.state = replace(other.rest.state)
         self._moves, self._engaged_for = other._moves, other._engaged_for
-        self.hand_over.from_rest(leading=not state_known)
+        self.hand_over = HandOver(
+            due=self.trajectory.state.u, widens=not state_known, leading=not state_known)
 
     def redesign(self, model: StateModel) -> Callable[[], object | None]:
         """See `better_design`."""
@@ -105,11 +123,14 @@ class Tracking:
         """Go on with a design as if it had been in use for as long as references are kept."""
         assert isinstance(gains, TrackingDesign)
         self._use(gains)
-        trajectory, before = self.trajectory, self.trajectory.references.empty
+        trajectory, feedback = self.trajectory, self.feedback
         trajectory.replay()
-        if not before:
-            deviation = list(map(sub, source.x_hat, trajectory.state.x))
-            self.hand_over.from_u_d(trajectory.u - self.feedback.peek(deviation))
+        if not trajectory.references.empty:
+            state, plan = replace(feedback.state), trajectory.state
+            deviation = feedback.deviation([float(x) for x in source.x_hat], source.x_cov, plan.x)
+            due = plan.u - feedback.u(deviation, held_back=False)
+            feedback.state = state  # this was no sample
+            self.hand_over = HandOver(due=due, widens=True)
             trajectory.advance()  # the plant is at the next sample when the next command is made
 
     def _use(self, chosen: TrackingDesign) -> None:
@@ -118,103 +139,106 @@ class Tracking:
         self.feedback.use(chosen)
         self.rest.use(chosen)
 
+    # --- at every sample ------------------------------------------------------------------------
+
     def control(self, inputs: ControlInput, inverse: BacklashInverse) -> Command:
         """Return u_d and v = BI(u_d)."""
-        estimate, trust, trajectory = inputs.estimate, self.trust, self.trajectory
-        feedback, x_cov = self.feedback, inputs.x_cov
-        first = trajectory.references.empty
-        self._y_noise.take(inputs.y)
-        trajectory.noise_std = max(self._noise_std, self._y_noise.std)
-        follows = self.rest.state.mode is Mode.FOLLOW and not inverse.taking_up
-        if trust.take(estimate) and follows and not first:
-            self.hand_over.to_estimate(inverse, trust.state)
-        self._take_reference(inputs, first)
-        x, ideal = trajectory.state.x, trajectory.u
-        deviation = feedback.deviation(inputs.x_hat, x)
-        feedback.take_covariance(x_cov)
-        feedback.ask(ideal, estimate)
-        trust.count(estimate, first, feedback.acquisition_bound)
-        held_back = inverse.limited or inverse.taking_up
-        before_turn = trajectory.state.side
-        asked = trajectory.turn(inverse.direction_band, inputs.crossing)
-        correction = feedback.u(deviation, held_back)
-        u_d = trajectory.onward_u - correction
+        y_m, y, estimate, _, crossing = inputs
+        feedback, trust, rest, x_cov = self.feedback, self.feedback.trust, self.rest, inputs.x_cov
+        first = self.trajectory.references.empty
+        self._y_noise.take(y)
+        self._go_on(estimate, inverse)
+        plan = self._plan(y, y_m)
+        deviation = feedback.deviation(inputs.x_hat, x_cov, plan.x)
+        feedback.begin(plan.u, estimate, first)
+        turned = self.trajectory.turn(
+            max(self._noise_std, self._y_noise.std), inverse.direction_band, crossing)
+        correction = feedback.u(deviation, inverse.limited or inverse.taking_up)
+        u_d = plan.onward_u() - correction
         # What the noise of the references makes of u* and is not followed shows as a deviation.
-        noise = NOISE_BAND * feedback.noise + IN_FEEDBACK * trajectory.noise_band
+        noise = NOISE_BAND * feedback.noise + IN_FEEDBACK * plan.noise_band
         if trust.full and abs(correction) < noise:
-            u_d = trajectory.bounded(u_d, BEYOND * feedback.noise)
-        u_d, handed_over = self.hand_over.apply(u_d, inverse, trust.state)
-        side = self._side(asked, asked is not before_turn, u_d, noise, inverse)
-        crossings = trust.state.crossings
-        rest, before = self.rest.state, self.rest.state.mode
-        mode = self.rest.decide(
-            inputs.y, trajectory.references.window, x, trajectory.onward, deviation,
-            None if x_cov is None else feedback.x_std, inverse.side,
-            feedback.most if trust.begun else feedback.acquisition_bound,
-        )
-        follows = mode is Mode.FOLLOW
-        if not follows:
+            u_d = plan.bounded(u_d, BEYOND * feedback.noise)
+        added = self.hand_over.fade()
+        u_d += added
+        pull, before = rest.pull_back(deviation, feedback.most), rest.state.mode
+        mode = rest.decide(y, self.trajectory.references.window, plan, deviation,
+                           None if x_cov is None else feedback.x_std, inverse.side, pull,
+                           abs(correction) > noise)
+        if mode.steps:
             if x_cov is not None:
-                self.rest.step(estimate, ideal, deviation, inverse, mode is not before)
-            elif before is Mode.FOLLOW:
-                self.rest.stay(inverse)
-            u_d = rest.u_d
-            crossings = shrunk_crossings(estimate, rest.shrinkage, trust.state.known)
+                rest.step(estimate, plan.u, pull, inverse, mode is not before)
+            elif not before.steps:
+                rest.stay(inverse)
+            side, u_d = None, rest.state.u_d
+            crossings = shrunk_crossings(estimate, rest.state.shrinkage, trust.known)
+        else:
+            side, crossings = self._side(turned, u_d, noise, inverse), trust.crossings
         # Whatever has made u_d: nothing leads it further from what the reference asks for.
-        reach = feedback.reach + handed_over
-        u_d = min(max(u_d, ideal - reach), ideal + reach)
-        v = self._invert(u_d, side if follows else None, crossings, inverse)
-        feedback.integrate(self.model.c * x[0] - inputs.y, inverse.limited)
-        trajectory.advance()
+        reach = feedback.reach + (abs(added) if self.hand_over.widens else 0.0)
+        u_d = min(max(u_d, plan.u - reach), plan.u + reach)
+        v = self._invert(u_d, side, crossings, inverse)
+        feedback.integrate(self._design.model.c * plan.x[0] - y, inverse.limited)
+        self.trajectory.advance()
         return Command(u_d, v, 0.0)
 
-    def _take_reference(self, inputs: ControlInput, first: bool) -> None:
-        y_m, trajectory = inputs.y_m, self.trajectory
-        if first:
+    def _go_on(self, estimate: Estimate, inverse: BacklashInverse) -> None:
+        """Take in the estimate, and v from whoever has made it until now."""
+        hand_over, feedback = self.hand_over, self.feedback
+        follows = not (self.rest.state.mode.steps or inverse.taking_up)
+        if feedback.take_estimate(estimate) and follows and hand_over.due is None:
+            hand_over.due = inverse.extreme  # that led to v with the estimate before
+        if hand_over.due is not None:
+            stands_for = inverse.resume(feedback.trust.slope, *feedback.trust.crossings)
+            if inverse.side is not Region.GAP:
+                hand_over.added += (stands_for - hand_over.due)
+            hand_over.due = None
+
+    def _plan(self, y: float, y_m: float) -> TrajectoryState:
+        """The trajectory at this sample, with the reference that came with it."""
+        trajectory, hand_over = self.trajectory, self.hand_over
+        if trajectory.references.empty:
             # What may be noise is no distance to go: a loop at rest stays at rest.
-            near = abs(inputs.y - y_m) <= OFF * self._noise_std
-            trajectory.begin(y_m if near else inputs.y)
-        elif self.hand_over.leading:
+            trajectory.begin(y_m if abs(y - y_m) <= OFF * self._noise_std else y)
+        elif hand_over.leading:
             trajectory.references.lead_to(y_m)
-        trajectory.take(y_m)
+        hand_over.leading = False
+        return trajectory.take(y_m)
 
     def _side(
-        self, asked: Region, turned: bool, u_d: float, noise: float, inverse: BacklashInverse,
+        self, turned: bool, u_d: float, noise: float, inverse: BacklashInverse,
     ) -> Region:
         """Return the side of the gap for u_d.
 
         A crossing costs wear and noise. The trajectory has no noise and is known ahead, so it
-        decides: asked; turned says whether it asks so since this sample. Feedback may ask for the
-        other side as well, where y is pushed, by more than noise: what of u_d may be noise.
+        decides; turned says whether it does since this sample. Feedback may ask for the other side
+        as well, where y is pushed, by more than noise: what of u_d may be noise.
         """
-        c_r, c_l = self.trust.state.crossings
+        plan, side, (c_r, c_l) = self.trajectory.state, inverse.side, self.feedback.trust.crossings
+        asked = plan.side
         if c_r == c_l and asked is not Region.GAP and u_d != inverse.held_u:
             return Region.RIGHT if u_d > inverse.held_u else Region.LEFT  # nothing is crossed
-        side = inverse.side
         if asked is Region.GAP or side is Region.GAP:
             return asked
-        back, come_back = (inverse.held_u - u_d) * side, self.trajectory.back
+        back = (inverse.held_u - u_d) * side
         if turned:
             # Limits may have kept v so far behind that u still has to go on.
-            return asked if side is asked or back > -(noise + come_back) else side
+            return asked if side is asked or back > -(noise + plan.back) else side
         # Where feedback turned before the trajectory does, that is no reason to turn again.
-        band = come_back + (noise if side is asked else 0.0)
+        band = plan.back + (noise if side is asked else 0.0)
         return Region(-side) if back > max(band, inverse.direction_band) else side
 
     def _invert(
-        self, u_d: float, side: Region | None, crossings: Sequence[float],
+        self, u_d: float, side: Region | None, crossings: tuple[float, float],
         inverse: BacklashInverse,
     ) -> float:
         """Return v; side: line for u_d, None where v steps to rest."""
-        before, v_before = inverse.side, inverse.v
-        c_r, c_l = crossings
-        slope = self.trust.state.slope
+        before, v_before, slope = inverse.side, inverse.v, self.feedback.trust.slope
         if side is None:
-            v = inverse.proceed(slope, c_r, c_l)
+            v = inverse.proceed(slope, *crossings)
         else:
-            v = inverse.follow(side, u_d, slope, c_r, c_l)
+            v = inverse.follow(side, u_d, slope, *crossings)
         self._moves.append(abs(v - v_before))
         crosses = inverse.taking_up or inverse.side is not before
         self._engaged_for = 0 if crosses else self._engaged_for + 1
-        self.hand_over.note(u_d)
         return v
