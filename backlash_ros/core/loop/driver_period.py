@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from itertools import islice
+from itertools import accumulate, islice, pairwise
 from math import isfinite, nan, sqrt
+from operator import mul
+from statistics import median
 from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 STAMPS = 1000  # the newest ones, to which the period is fitted, within 2 s
 # The period that is counted with is learned anew after so many intervals. It is taken for another
@@ -85,28 +82,29 @@ class DriverPeriod:
         It is known to some 0.1 % after a second. A message that was lost, or came twice, does not
         disturb it; unknown where most intervals are no period at all, or scatter widely.
         """
-        newest = islice(reversed(self._stamps_ns), intervals + 1)
-        stamps = list(newest)[::-1]
-        begin = len(stamps) - 21  # 20 intervals at least
-        if begin < 0:
+        stamps = list(islice(reversed(self._stamps_ns), intervals + 1))
+        newest_ns, nominal_s = stamps[0] if stamps else 0, self.nominal_s
+        # 20 intervals at least.
+        times = [
+            1e-9 * (stamp - newest_ns) for i, stamp in enumerate(stamps)
+            if i <= 20 or newest_ns - stamp <= 2_000_000_000
+        ][::-1]
+        if len(times) <= 20:
             return UNKNOWN_PERIOD
-        times = 1e-9 * np.array([float(stamp - stamps[-1]) for stamp in stamps])
-        early = np.flatnonzero(times[:begin] < -2.0)
-        times = times[early[-1] + 1 if len(early) else 0:]
-        steps = np.diff(times)
-        ordered = np.sort(steps)
-        quarter = len(ordered) // 4
-        typical = float(ordered[quarter:-quarter].mean())
-        if not abs(typical / self.nominal_s - 1.0) < 0.25:
+        steps = [later - earlier for earlier, later in pairwise(times)]
+        ordered, quarter = sorted(steps), len(steps) // 4
+        typical = sum(ordered[quarter:-quarter]) / (len(ordered) - 2 * quarter)
+        if not abs(typical / nominal_s - 1.0) < 0.25:
             return UNKNOWN_PERIOD
-        found = _slope(np.append(0.0, np.rint(steps / self.nominal_s)).cumsum(), times)
+        found = _slope(list(accumulate((round(step / nominal_s) for step in steps), initial=0)),
+                       times)
         if found.mean > 0.0:
-            found = _slope(np.array(_numbered(times.tolist(), found.mean), float), times)
+            found = _slope(_numbered(times, found.mean), times)
         # Beyond such a scatter, as of a driver that is held up all the time, nobody can tell from
         # the stamps which samples were left out.
-        if not (found.mean > 0.0 and found.scatter < 0.2 * self.nominal_s):
+        if not (found.mean > 0.0 and found.scatter < 0.2 * nominal_s):
             return UNKNOWN_PERIOD
-        return found._replace(median=float(np.median(ordered)))
+        return found._replace(median=median(ordered))
 
 
 def _numbered(times: list[float], period_s: float) -> list[int]:
@@ -120,12 +118,15 @@ def _numbered(times: list[float], period_s: float) -> list[int]:
     return numbers
 
 
-def _slope(numbers: Array, times: Array) -> Period:
-    n, t = numbers - numbers.mean(), times - times.mean()
-    spread = float(n @ n)
+def _slope(numbers: list[int], times: list[float]) -> Period:
+    """The straight line through the times of numbered samples."""
+    count = len(numbers)
+    n_mean, t_mean = sum(numbers) / count, sum(times) / count
+    n, t = [each - n_mean for each in numbers], [each - t_mean for each in times]
+    spread = sum(each * each for each in n)
     if not spread:
         return UNKNOWN_PERIOD
-    slope = float(n @ t) / spread
-    rest = float(np.mean((t - slope * n)**2))
+    slope = sum(map(mul, n, t)) / spread
+    rest = sum((time - slope * number)**2 for number, time in zip(n, t, strict=True)) / count
     # A process that is held up is late for some ten samples, whose lateness is one error.
     return Period(slope, sqrt(10.0 * rest / spread), scatter=sqrt(rest))
