@@ -59,7 +59,7 @@ setup(
             f'compare = {PACKAGE}.tools.compare:main',
             f'check_driver = {PACKAGE}.nodes.check_driver:main',
             f'identify = {PACKAGE}.tools.identify.command:main',
-            f'replay = {PACKAGE}.tools.replay.command:main',
+            f'replay = {PACKAGE}.tools.replay:main',
             f'monitor = {PACKAGE}.nodes.monitor:main',
             f'live = {PACKAGE}.nodes.live:main',
         ],

@@ -43,8 +43,7 @@ def record_of(
     if again.any():
         said.append(f'{again.sum()} rows that repeat the one before left out')
         table = table[:, ~again]
-    _check('v', table[1])
-    _check('y', table[2])
+    _check(v=table[1], y=table[2])
     # An angle that begins anew is far from the rows around as well.
     bad, value = failed(unwrapped(table[2])[0])
     if bad.any():
@@ -80,8 +79,7 @@ def usable(record: Record) -> Record:
     Before the first command the motor rests where it is. Raises RecordError where v or y are no
     measurements.
     """
-    _check('v', record.v)
-    _check('y', record.y)
+    _check(v=record.v, y=record.y)
     first = int(np.argmax(np.isfinite(record.v)))
     v, y, commands = _held(record.v)[first:], record.y[first:], record.commands
     if np.ptp(v) == 0.0:
@@ -92,24 +90,22 @@ def usable(record: Record) -> Record:
     if commands is not None:
         commands = _held(commands)[first:]
         commands = np.where(np.isnan(commands), v[0], commands)
-        if not np.abs(commands).max() <= LARGEST:
-            commands = None
-    return replace(
-        record, v=v, y=y, sample_period=float(f'{record.sample_period:.9g}'), commands=commands
-    )
+        commands = commands if np.abs(commands).max() <= LARGEST else None
+    period = float(f'{record.sample_period:.9g}')
+    return replace(record, v=v, y=y, sample_period=period, commands=commands)
 
 
-def _check(name: str, values: Array) -> None:
+def _check(**signals: Array) -> None:
     """Raise RecordError where the values are no measurements."""
-    if not np.isfinite(values).any():
-        raise RecordError(f'{name} holds no number')
-    largest = float(np.nanmax(np.abs(values)))
-    swing = float(np.nanmax(values) - np.nanmin(values))
-    if largest > LARGEST or 0.0 < swing < 1.0 / LARGEST:
-        raise RecordError(
-            f'{name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
-            f'{1.0 / LARGEST:g} to {LARGEST:g}: choose another unit, drop what is no reading'
-        )
+    for name, values in signals.items():
+        if not np.isfinite(values).any():
+            raise RecordError(f'{name} holds no number')
+        largest, swing = np.nanmax(np.abs(values)), np.nanmax(values) - np.nanmin(values)
+        if largest > LARGEST or 0.0 < swing < 1.0 / LARGEST:
+            raise RecordError(
+                f'{name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
+                f'{1.0 / LARGEST:g} to {LARGEST:g}: choose another unit, drop what is no reading'
+            )
 
 
 def _held(values: Array) -> Array:

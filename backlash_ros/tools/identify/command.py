@@ -43,10 +43,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--slope', type=positive, default=1.0, metavar='M',
                         help='m, a gear ratio for instance; it cannot be told from the gain of G '
                              '(default: 1)')
-    parser.add_argument('--held-out', type=lambda text: _share(text, 0.1, 0.6),
-                        default=1.0 / 3.0, metavar='SHARE',
-                        help='share at the end of the record on which structures are compared '
-                             '(default: 0.33)')
     add_span_options(parser)
     add_out_option(parser)
     drive = parser.add_argument_group('with --drive')
@@ -55,8 +51,7 @@ def make_parser() -> argparse.ArgumentParser:
                             'control.rate_max of --config, record, bring it to rest, identify')
     drive.add_argument('--duration', type=positive, metavar='S', default=20.0,
                        help='longest motion [s] (default: 20)')
-    drive.add_argument('--precision', type=lambda text: _share(text, 0.0, 0.99), default=0.0,
-                       metavar='P%',
+    drive.add_argument('--precision', type=_share, default=0.0, metavar='P%',
                        help='end the motion as soon as gap and G are known to this (default: 0, '
                             'the whole duration)')
     drive.add_argument('--amplitude', type=positive, metavar='V', help='keep v within ±V as well')
@@ -80,13 +75,13 @@ def _numbers(text: str, most: int) -> tuple[int, ...]:
     return tuple(range(int(first), int(last or first) + 1))
 
 
-def _share(text: str, least: float, most: float) -> float:
+def _share(text: str) -> float:
     try:
         number = float(text.removesuffix('%')) / (100.0 if text.endswith('%') else 1.0)
     except ValueError:
         number = -1.0
-    if not least <= number <= most:
-        raise argparse.ArgumentTypeError(f'{text!r} must be {least:g} to {most:g}, or in %')
+    if not 0.0 <= number < 1.0:
+        raise argparse.ArgumentTypeError(f'{text!r} must be like 1% or 0.01')
     return number
 
 

@@ -44,7 +44,6 @@ def identifying_record(
     """Identify with what the command line says; yields what is being done."""
     found = yield from identifying(record.v, record.y, record.sample_period, Options(
         options.order, options.delay, INTEGRATORS[options.integrator], options.slope,
-        options.held_out,
     ))
     return found if record.commands is None else with_actuator(found, record.commands)
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros import topics
-from backlash_ros.bags.reader import Topic
 from backlash_ros.core.loop.command_history import REPORTED, v_of_intervals
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
@@ -154,33 +153,24 @@ def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     def is_command(topic: str) -> bool:
         return any(word in topic.lower() for word in COMMAND_WORDS)
 
-    def wanted(topic: Topic) -> bool:
-        return topic.message_type in (NUMBER, JOINTS) or (
-            topic.message_type == NUMBERS and is_command(topic.name))
-
-    content = read_topics(path, wanted)
-    series: dict[tuple[str, str], list[tuple[int, float]]] = {}
+    content = read_topics(path, lambda topic: topic.message_type in (NUMBER, JOINTS) or (
+        topic.message_type == NUMBERS and is_command(topic.name)))
+    series: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
     for topic, messages in sorted(content.messages.items()):
         for stamp, message in messages:
-            for part, value in _numbers_of(message):
-                series.setdefault((topic, part), []).append((stamp, value))
+            numbers: Iterable[tuple[str, str, float]]
+            if hasattr(message, 'name'):
+                numbers = ((f'/{joint}', joint, value) for joint, value in zip(
+                    message.name, message.position, strict=False))
+            elif hasattr(message, 'layout'):
+                numbers = ((f'[{place}]', '', value) for place, value in enumerate(message.data))
+            else:
+                numbers = [('', '', message.data)]
+            for part, joint, value in numbers:
+                series.setdefault((topic, part, joint), []).append((stamp, float(value)))
     found = {}
-    for (topic, part), pairs in series.items():
+    for (topic, part, joint), pairs in series.items():
         stamps, values = zip(*pairs, strict=True)
-        found[topic.removeprefix('/') + part] = Signal(
-            (np.array(stamps, dtype=np.int64), np.array(values)), is_command(topic),
-            part.removeprefix('/') if part.startswith('/') else '',
-        )
+        messages_of = np.array(stamps, dtype=np.int64), np.array(values)
+        found[topic.removeprefix('/') + part] = Signal(messages_of, is_command(topic), joint)
     return found, content.damage
-
-
-def _numbers_of(message: Any) -> Iterator[tuple[str, float]]:
-    """Its numbers, each with what its name has behind that of the topic."""
-    if hasattr(message, 'name'):
-        for joint, value in zip(message.name, message.position, strict=False):
-            yield f'/{joint}', float(value)
-    elif hasattr(message, 'layout'):
-        for place, value in enumerate(message.data):
-            yield f'[{place}]', float(value)
-    else:
-        yield '', float(message.data)

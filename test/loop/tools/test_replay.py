@@ -12,7 +12,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.tools import simulate as simulate
-from backlash_ros.tools.replay.command import main
+from backlash_ros.tools.replay import main
 
 NOISY = {'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3}
 # Losses, a structure that feeds y back, a learned G, a law of another kind, a limited v.

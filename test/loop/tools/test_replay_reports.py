@@ -14,7 +14,7 @@ from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
 from backlash_ros.tools.config import write_config
-from backlash_ros.tools.replay.command import main
+from backlash_ros.tools.replay import main
 from backlash_ros.tools.runs.read_run import read_run
 
 FLOAT = 'std_msgs/msg/Float64'

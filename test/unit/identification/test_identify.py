@@ -106,7 +106,7 @@ def test_a_record_of_no_use_is_told_and_leaves_no_parameter_file(tmp_path, capsy
 @pytest.mark.parametrize('arguments', [
     [], ['nowhere.csv'], ['--drive', 'a.csv'], ['a.csv', '--order', '7'],
     ['a.csv', '--order', '4-2'], ['a.csv', '--delay', 'x'], ['a.csv', '--slope', '0'],
-    ['a.csv', '--held-out', '0.9'], ['a.csv', '--from', '3', '--to', '2'],
+    ['a.csv', '--from', '3', '--to', '2'],
     ['a.csv', '--integrator', 'perhaps'], ['a.csv', '--precision', '200%'],
     ['a.csv', '--columns', 'x=1'], ['a.csv', '--columns', 't=w'], ['a.csv', '--period', '0'],
     ['a.csv', '--config', 'nowhere.yaml'], ['a.csv', '--ros-args', '-r', 'a:=b'],

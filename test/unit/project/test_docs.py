@@ -22,12 +22,12 @@ from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.nodes.check_driver import parse_options
 from backlash_ros.tools import batch
 from backlash_ros.tools import compare as compare
+from backlash_ros.tools import replay as replay
 from backlash_ros.tools import report as report
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.bringup import __main__ as bringup
 from backlash_ros.tools.config import effective_parameters
 from backlash_ros.tools.identify import command as identify
-from backlash_ros.tools.replay import command as replay
 
 DOCS = ROOT / 'docs'
 PAGES = sorted([ROOT / 'README.md', *DOCS.rglob('*.md')])

@@ -10,10 +10,10 @@ from rosbags.rosbag2 import StoragePlugin
 
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import RunRecord
+from backlash_ros.tools import replay as replay
 from backlash_ros.tools import report as report
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.records.reading import read_record
-from backlash_ros.tools.replay import command as replay
 from backlash_ros.tools.runs.read_run import read_run
 
 

@@ -9,7 +9,7 @@ from places import ROOT
 from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.estimates_file import load_estimate
 from backlash_ros.tools.config import effective_parameters
-from backlash_ros.tools.replay.command import main as replay
+from backlash_ros.tools.replay import main as replay
 from backlash_ros.tools.runs.read_run import read_run
 
 OLD = ROOT / 'test' / 'of_0_2_0'

@@ -6,10 +6,11 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, isnan, nan
+from math import isnan, nan
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from backlash_ros.atomic_file import write_atomically
@@ -20,24 +21,11 @@ from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
+from backlash_ros.tools import cli, figures
 from backlash_ros.tools.batch import combinations, parse_sweep, value_text
-from backlash_ros.tools.cli import (
-    NOTHING,
-    BrokenOffError,
-    InputError,
-    Span,
-    add_out_option,
-    add_span_options,
-    format_table,
-    print_warnings,
-    run_tool,
-    span_of,
-)
 from backlash_ros.tools.config import parse_setting
-from backlash_ros.tools.figures import png
 from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
-from backlash_ros.tools.replay.replay_figure import draw_replay
 from backlash_ros.tools.report import REPORT_PAGE, write_report
 from backlash_ros.tools.runs.bag import read_reports
 from backlash_ros.tools.runs.files import Run, result_directory, write_table
@@ -67,7 +55,7 @@ class Source:
             except ParameterError:
                 raise
             except ValueError as error:
-                raise BrokenOffError(f'the replay broke off: {error}') from error
+                raise cli.BrokenOffError(f'the replay broke off: {error}') from error
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -85,101 +73,86 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--sweep', action='append', default=[], metavar='KEY=V1,V2,...',
                         help='once for each value; several sweeps: for each combination')
     parser.add_argument('--axis', default='', metavar='NAME', help='of a bag with several')
-    add_span_options(parser)
-    add_out_option(parser)
+    cli.add_span_options(parser)
+    cli.add_out_option(parser)
     return parser
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point of `replay`."""
-    return run_tool('replay', lambda: _replay(args))
+    return cli.run_tool('replay', lambda: _replay(args))
 
 
 def _replay(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
-    span = span_of(parser, options)
+    span = cli.span_of(parser, options)
     changes = combinations([parse_sweep(text) for text in options.sweep])
     sources = [_opened(path, options, span) for path in options.runs]
     if len(sources) * len(changes) == 1:
         _one(sources[0], options.out)
         return
-    rows: list[tuple[object, ...]] = []
+    rows = []
     for source in sources:
         for change in changes:
             words = ' '.join(f'{name}={value_text(value)}' for name, value in change.items())
             run = source.replayed(source.parameters.replaced(change), f'{source.path.name} {words}')
-            rows.append((str(source.path), words, *_figures(run)))
+            rows.append(((str(source.path), words), _numbers(run)))
     directory = result_directory(options.out)
-    write_table(directory / TABLE, HEADER, rows)
-    print(format_table(HEADER, [
-        tuple(str(cell) if not isinstance(cell, float) else f'{cell:.4g}' if isfinite(cell) else
-              NOTHING for cell in row) for row in rows
-    ]))
+    write_table(directory / TABLE, HEADER, [(*names, *values) for names, values in rows])
+    print(cli.format_table(
+        HEADER, [(*names, *map(cli.number, values)) for names, values in rows]))
     print(directory / TABLE)
 
 
-def _opened(path: Path, options: argparse.Namespace, span: Span) -> Source:
+def _opened(path: Path, options: argparse.Namespace, span: cli.Span) -> Source:
     """The run, the parameters with which it is to be replayed, and what its driver reported."""
     run, applied = read_run_or_log(path, options.config, span, options.axis, options.columns)
     for text in run.notes:
         print(f'replay: {"warning: " if applied is None else ""}{text}', file=sys.stderr)
     if run.record.samples == 0:
-        raise InputError(f'{path}: holds no sample')
+        raise cli.InputError(f'{path}: holds no sample')
     if run.parameters is None:
-        raise InputError(f'{path}: no parameters.yaml stands beside it: give --config'
-                         if applied is None else
-                         f'{path}: is a log: give --config, like identified.yaml of `identify`')
+        raise cli.InputError(
+            f'{path}: no parameters.yaml stands beside it: give --config' if applied is None else
+            f'{path}: is a log: give --config, like identified.yaml of `identify`')
     changes = {}
     for text in options.settings:
         setting = parse_setting(text)
         if setting.axis:
-            raise InputError(f'--set {text!r}: leave out the axis: there is one run')
+            raise cli.InputError(f'--set {text!r}: leave out the axis: there is one run')
         changes[setting.name] = setting.value
     parameters = run.parameters.replaced(changes)
     if applied is not None:
         # Its v is what acted, in every interval.
         parameters = parameters.replaced({'estimator.use_applied_control': 'true'})
-    else:
-        applied = _reports(path, run.record, parameters, options.axis)
-    return Source(path, run.record, parameters, applied)
-
-
-def _reports(
-    path: Path, run: RunRecord, parameters: Parameters, axis: str,
-) -> Sequence[Sequence[float]]:
-    """What the driver said to have applied before each row, where the controller uses it."""
-    use = report_use(parameters)
-    if use is ReportUse.NEVER:
-        return ()
-    bag = find_bag(path)
-    reports = [] if bag is None else read_reports(bag, run.column('y'), axis)
-    if not reports and use is ReportUse.ALWAYS:
+        return Source(path, run.record, parameters, applied)
+    use, bag = report_use(parameters), find_bag(path)
+    reports: Sequence[Sequence[float]] = ()
+    if use is not ReportUse.NEVER and bag is not None:
+        reports = read_reports(bag, run.record.column('y'), options.axis)
+    if use is ReportUse.ALWAYS and not reports:
         print(f'replay: warning: {path}: holds no applied_control: v is that of control',
               file=sys.stderr)
-    return reports
+    return Source(path, run.record, parameters, reports)
 
 
 def _one(source: Source, out: Path | None) -> None:
     """What `simulate` writes, a figure beside it, and where the replay parts from the run."""
     recorded = source.recorded
-    print_warnings('replay', source.parameters)
+    cli.print_warnings('replay', source.parameters)
     replayed = source.replayed(source.parameters, source.path.name)
     directory = result_directory(out)
     summary = write_report(Run(replayed, source.parameters), directory)
-    write_atomically(directory / FIGURE, png(draw_replay(recorded, replayed)))
-    print(format_table(('', 'run', 'replay', '±'), [
-        (name, _number(recorded.column(name)[-1]), _number(summary['final'][name]),
-         _number(summary['final_std'][name], 2)) for name in BACKLASH
+    write_atomically(directory / FIGURE, figures.png(draw_replay(recorded, replayed)))
+    print(cli.format_table(('', 'run', 'replay', '±'), [
+        (name, cli.number(recorded.column(name)[-1], 6), cli.number(summary['final'][name], 6),
+         cli.number(summary['final_std'][name], 2)) for name in BACKLASH
     ]))
     of_log = isnan(recorded.column('m')[-1])
     print(_states(replayed) if of_log else _parted(recorded, replayed))
     print(directory / FIGURE)
     print(directory / REPORT_PAGE)
-
-
-def _number(value: float, digits: int = 6) -> str:
-    return f'{value:.{digits}g}' if isfinite(value) else NOTHING
 
 
 def _states(run: RunRecord) -> str:
@@ -202,11 +175,41 @@ def _parted(recorded: RunRecord, replayed: RunRecord) -> str:
     )
 
 
-def _figures(run: RunRecord) -> tuple[float, ...]:
+def _numbers(run: RunRecord) -> tuple[float, ...]:
     """What a table has of a replay, as HEADER names it."""
-    last = [float(run.column(name)[-1]) for name in HEADER[2:8]]
     tracking = run.column('t')[run.column('status') == Status.TRACKING]
     innovation = run.column('innovation')[run.samples // 2:]
     known = innovation[np.isfinite(innovation)]
-    return (*last, float(tracking[0]) if len(tracking) else nan,
+    return (*(float(run.column(name)[-1]) for name in HEADER[2:8]),
+            float(tracking[0]) if len(tracking) else nan,
             float(np.sqrt(np.mean(known**2))) if len(known) else nan)
+
+
+def draw_replay(recorded: RunRecord, replayed: RunRecord) -> Figure:
+    """m, c_r, c_l, innovation and status over time; grey: as the run had them."""
+    figure, own, hues = figures.new_figure(10.0), figures.HUES['y_m'], figures.HUES
+    rooms = figure.subplots(5, 1, sharex=True, height_ratios=[1.0, 1.0, 1.0, 1.0, 0.5])
+    t = replayed.column('t')
+    for axes, name in zip(rooms, BACKLASH, strict=False):
+        before, again = recorded.column(name), replayed.column(name)
+        std = replayed.column(f'std_{name}')
+        if np.isfinite(before).any():
+            figures.curve(axes, t, before, own, 'run', width=2.6)
+        figures.curve(axes, t, again, hues[name], 'replay')
+        figures.band(axes, t, again - std, again + std, hues[name])
+        low, high = np.nanpercentile(np.concatenate([before, again]), [1.0, 99.0])
+        room = 0.2 * (high - low) or 0.1 * max(abs(high), 1e-9)
+        axes.set_ylim(low - room, high + room)
+        figures.label(axes, '', f'${figures.HATS[name]}$ [{figures.BACKLASH_UNITS[name]}]')
+    figures.legend_above(rooms[0])
+    for run, colour, width in ((recorded, own, 2.6), (replayed, hues['e'], 1.3)):
+        figures.curve(rooms[3], t, run.column('innovation'), colour, width=width)
+        rooms[4].step(t, run.column('status'), where='post', color=colour, linewidth=width)
+    figures.label(rooms[3], '', 'innovation [y]')
+    rooms[4].set_yticks([int(state) for state in Status], [state.word for state in Status])
+    figures.label(rooms[4], '', '', figures.TIME_LABEL)
+    return figure
+
+
+if __name__ == '__main__':
+    sys.exit(main())

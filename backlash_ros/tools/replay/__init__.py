@@ -1,1 +1,0 @@
-"""`replay`: a recorded run through the controller once more."""
