@@ -1,11 +1,13 @@
-"""From a measured record to the files of a result and what the terminal shows of it."""
+"""From a measured record to the files of a result, the page, and what the terminal shows of it."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
+from html import escape
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
 from backlash_ros.core.identification.identification import (
+    Details,
     Identification,
     Options,
     identifying,
@@ -22,14 +25,17 @@ from backlash_ros.core.identification.identification import (
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record
-from backlash_ros.tools.cli import BrokenOffError, format_table
+from backlash_ros.tools.cli import NOTHING, BrokenOffError, format_table
 from backlash_ros.tools.identify.identified_file import (
     alike,
     as_estimate,
     commented_yaml,
+    hertz,
     identified_parameters,
     numbers,
 )
+from backlash_ros.tools.identify.pictures import pictures
+from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
@@ -80,13 +86,10 @@ def write_outcome(
             found = replace(found, reasons=(f'the controller does not take it: {error}',))
     write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes}, out / JSON)
     write_record(record, out / 'record.csv')
-    # Matplotlib is loaded where there is something to draw.
-    from backlash_ros.tools.identify.page import render
-    from backlash_ros.tools.identify.pictures import pictures
     drawn = list(pictures(found))
     for picture in drawn:
         write_atomically(out / picture.name, picture.data)
-    write_atomically(out / PAGE, render(found, record, drawn, text))
+    write_atomically(out / PAGE, _page(found, record, drawn, text))
     _print(found, record)
     print(out / (YAML if found.usable else JSON))
     print(out / PAGE)
@@ -112,7 +115,7 @@ def _print(found: Identification, record: Record) -> None:
         print(f'G(z): {len(found.denominator) - 1} poles'
               + (', one of them an integrator' if found.integrator else '')
               + f', delay {found.delay}{alike(found)}'
-              + f', known to {found.response_std.max():.2g} of itself; noise of y '
+              + f', known to {100.0 * found.response_std.max():.2g} %; noise of y '
               + f'{found.noise_std:.3g}')
     if found.actuator is not None:
         actuator = found.actuator
@@ -122,7 +125,85 @@ def _print(found: Identification, record: Record) -> None:
     print(f'time: {record.timing}')
     for text in (*record.notes, *found.remarks):
         print(f'note: {text}')
-    for text in found.reasons:
-        # That the backlash is not known stands in the first lines.
-        if found.verdict is None or found.verdict.backlash.known:
-            print(f'no {YAML}: {text}')
+    for text in _other_reasons(found):
+        print(f'no {YAML}: {text}')
+
+
+def _other_reasons(found: Identification) -> list[str]:
+    """Why it is of no use to a controller, but for what the verdict says."""
+    said = () if found.verdict is None else found.verdict.reasons
+    return [text for text in found.reasons if text not in said]
+
+
+def _page(
+    found: Identification, record: Record, pictures: Sequence[Picture], parameters: str | None,
+) -> str:
+    """The page as text. parameters: content of identified.yaml, None where there is none."""
+    verdict = found.verdict
+    known = verdict is not None and verdict.backlash.known
+    lead = (
+        f'<b>The backlash is {"" if known else "not "}known</b>: {len(found.y)} samples of '
+        f'{found.sample_period:g} s from {escape(record.source)}.'
+    )
+    notes = (*(() if verdict is None else verdict.lines), *_other_reasons(found), *found.remarks,
+             *record.notes)
+    parts = [] if found.details is None else [
+        _numbers(found) + _facts(found, record), _compared(found.details)]
+    folded = None if parameters is None else ('identified.yaml', parameters)
+    return page('Identification of backlash and G(z)', lead, notes, parts, pictures, folded)
+
+
+def _numbers(found: Identification) -> str:
+    rows = [
+        (symbol, f'{value:.6g}', f'{found.std[name]:.2g}', unit)
+        for name, symbol, value, unit in (
+            ('gap', 'gap, c<sub>r</sub> − c<sub>l</sub>', found.gap, 'of v'),
+            ('c_r', 'c<sub>r</sub>', found.c_r, 'of v'),
+            ('c_l', 'c<sub>l</sub>', found.c_l, 'of v'),
+            ('m', 'm (told, or 1; deviation: of the gain of m G)', found.m, 'of u/v'),
+        )
+    ]
+    return table(('', 'found', 'std. deviation', 'unit'), rows)
+
+
+def _facts(found: Identification, record: Record) -> str:
+    band = hertz(found)
+    held_out = found.details and found.details.held_out
+    quantum = f', steps of {found.quantum:.3g}' if found.quantum else ''
+    return facts([
+        ('time', escape(record.timing)),
+        ('numerator of G', _listed(found.numerator)),
+        ('denominator of G', _listed(found.denominator)),
+        ('poles', ', '.join(
+            f'{pole.real:.5g}' + (f' {pole.imag:+.5g} i' if abs(pole.imag) >= 1e-9 else '')
+            for pole in np.roots(found.denominator))),
+        ('delay', f'{found.delay} samples{alike(found)}'),
+        ('G is known to', f'{100.0 * found.response_std.max():.2g} %, {band[0]:.2g} to '
+                          f'{band[-1]:.2g} Hz'),
+        ('noise of y', f'{found.noise_std:.3g}{quantum}'),
+        ('error on samples held out', NOTHING if held_out is None else
+         f'{held_out.rms:.3g} (fit: {held_out.trained:.3g})'),
+        ('correlation of the residual', f'{found.correlation:.2g} from sample to sample'
+         if isfinite(found.correlation) else NOTHING),
+        ('lost samples, outliers', f'{record.lost}, {found.outliers}'),
+    ], columns=1)
+
+
+def _compared(details: Details) -> str:
+    """The best of each order, with and without an integrator."""
+    kinds = sorted({(one.structure.order, one.structure.integrator) for one in details.compared})
+    rows = []
+    for order, integrator in kinds:
+        best = min((one for one in details.compared if one.structure.order == order
+                    and one.structure.integrator == integrator), key=lambda one: one.held_out)
+        taken = best.structure[:3] == details.chosen.structure[:3]
+        rows.append((
+            f'{order} pole{"s" * (order != 1)}' + ', one an integrator' * integrator
+            + ' (taken)' * taken, str(best.structure.delay), f'{best.held_out:.4g}',
+        ))
+    return '<h2>Orders compared</h2>' + table(
+        ('G', 'delay [samples]', 'error on samples held out'), rows)
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ', '.join(f'{value:.6g}' for value in values)

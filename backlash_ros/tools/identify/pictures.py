@@ -43,10 +43,10 @@ def pictures(found: Identification) -> Iterator[Picture]:
          'Simulated from v alone, with a model that was fitted to the samples before: the lines '
          'should lie on each other, and the difference should look like noise.',
          6.2, draw_held_out),
-        ('loop.png', 'The loop of v and y',
-         'Left: v against y as measured. Right: v against the u that was found: it follows the '
-         'right line (c<sub>r</sub>) while v rises, the left one (c<sub>l</sub>) while v falls, '
-         'and stands still between them: that is the backlash.', 4.6, draw_loop),
+        ('loop.png', 'The backlash',
+         'Left: y over v as measured. Right: what the backlash that was found takes from v, over '
+         'v: c<sub>r</sub> while v pushes to the right, c<sub>l</sub> to the left, and in between '
+         'while v crosses the gap after each turn.', 4.6, draw_loop),
         ('gap.png', 'Misfit over the gap',
          'What is left over for each width of the gap, everything else refitted. One narrow '
          'valley: the gap is known. Two valleys of one depth: it is not.', 4.2, draw_profile),
@@ -61,7 +61,7 @@ def pictures(found: Identification) -> Iterator[Picture]:
     ):
         figure = Figure(figsize=(10.0, height), constrained_layout=False)
         # Margins that suit all of them: a layout takes as long as to draw it.
-        figure.subplots_adjust(left=0.085, right=0.985, bottom=0.55 / height,
+        figure.subplots_adjust(left=0.1, right=0.985, bottom=0.55 / height,
                                top=1.0 - 0.4 / height, wspace=0.2, hspace=0.4)
         draw(figure, found, details)
         buffer = io.BytesIO()
@@ -88,18 +88,17 @@ def draw_held_out(figure: Figure, found: Identification, details: Details) -> No
 
 
 def draw_loop(figure: Figure, found: Identification, details: Details) -> None:
-    """v against y, and v against the u that was found with its two lines."""
+    """y over v, and v - u / m over v, between the crossings."""
     left, right = figure.subplots(1, 2)
     v = details.samples.v[-LOOP_POINTS:]
     curve(left, v, details.samples.whole_y[-LOOP_POINTS:], HUES['y'], width=0.8)
     label(left, 'As measured', 'y', 'v')
-    curve(right, v, found.m * (details.fit.p[-LOOP_POINTS:] - found.c_r), HUES['u'], 'u')
-    ends = np.array([v.min(), v.max()])
+    curve(right, v, v - details.fit.p[-LOOP_POINTS:] + found.c_r, HUES['u'], width=0.8)
     for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):
-        curve(right, ends, found.m * (ends - value), HUES[name], f'${name}$ = {value:.4g}',
-              width=4.0, alpha=0.5)
-    label(right, 'As found', 'u', 'v')
-    right.legend(loc='upper left')
+        right.axhline(value, color=HUES[name], linewidth=4.0, alpha=0.5,
+                      label=f'${name}$ = {value:.4g}')
+    label(right, 'As found', 'v − u / m', 'v')
+    legend_above(right)
 
 
 def draw_profile(figure: Figure, found: Identification, details: Details) -> None:
@@ -107,7 +106,7 @@ def draw_profile(figure: Figure, found: Identification, details: Details) -> Non
     whole, near = figure.subplots(1, 2)
     gaps, std = details.profile.gaps, found.std['gap']
     rms = np.sqrt(details.profile.squares / max(details.profile.best.rows, 1))
-    close = np.abs(gaps - found.gap) <= 0.21 * found.gap
+    close = np.abs(gaps - found.gap) <= max(0.21 * found.gap, 2.0 * SURE * std)
     for axes, chosen in ((whole, np.full(len(gaps), True)), (near, close)):
         axes.plot(gaps[chosen], rms[chosen], '.-', color=HUES['m'], markersize=4)
         axes.axvline(found.gap, color=HUES['c_r'], linewidth=1.0)
