@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -87,12 +88,14 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     code = DONE
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def bringup() -> None:
         nonlocal code
         options = parse_options(arguments)
-        # Loading numpy and scipy takes a second, in which a Ctrl-C is to be heard already.
         with StopRequests() as requests:
+            # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
             from backlash_ros.tools.bringup.plan import prepare
             plan = prepare(options)
             watch = run(plan, requests)
