@@ -13,14 +13,8 @@ from tqdm import tqdm
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.assembly import build_model
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation import metrics
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
-from backlash_ros.core.simulation.metrics import (
-    control_error_rms,
-    delayed_reference,
-    delayed_tracking_error_rms,
-    gap_crossings_per_reversal,
-    total_variation,
-)
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli
 from backlash_ros.tools.cli import NOTHING, BrokenOffError, number
@@ -131,15 +125,18 @@ def _measure(contender: Contender, scenario: Parameters, samples: int) -> Result
     window = max(round(COMPARISON_WINDOW_S / run.sample_period), 1)
     error = penalty = tracking = None
     if contender.follows:
-        tracking = moving_rms(run.column('y') - delayed_reference(run, delay), window)
+        tracking = moving_rms(run.column('y') - metrics.delayed_reference(run, delay), window)
         gapless = run_loop(build_closed_loop(p.replaced({
             **GAPLESS, **_fixed(p.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
         })), samples)
-        error, best = (delayed_tracking_error_rms(each, delay, since) for each in (run, gapless))
+        error, best = (
+            metrics.delayed_tracking_error_rms(each, delay, since) for each in (run, gapless)
+        )
         penalty = None if error is None or best is None else error - best
     return Result(contender, (
-        control_error_rms(run), error, penalty, total_variation(run.column('v')[t >= since]),
-        gap_crossings_per_reversal(run, since),
+        metrics.control_error_rms(run), error, penalty,
+        metrics.total_variation(run.column('v')[t >= since]),
+        metrics.gap_crossings_per_reversal(run, since),
     ), ErrorCurves(contender.name, t, moving_rms(control_error(run), window), tracking))
 
 

@@ -19,7 +19,7 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters, check_names, check_value
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Parameter, Value
-from backlash_ros.core.parameters.parameter_set import entry_of, split
+from backlash_ros.core.parameters.parameter_set import entry_of
 from backlash_ros.core.parameters.table import (
     BRINGUP,
     BY_NAME,
@@ -264,10 +264,7 @@ def _flat(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str
 def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
     """A section of a file; raises InputError for its name, ParameterError for what it holds."""
     axis, node = _address(name)
-    shared, own = split(values, joints)
-    check_names(shared, joints)
-    for joint, changes in own.items():
-        check_names([f'{joint}.{key}' for key in changes if key not in BY_NAME], joints)
+    Parameters({JOINTS: joints, **values})  # checks all names and values
     checked = {}
     for key, value in values.items():
         entry = entry_of(key)

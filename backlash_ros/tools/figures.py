@@ -18,13 +18,8 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.simulation.run_record import RunRecord
-from backlash_ros.tools.runs.figure_data import (
-    ErrorCurves,
-    FollowedReference,
-    LawTrace,
-    Part,
-    estimated_loop,
-)
+from backlash_ros.tools.runs import figure_data
+from backlash_ros.tools.runs.figure_data import Part
 from backlash_ros.topics import BACKLASH
 
 Array = NDArray[np.float64]
@@ -249,7 +244,7 @@ def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part])
     return figure
 
 
-def draw_laws(traces: Sequence[LawTrace], start: Part) -> Figure:
+def draw_laws(traces: Sequence[figure_data.LawTrace], start: Part) -> Figure:
     """Control errors of the laws, as Figure 5 of the paper: each alone, then their size."""
     colours = {'moving_horizon': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
     rows, sizes = {}, []
@@ -285,7 +280,7 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     figure = new_figure(6.0)
     axes = figure.subplots()
     t, v, truth = run.column('t')[end.rows], run.column('v'), run.has_truth
-    u = run.column('u') if truth else estimated_loop(run)
+    u = run.column('u') if truth else figure_data.estimated_loop(run)
     span = np.array(limits([v[end.rows]], margin=0.15))
     for name, side in (('c_r', 'right'), ('c_l', 'left')):
         m, c = run.column('m')[-1], run.column(name)[-1]
@@ -306,7 +301,7 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     return figure
 
 
-def draw_output(run: RunRecord, end: Part, reference: FollowedReference) -> Figure:
+def draw_output(run: RunRecord, end: Part, reference: figure_data.FollowedReference) -> Figure:
     """Reference and output: on one scale where y follows, else each on its own."""
     t, y, y_m = run.column('t'), run.column('y'), reference.values
     late = f', {reference.delay:.4g} s late' if reference.delay else ''
@@ -374,7 +369,7 @@ def draw_sweep(
     return figure
 
 
-def draw_comparison(loops: Sequence[ErrorCurves], window_s: float) -> Figure:
+def draw_comparison(loops: Sequence[figure_data.ErrorCurves], window_s: float) -> Figure:
     """Size of the control error (Figure 5 of the paper, extended) and of the tracking error.
 
     window_s: over which the RMS was taken [s].

@@ -16,29 +16,13 @@ from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
-from backlash_ros.tools import figures
-from backlash_ros.tools.cli import (
-    NOTHING,
-    InputError,
-    add_out_option,
-    add_span_options,
-    number,
-    run_tool,
-    span_of,
-)
+from backlash_ros.tools import cli, figures
+from backlash_ros.tools.cli import NOTHING, number
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
-from backlash_ros.tools.runs import figure_data
-from backlash_ros.tools.runs.files import (
-    CONFIG_FILE,
-    SUMMARY_FILE,
-    Run,
-    result_directory,
-    write_run,
-    write_summary,
-)
+from backlash_ros.tools.runs import figure_data, files
 from backlash_ros.tools.runs.summary import ESTIMATE_HEADER, estimate_cells, summarise
 from backlash_ros.topics import BACKLASH
 
@@ -46,7 +30,7 @@ REPORT_PAGE = 'report.html'
 HTML_SYMBOLS = {'m': 'm', 'c_r': 'c<sub>r</sub>', 'c_l': 'c<sub>l</sub>'}
 
 
-def write_report(run: Run, out: Path) -> dict[str, Any]:
+def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     """Write report, figures, samples.csv and summary.json of a run to out; return the summary.
 
     Prints on stderr what the user has to know about the source. Raises InputError for a run without
@@ -55,12 +39,12 @@ def write_report(run: Run, out: Path) -> dict[str, Any]:
     for note in run.notes:
         print(f'report: warning: {note}', file=sys.stderr)
     summary = summarise(run.record, run.parameters, run.latency_s)
-    write_run(run.record, out)
-    write_summary(summary, out / SUMMARY_FILE)
+    files.write_run(run.record, out)
+    files.write_summary(summary, out / files.SUMMARY_FILE)
     folded = None
     if run.parameters is not None:
-        write_config(run.parameters, out / CONFIG_FILE)
-        folded = ('Parameters of this run', (out / CONFIG_FILE).read_text(encoding='utf-8'))
+        write_config(run.parameters, out / files.CONFIG_FILE)
+        folded = ('Parameters of this run', (out / files.CONFIG_FILE).read_text(encoding='utf-8'))
     pictures = [
         Picture(name, heading, caption, figures.png(figure))
         for name, heading, caption, figure in _figures(run.record, run.parameters, summary)
@@ -207,8 +191,8 @@ def make_parser() -> argparse.ArgumentParser:
         '--config', type=Path, metavar='FILE',
         help='parameters of the run (default: parameters.yaml beside it)',
     )
-    add_out_option(parser)
-    add_span_options(parser)
+    cli.add_out_option(parser)
+    cli.add_span_options(parser)
     parser.add_argument('--axis', default='', metavar='NAME',
                         help='of a bag with several: the one to report (default: the first)')
     return parser
@@ -217,18 +201,20 @@ def make_parser() -> argparse.ArgumentParser:
 def _report(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
-    run, _ = read_run_or_log(options.path.resolve(), options.config, span_of(parser, options),
-                             options.axis, options.columns)
+    span = cli.span_of(parser, options)
+    run, _ = read_run_or_log(
+        options.path.resolve(), options.config, span, options.axis, options.columns
+    )
     if run.record.samples == 0:
-        raise InputError(f'{options.path}: holds no sample')
-    out = result_directory(options.out)
+        raise cli.InputError(f'{options.path}: holds no sample')
+    out = files.result_directory(options.out)
     write_report(run, out)
     print(out / REPORT_PAGE)
 
 
 def main(args: Sequence[str] | None = None) -> int:
     """Entry point of `report`."""
-    return run_tool('report', lambda: _report(args))
+    return cli.run_tool('report', lambda: _report(args))
 
 
 if __name__ == '__main__':

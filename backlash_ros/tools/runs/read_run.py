@@ -14,15 +14,9 @@ from backlash_ros.core.simulation.closed_loop import ClosedLoop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, BrokenOffError, InputError, Span
 from backlash_ros.tools.config import read_configuration
+from backlash_ros.tools.runs import files
 from backlash_ros.tools.runs.bag import read_bag
-from backlash_ros.tools.runs.files import (
-    CONFIG_FILE,
-    RECORD_FILE,
-    SAMPLES_FILE,
-    Run,
-    read_record,
-    read_samples,
-)
+from backlash_ros.tools.runs.files import CONFIG_FILE, RECORD_FILE, SAMPLES_FILE, Run
 
 BAG = 'bag'  # folder of the bag within the results
 
@@ -44,16 +38,16 @@ def read_run(
         return replace(read_bag(bag, period, span, axis), parameters=parameters)
     file = path
     if path.is_dir():
-        files = [path / name for name in (RECORD_FILE, SAMPLES_FILE) if (path / name).is_file()]
-        if not files:
+        found = [path / name for name in (RECORD_FILE, SAMPLES_FILE) if (path / name).is_file()]
+        if not found:
             raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
-        file = files[0]
+        file = found[0]
     if file.suffix not in ('.npz', '.csv'):
         raise InputError(
             f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of results, '
             f'{RECORD_FILE} or {SAMPLES_FILE}'
         )
-    record = read_record(file) if file.suffix == '.npz' else read_samples(file, period)
+    record = files.read_record(file) if file.suffix == '.npz' else files.read_samples(file, period)
     return Run(record if span == WHOLE_SPAN else _cut(record, span), parameters)
 
 
