@@ -14,7 +14,6 @@ from backlash_ros.core.parameters.errors import ParameterError
 
 VERSION = 1  # of the file format
 LAW, FIXED = 'estimator.law', 'fixed'
-WITHOUT_DEVIATIONS = ('lms', 'printed', 'gradient')
 # What a saved estimate depends on; a file for anything else is refused.
 KEY = (
     LAW,
@@ -86,7 +85,7 @@ def load_estimate(p: Parameters) -> Estimate | None:
         )
     law = p.estimator.law
     if isinstance(key, dict) and LAW not in key and law != FIXED:
-        if law in WITHOUT_DEVIATIONS or not estimate.learned:
+        if law in ('lms', 'printed', 'gradient') or not estimate.learned:
             raise ParameterError(
                 'estimates.file', name, 'does not say by which law it was learned',
                 'delete it or set estimates.load: false',

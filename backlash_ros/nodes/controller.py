@@ -49,7 +49,6 @@ from backlash_ros.nodes.runtime.process import emit, run
 # Share of a period for which the controller sleeps after the command: on a busy processor the
 # driver, woken by the command, would have to wait for it otherwise.
 POST_COMMAND_SLEEP = 0.05
-PUT_OFF = 5  # samples for which a controller that is behind may leave the search for the gap alone
 
 
 class ControllerNode(ManagedNode):
@@ -319,13 +318,15 @@ class ControllerNode(ManagedNode):
         Where the next output is waiting already, there is no time for what may be put off.
         received_ns: when the output came that was answered.
         """
+        # samples for which a controller that is behind may leave the search for the gap alone
+        put_off = 5
         period = self.settings.sample_period
         if 0 < received_ns < time.time_ns() - period * 1e9:
             self._behind += 1
         else:
             self._behind = 0
             time.sleep(POST_COMMAND_SLEEP * period)
-        if self._behind % PUT_OFF == 0:
+        if self._behind % put_off == 0:
             self._turn = (self._turn + 1) % len(loops.loops)
             loops.loops[self._turn].core.refine(REFINE_SHARE * period)
 

@@ -29,7 +29,6 @@ from backlash_ros.nodes.runtime.messages import (
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
-SERVE_PERIOD_S = 0.05  # between two looks at signals and requests
 # The loop runs so long, as the controller tells, before outputs that do not come here are given up.
 UNHEARD_S = 0.5
 
@@ -103,7 +102,7 @@ class ReferenceNode(ProcessNode):
         while not self.stopping:
             if now >= serve_at:
                 executor.spin_once(timeout_sec=0.0)
-                serve_at = now + SERVE_PERIOD_S
+                serve_at = now + 0.05  # between two looks at signals and requests
                 if diagnostics is not None and not pace.waits:
                     diagnostics.close()
                     diagnostics = None

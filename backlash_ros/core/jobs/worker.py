@@ -27,7 +27,6 @@ from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure, Re
 
 NICENESS = 5  # beyond that of the loop
 LENGTH = Struct('<Q')  # of an answer, in bytes, before it
-READ_BYTES = 65536  # at once, at most
 # Wait before a worker is replaced [s] that died at a job or before its first, as the one before it
 # did: the first, and the longest, by doubling.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 10.0
@@ -99,7 +98,7 @@ class WorkerExecutor(Executor):
             return
         try:
             self._write_to(process.stdin.fileno())
-            received = os.read(process.stdout.fileno(), READ_BYTES)
+            received = os.read(process.stdout.fileno(), 65536)  # at once, at most
         except BlockingIOError:  # nothing has come
             return
         except BrokenPipeError:

@@ -20,7 +20,6 @@ KEEPS_TIME_AFTER = 20
 # Samples in a row that all came later than expected, after which the least lateness among them is
 # the new phase of the sender, which has paused: at its start, and when its period is known.
 PHASE_AT_START, PHASE_SAMPLES = 6, 20
-STRANGERS = 5
 
 
 class Output(NamedTuple):
@@ -162,7 +161,7 @@ class SampleCounter:
     def _stranger(self, stamp_ns: int, sequence: int, missing: int = 0) -> Arrival:
         """Another sender, or a clock that was set back: believed after so many messages."""
         self._strange += 1
-        return NO_SAMPLE if self._strange < STRANGERS \
+        return NO_SAMPLE if self._strange < 5 \
             else self._restarted(stamp_ns, sequence, missing)
 
     def _restarted(self, stamp_ns: int, sequence: int, missing: int) -> Arrival:

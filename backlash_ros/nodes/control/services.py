@@ -14,8 +14,6 @@ from std_srvs.srv import SetBool, Trigger
 from backlash_ros.core.estimates_file import worth_saving
 from backlash_ros.core.loop.control_loop import ControlLoop
 
-UNCONFIGURED = 'the controller is unconfigured: configure it first'
-
 
 def offer_services(
     node: Node, loops_of: Callable[[], Sequence[ControlLoop]],
@@ -26,6 +24,7 @@ def offer_services(
     loops_of: the loops, none while there are none. save_estimates: begins to save what is worth
     it; each result says why it failed, empty if it did not. files: where to, empty for nowhere.
     """
+    unconfigured = 'the controller is unconfigured: configure it first'
 
     def offer(
         kind: type[SetBool] | type[Trigger], name: str,
@@ -37,7 +36,7 @@ def offer_services(
             for loop in loops:
                 act(loop, wanted)
             response.success = bool(loops)
-            response.message = done[wanted] if loops else UNCONFIGURED
+            response.message = done[wanted] if loops else unconfigured
             node.get_logger().info(response.message)
             return response
 
@@ -45,7 +44,7 @@ def offer_services(
 
     async def save(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not loops_of():
-            response.message = UNCONFIGURED
+            response.message = unconfigured
         elif not files():
             response.message = 'estimates.file is empty, so there is nowhere to save: start with ' \
                 '-p estimates.file:=PATH, or set it while unconfigured'

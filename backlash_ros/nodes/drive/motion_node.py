@@ -28,7 +28,6 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.options import BAD_INPUT, FAILED
 
 LOOK_S = 0.1  # between two looks at the graph
-SETTLE_S = 1.0  # after which everybody should have found everybody
 # What a motion is: limits, sample period [s], duration [s], v at its begin.
 MakeMotion = Callable[[Range, float, float, float], Drive]
 
@@ -106,6 +105,7 @@ class MotionNode(ProcessNode):
 
     def _follow(self, executor: PromptExecutor) -> None:
         """Listen for the duration, and drive."""
+        settle_s = 1.0  # after which everybody should have found everybody
         self._hear(topics.APPLIED_CONTROL, self.heard.applied.append)
         if self.options.drive:
             control = self.names[topics.CONTROL]
@@ -117,7 +117,7 @@ class MotionNode(ProcessNode):
             self._hear(topics.CONTROL, self.heard.controls.append)
         self._hear(topics.PLANT_OUTPUT, self._on_output)
         begin = looked = time.monotonic()
-        end = begin + self.options.duration + (SETTLE_S if self.options.drive else 0.0)
+        end = begin + self.options.duration + (settle_s if self.options.drive else 0.0)
         p = self.settings
         patience = max(p.timeout.plant_output, 10.0 * p.sample_period)
         outputs, newest = 0, inf  # y heard so far, and when that was seen
@@ -129,7 +129,7 @@ class MotionNode(ProcessNode):
             if now > looked + LOOK_S:
                 looked = now
                 self.look()
-                if self.options.drive and now > begin + SETTLE_S:
+                if self.options.drive and now > begin + settle_s:
                     if self._presence.others():
                         self._rivals = self._rivals or 'a controller of this machine'
                     self._driving = self._control.get_subscription_count() > 0

@@ -18,7 +18,6 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 
-LOOK_NS = 100_000_000  # services and events may wait so long
 WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
@@ -69,7 +68,7 @@ class PromptExecutor(SingleThreadedExecutor):
 
     The executor of rclpy makes a new wait set of every service, timer and event for each single
     message, which takes longer than to answer it. This one keeps a wait set of its own for what is
-    urgent, calls timers when they are due, and every LOOK_NS leaves the rest to rclpy.
+    urgent, calls timers when they are due, and every tenth of a second leaves the rest to rclpy.
     """
 
     def __init__(self, node: Node) -> None:
@@ -130,6 +129,7 @@ class PromptExecutor(SingleThreadedExecutor):
 
     def look_if_due(self, ahead_ns: int = 0) -> None:
         """Serve what is not urgent, if it is due within so long."""
+        look_ns = 100_000_000  # services and events may wait so long
         now = time.monotonic_ns()
         if now + ahead_ns < self._look_at_ns:
             return
@@ -143,9 +143,9 @@ class PromptExecutor(SingleThreadedExecutor):
                 continue
             timer.callback()
         if now + ahead_ns >= self._rclpy_at_ns:
-            self._rclpy_at_ns = now + (0 if self._serve_rest() else LOOK_NS)
+            self._rclpy_at_ns = now + (0 if self._serve_rest() else look_ns)
         due = [timer.time_until_next_call() for timer in self._node.timers]
-        wait_ns = min((ns for ns in due if ns is not None), default=LOOK_NS)
+        wait_ns = min((ns for ns in due if ns is not None), default=look_ns)
         self._look_at_ns = min(now + max(wait_ns, 0), self._rclpy_at_ns)
 
     def _prepare(self) -> None:

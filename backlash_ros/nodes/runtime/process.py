@@ -38,7 +38,6 @@ from backlash_ros.nodes.runtime.parameters import ParameterNode, complaints, dec
 from backlash_ros.options import BAD_INPUT, DONE, FAILED, OptionParser
 
 ENABLED = os.environ.get('BACKLASH_ROS_EVENTS') == '1'
-GOODBYE_S = 0.4  # for the middleware to leave the network; a signal ends a node in a second
 
 
 def emit(event: str, **content: object) -> None:
@@ -160,6 +159,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
 
     That of the node, or 2 for bad input, told in one line on stderr. Any other exception passes.
     """
+    goodbye_s = 0.4  # for the middleware to leave the network; a signal ends a node in a second
     arguments = sys.argv[1:] if args is None else args
     # A signal becomes a callback of the executor: so no callback is torn apart by an exception, and
     # ROS still works when the node says good-bye. The handlers of rclpy would raise
@@ -198,7 +198,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
         finally:
             node.finish()
             code = node.exit_code or code
-            with exit_at_the_latest(GOODBYE_S, code):
+            with exit_at_the_latest(goodbye_s, code):
                 executor.shutdown()
                 Node.destroy_node(node)
                 rclpy.try_shutdown()

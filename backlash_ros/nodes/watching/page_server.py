@@ -14,7 +14,6 @@ from aiohttp import web
 from aiohttp.typedefs import Handler
 
 HOST = '127.0.0.1'
-MOST_READERS = 16  # pages that are open at once
 Curves = dict[str, list[float | None]]
 
 
@@ -142,8 +141,9 @@ class PageServer:
         )
 
     async def _events(self, request: web.Request) -> web.StreamResponse:
-        if self._readers >= MOST_READERS:
-            raise web.HTTPServiceUnavailable(text=f'{MOST_READERS} pages are open already\n')
+        most_readers = 16  # pages that are open at once
+        if self._readers >= most_readers:
+            raise web.HTTPServiceUnavailable(text=f'{most_readers} pages are open already\n')
         response = web.StreamResponse(
             headers={'Content-Type': 'text/event-stream', 'Cache-Control': 'no-store'}
         )

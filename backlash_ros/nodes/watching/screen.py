@@ -15,7 +15,6 @@ from backlash_ros.topics import BACKLASH
 
 # Sure, within the band, beyond it.
 BAR, ASCII_BAR = '█▒·', '#=.'
-PANEL_LINES = 10  # lines of a controller without events, its frame included
 
 
 def bar(value: float, half_width: float, scale: float, width: int, blocks: str = BAR) -> str:
@@ -52,17 +51,18 @@ def screen(
 
     notice: in place of the keys. now_s: on the steady clock. width, height: of the terminal.
     """
+    panel_lines = 10  # lines of a controller without events, its frame included
     keys = 'f freeze/learn  c compensate  r reset  s save  q quit'
     several = len(states) > 1
     below = wrap(notice or ('Tab next  ' if several else '') + keys, width)
     room = height - len(below)
-    every = len(states) * PANEL_LINES <= room
+    every = len(states) * panel_lines <= room
     long = room // max(len(states), 1) if every else room - (len(states) - 1)
     parts: list[Panel | Text] = []
     for i, state in enumerate(states):
         if every or i == selected:
             chosen = several and i == selected
-            parts.append(_panel(state, now_s, width, long - PANEL_LINES, chosen, blocks))
+            parts.append(_panel(state, now_s, width, long - panel_lines, chosen, blocks))
         else:
             parts.append(_cropped(plain_line(state, now_s)[:width]))
     parts += [_cropped(line, style='bold' if notice else 'dim') for line in below]
