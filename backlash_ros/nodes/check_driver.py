@@ -7,7 +7,6 @@ import csv
 import sys
 import tempfile
 from collections.abc import Sequence
-from math import inf
 from pathlib import Path
 
 import yaml
@@ -17,9 +16,9 @@ from backlash_ros.core.driver_check.findings import WRONG, Finding, timing_of
 from backlash_ros.core.driver_check.gentle_drive import GentleDrive
 from backlash_ros.core.driver_check.motion import record_of
 from backlash_ros.core.driver_check.verdict import all_fit, judge, table
-from backlash_ros.nodes.drive.motion_node import MotionNode
+from backlash_ros.nodes.drive.motion_node import MotionNode, add_motion_options
 from backlash_ros.nodes.runtime.process import ros_arguments, run
-from backlash_ros.options import DONE, FAILED, OptionParser, positive
+from backlash_ros.options import DONE, FAILED, OptionParser
 from backlash_ros.shipped import find_config
 
 CHECK_DRIVER = 'check_driver'
@@ -72,23 +71,10 @@ def parse_options(plain: Sequence[str]) -> argparse.Namespace:
     )
     parser.add_argument('--config', metavar='FILE', help='ROS 2 parameter file of the controller, '
                         'or the name of a shipped one')
-    parser.add_argument('--duration', type=positive, default=10.0, metavar='SECONDS',
-                        help='how long to listen (default: 10)')
-    parser.add_argument('--wait', type=positive, default=10.0, metavar='SECONDS',
-                        help='how long to wait for a driver (default: 10)')
-    parser.add_argument('--drive', action='store_true',
-                        help='move v, to and fro within control.min, control.max and '
-                             'control.rate_max, to rest at the end')
-    parser.add_argument('--amplitude', type=positive, metavar='V',
-                        help='drive: keep v within ±V as well')
-    parser.add_argument('--rate', type=positive, metavar='V_PER_S',
-                        help='drive: keep v slower than this as well')
-    parser.add_argument('--rest', type=positive, default=30.0, metavar='SECONDS',
-                        help='drive: longest way to rest at the end, after which v is held '
-                             '(default: 30); a signal on that way holds v at once')
-    parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),
-                        metavar=('LOW', 'HIGH'), help='drive: stop when y leaves this range')
+    parser.add_argument('--drive', action='store_true', help='move v, to and fro within '
+                        'control.min, control.max and control.rate_max, to rest at the end')
     parser.add_argument('--save', type=Path, metavar='FILE', help='write t,v,y as CSV')
+    add_motion_options(parser)
     options = parser.parse_args(plain)
     for name in ('amplitude', 'rate'):
         if getattr(options, name) is not None and not options.drive:

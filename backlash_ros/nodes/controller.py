@@ -238,7 +238,7 @@ class ControllerNode(ManagedNode):
         deadline, cut_short = told + longest_s, ''
         while loops.send_next():
             if not cut_short:
-                if self.urged.is_set():
+                if self.urged:
                     cut_short = 'SIGTERM came before it reached zero'
                 elif time.monotonic() + step_s > deadline:
                     cut_short = f'it did not reach zero within timeout.ramp={longest_s:g} s'
@@ -247,7 +247,7 @@ class ControllerNode(ManagedNode):
                         if loop.v != loop.core.limits.zero:
                             self.log.warning(f'v={loop.v:.6g} is held: {cut_short}')
                     continue
-            time.sleep(step_s) if cut_short else self.urged.wait(step_s)
+            time.sleep(step_s)
             if time.monotonic() > told + DIAGNOSTICS_PERIOD_S:
                 told = time.monotonic()
                 self._diagnose()  # so that who stands down does not take this node for gone

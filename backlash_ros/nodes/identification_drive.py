@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
-from math import inf
 from pathlib import Path
 
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros import topics
 from backlash_ros.core.driver_check.gentle_drive import IdentificationDrive
-from backlash_ros.nodes.drive.motion_node import MotionNode
+from backlash_ros.nodes.drive.motion_node import MotionNode, add_motion_options
 from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED
 
@@ -62,11 +61,7 @@ def main(args: list[str] | None = None) -> int:
     parser.set_defaults(drive=True)
     parser.add_argument('--messages', type=Path, required=True)
     parser.add_argument('--config', required=True)
-    for name in ('duration', 'wait', 'rest'):
-        parser.add_argument(f'--{name}', type=float, required=True)
-    for name in ('amplitude', 'rate'):
-        parser.add_argument(f'--{name}', type=float)
-    parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf))
+    add_motion_options(parser)
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])
     return run(
         IDENTIFY, lambda: IdentificationDriveNode(options),

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import json
 import socket
 import sys
 import time
@@ -21,8 +20,8 @@ from backlash_ros.nodes.watching.followed import ControllerState, FollowedContro
 from backlash_ros.nodes.watching.page_server import (
     HOST,
     CurvePoints,
-    History,
     PageServer,
+    as_json,
     bound_socket,
     rounded,
 )
@@ -51,16 +50,13 @@ class LiveNode(ProcessNode):
         self._socket = bound
         self._start_ns = time.time_ns()
         self._points: dict[str, CurvePoints] = {}
-        self._history = History(round(SHOWN_S / FRAME_PERIOD_S))
-        self._states = ''  # of all controllers, as JSON
 
     def work(self, executor: PromptExecutor) -> None:
         """Serve the page until a signal ends it."""
         asyncio.run(self._serve(executor))
 
     async def _serve(self, executor: PromptExecutor) -> None:
-        server = PageServer(self._socket, self._frame)
-        self._look()
+        server = PageServer(self._socket, self._head, kept=round(SHOWN_S / FRAME_PERIOD_S))
         await server.start()
         address = f'http://{HOST}:{self._socket.getsockname()[1]}'
         if ENABLED:
@@ -70,37 +66,24 @@ class LiveNode(ProcessNode):
         due_s = time.monotonic()
         try:
             while not self.stopping:
-                # Signals, and the look for further controllers; it does not wait.
-                executor.spin_once(timeout_sec=0.0)
-                self._look()
-                await server.renew()
+                executor.spin_once(timeout_sec=0.0)  # the look for further controllers
+                self._followed.take_diagnostics()
+                await server.add(as_json({
+                    name: self._points.setdefault(name, CurvePoints(self._start_ns))
+                    .take(state.watch()) for name, state in self._followed.by_name.items()
+                }))
                 due_s = max(due_s + FRAME_PERIOD_S, time.monotonic())
                 await asyncio.sleep(due_s - time.monotonic())
         finally:
             await server.stop()
 
-    def _look(self) -> None:
-        """Take in what has come since the last look."""
-        self._followed.take_diagnostics()
+    def _head(self) -> str:
         by_name, now_s = self._followed.by_name, time.monotonic()
-        self._history.add({
-            name: self._points.setdefault(name, CurvePoints(self._start_ns)).take(state.watch())
-            for name, state in by_name.items()
-        })
-        self._states = json.dumps(
-            [content_of(by_name[name], now_s) for name in sorted(by_name)],
-            separators=(',', ':'), allow_nan=False,
-        )
-
-    def _frame(self, known: int) -> tuple[str, int]:
-        """A frame for a page that has the portions before the number `known`."""
-        now = 1e-9 * (time.time_ns() - self._start_ns)
-        awaited = json.dumps(self._followed.awaited)
-        portions = ','.join(self._history.since(known))
-        return (
-            f'{{"now":{now:.3f},"shown":{SHOWN_S},"awaited":{awaited},'
-            f'"controllers":{self._states},"portions":[{portions}]}}', self._history.end
-        )
+        return as_json({
+            'now': round(1e-9 * (time.time_ns() - self._start_ns), 3), 'shown': SHOWN_S,
+            'awaited': self._followed.awaited,
+            'controllers': [content_of(by_name[name], now_s) for name in sorted(by_name)],
+        })[1:-1]
 
 
 def content_of(state: ControllerState, now_s: float) -> dict[str, object]:

@@ -9,6 +9,7 @@ import argparse
 import os
 import re
 import select
+import signal
 import sys
 import termios
 import time
@@ -28,7 +29,7 @@ from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ProcessNode, ros_arguments, run
 from backlash_ros.nodes.watching.followed import ControllerState, FollowedControllers, give_way
 from backlash_ros.nodes.watching.screen import ASCII_BAR, BAR, plain_line, screen
-from backlash_ros.options import DONE, OptionParser
+from backlash_ros.options import OptionParser
 from backlash_ros.topics import BACKLASH
 
 MONITOR = 'monitor'
@@ -37,16 +38,10 @@ ANSWER_S = 5.0  # longest wait for a service
 NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
 
 
-class Action(NamedTuple):
-    """What a key calls, and the switch of the diagnostics that it turns over, empty for none."""
-
-    service: str
-    switch: str = ''
-
-
+# By key: the service, and the switch of the diagnostics that it turns over.
 ACTIONS = {
-    'f': Action('freeze_adaptation', 'learning'), 'r': Action('reset_estimates'),
-    'c': Action('enable_compensation', 'compensating'), 's': Action('save_estimates'),
+    'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
+    'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
 }
 
 
@@ -99,23 +94,22 @@ class MonitorNode(ProcessNode):
             console=console, screen=True, auto_refresh=False, redirect_stdout=False,
             redirect_stderr=False,
         ) as live:
-            due_s = 0.0
             while not self.stopping:
-                executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
-                pressed = keys()
+                self._refresh()
+                now_s = time.monotonic()
+                notice = self._notice if now_s < self._notice_ends_s \
+                    else '' if self._states else self._followed.awaited
+                live.update(screen(
+                    self._states, self._selected, notice, now_s, console.width, console.height,
+                    blocks,
+                ), refresh=True)
+                pressed = ''
+                while not (pressed or self.stopping or time.monotonic() > now_s + SCREEN_PERIOD_S):
+                    executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
+                    pressed = keys()
                 for key in pressed:
                     self._on_key(key)
                 self._look_for_answers()
-                now_s = time.monotonic()
-                if pressed or now_s >= due_s:
-                    due_s = now_s + SCREEN_PERIOD_S
-                    self._refresh()
-                    notice = self._notice if now_s < self._notice_ends_s \
-                        else '' if self._states else self._followed.awaited
-                    live.update(screen(
-                        self._states, self._selected, notice, now_s, console.width, console.height,
-                        blocks,
-                    ), refresh=True)
 
     def _print_lines(self, executor: PromptExecutor) -> None:
         due_s = time.monotonic() + 1.0
@@ -135,38 +129,35 @@ class MonitorNode(ProcessNode):
                 name = f'{state.node}/{service}'
                 if name not in self._callers:
                     self._callers[name] = self.create_client(SetBool if switch else Trigger, name)
-            for _ in state.watch():
-                pass  # the state has it
+            state.watch()
 
     def _on_key(self, key: str) -> None:
         if key == 'q':
-            self.exit_code, self.stopping = DONE, True
+            signal.raise_signal(signal.SIGINT)
         elif key == '\t' and self._states:
             self._selected = (self._selected + 1) % len(self._states)
             self._confirmed_until_s = 0.0
-        elif key in ACTIONS and self._states:
-            self._call(key, self._states[self._selected])
-
-    def _call(self, key: str, state: ControllerState) -> None:
-        """Call the service behind a key."""
-        service, switch = ACTIONS[key]
-        if key == 'r' and time.monotonic() > self._confirmed_until_s:
+        elif key == 'r' and self._states and time.monotonic() > self._confirmed_until_s:
             self._confirmed_until_s = time.monotonic() + NOTICE_S
-            self._say(f'press r once more to reset the estimates of {state.name}')
-            return
-        self._confirmed_until_s = 0.0
+            name = self._states[self._selected].name
+            self._say(f'press r once more to reset the estimates of {name}')
+        elif key in ACTIONS and self._states:
+            self._confirmed_until_s = 0.0
+            self._call(self._states[self._selected], *ACTIONS[key])
+
+    def _call(self, state: ControllerState, service: str, switch: str) -> None:
         name = f'{state.node}/{service}'
-        if not self._callers[name].service_is_ready():
+        client = self._callers[name]
+        if not client.service_is_ready():
             self._say(f'{name} is not there')
             return
+        on = not state.is_on(switch)
         request: Any = Trigger.Request()
-        then: dict[str, str] = {}
         if switch:
-            on = not state.is_on(switch)
-            then = {switch: str(on)}
             request = SetBool.Request(data=on if service == 'enable_compensation' else not on)
         self._pending.append(Asked(
-            self._callers[name].call_async(request), time.monotonic() + ANSWER_S, state, then
+            client.call_async(request), time.monotonic() + ANSWER_S, state,
+            {switch: str(on)} if switch else {},
         ))
         self._say(f'{name} ...')
 

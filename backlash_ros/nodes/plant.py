@@ -13,18 +13,13 @@ from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import HeldControl
-from backlash_ros.core.loop.diagnosis import TROUBLE
-from backlash_ros.core.loop.finding import Finding, Level
-from backlash_ros.core.loop.loop_statistics import Lately
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import PLANT
 from backlash_ros.core.scenario import build_plant
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import (
     DEPTH,
-    DIAGNOSTICS_PERIOD_S,
     KEPT_QOS,
-    DiagnosticsPublisher,
     LabelledArrayPublisher,
     arrival_ns,
     clock_message,
@@ -96,12 +91,9 @@ class PlantNode(ProcessNode):
         self._held = HeldControl()  # times of arrival on the monotonic clock
         self._heard = self._expecting = False  # a first v; none since the newest output
         self._counts = {LATE: 0, MISSED: 0, BAD: 0}
-        self._lately = Lately()
         self._published = PlantTopics(self)
-        self._diagnostics = DiagnosticsPublisher(self, 'simulated plant')
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
         let_parameters_change(self, build_plant, self._take_up)
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         name, outputs = self.resolve_topic_name, topics.PLANT_OUTPUT
         wanted = p.wait_for_subscribers
         self.log.info(
@@ -225,29 +217,6 @@ class PlantNode(ProcessNode):
                 'samples': self._published.newest + 1, topics.PLANT_OUTPUT: self._published.outputs,
                 topics.APPLIED_CONTROL: self._plant.sample, topics.TRUTH: self._plant.sample,
             })
-
-    def _diagnose(self) -> None:
-        counts = {'samples': self._plant.sample, **self._counts}
-        self._diagnostics.publish(
-            finding_of(self._lately.gained(counts, time.monotonic())), counts
-        )
-
-
-def finding_of(lately: dict[str, int]) -> Finding:
-    """What the counts of the last few seconds say."""
-    samples = max(lately['samples'], 1)
-    if lately[BAD]:
-        return Finding(Level.WARN, BAD, (
-            f'{lately[BAD]} {topics.CONTROL} messages lately were no finite number: the old one '
-            'holds'
-        ))
-    for count, text in (
-        (MISSED, f'{topics.PLANT_OUTPUT} was left out: the machine is too slow for sample_period'),
-        (LATE, f'{topics.CONTROL} came too late or not at all: is the controller slow or gone?'),
-    ):
-        if lately[count] > TROUBLE * samples:
-            return Finding(Level.WARN, count, f'{lately[count] / samples:.2%} of {text}')
-    return Finding(Level.OK, 'running', 'running')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import signal
 import sys
 import time
@@ -11,7 +10,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +120,6 @@ class RecorderNode(ProcessNode):
         p, self.failure = self.settings, ''
         self._now_ns: int | None = 0 if p.lockstep else None  # simulated time
         self._bag: Bag | None = None
-        self._diagnostics: DiagnosticsPublisher | None = None
         self._channels: dict[str, Channel] = {}
         self._progress = Progress()
         if p.bag:
@@ -190,10 +187,18 @@ class RecorderNode(ProcessNode):
                 'the installed version of rosbags cannot be flushed: a crash of the recorder or a '
                 'power cut loses everything. Install the version that requirements/run.txt names'
             )
-        self._diagnostics = DiagnosticsPublisher(self, path, logs=False)
+        diagnostics = DiagnosticsPublisher(self, path)
+
+        def diagnose() -> None:
+            finding = Finding(Level.OK, 'recording', f'recording to {path}')
+            if self.failure:
+                finding = Finding(Level.ERROR, 'stopped', 'recording stopped, all else goes on')
+            # The log has it already.
+            diagnostics.publish(finding, {'reason': self.failure}, logs=False)
+
+        self.create_timer(DIAGNOSTICS_PERIOD_S, diagnose, clock=self.steady_clock)
         # A crash or a power cut costs half a second, with the time that a flush takes.
         self.create_timer(0.4, lambda: self._with_bag(Bag.flush), clock=self.steady_clock)
-        self.create_timer(DIAGNOSTICS_PERIOD_S, self._diagnose, clock=self.steady_clock)
         return bag
 
     def _with_bag(self, action: Callable[[Bag], None]) -> bool:
@@ -213,7 +218,6 @@ class RecorderNode(ProcessNode):
             self.exit_code = FAILED
             self.log.error(self.failure)
             emit('recording_stopped', reason=self.failure)
-            self._diagnose()
             return False
         return True
 
@@ -262,24 +266,6 @@ class RecorderNode(ProcessNode):
         if content:
             received = {topic: channel.received for topic, channel in self._channels.items()}
             emit('progress', **content, received=received)
-
-    def _diagnose(self) -> None:
-        if self._diagnostics is None:
-            return
-        if self._bag is None:
-            self._diagnostics.publish(
-                Finding(Level.ERROR, 'stopped', 'recording stopped, all else goes on: see reason'),
-                {'reason': self.failure},
-            )
-            return
-        try:
-            free = shutil.disk_usage(self._bag.path).free * 1e-6
-        except OSError:  # somebody has removed the folder
-            free = nan
-        self._diagnostics.publish(
-            Finding(Level.OK, 'recording', f'recording to {self._bag.path}'),
-            {'saved messages': self._bag.saved, 'free on the disk [MB]': free},
-        )
 
 
 def main(args: list[str] | None = None) -> int:

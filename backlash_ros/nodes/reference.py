@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
+from math import inf
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rosgraph_msgs.msg import Clock
@@ -18,7 +20,7 @@ from backlash_ros.core.parameters.table import REFERENCE_NODE
 from backlash_ros.core.reference.signal import PERIODIC
 from backlash_ros.core.scenario import build_reference
 from backlash_ros.nodes.runtime.driver_io import DriverIo
-from backlash_ros.nodes.runtime.executor import Inbox, PromptExecutor, serve_polled
+from backlash_ros.nodes.runtime.executor import PromptExecutor, serve_polled
 from backlash_ros.nodes.runtime.messages import (
     DEPTH,
     KEPT_QOS,
@@ -48,6 +50,7 @@ class ReferenceNode(ProcessNode):
         self._offset_s = 0.0  # keeps the phase where the frequency changes
         self._newest = 0  # sample that was published last
         self._started = False
+        self._loop_runs_at = inf  # since then, as the controller tells [s]
         self._io = DriverIo(self, p)
         self._output = self.create_publisher(
             Float64, topics.REFERENCE, KEPT_QOS if p.lockstep else DEPTH
@@ -97,21 +100,22 @@ class ReferenceNode(ProcessNode):
                 pace.hear(counter.index, arrival_ns(output.received_ns) * 1e-9)
 
         outputs = self._io.listen(hear, depth=1, polled=True)
-        diagnostics = Inbox(self, DiagnosticArray, topics.DIAGNOSTICS, 10) if pace.waits else None
-        loop_runs_at, serve_at = None, now
+        diagnostics = self.listen(
+            DiagnosticArray, topics.DIAGNOSTICS, self._hear_diagnostics, 10, polled=True
+        ) if pace.waits else None
+        serve_at = now
         while not self.stopping:
             if now >= serve_at:
                 executor.spin_once(timeout_sec=0.0)
                 serve_at = now + 0.05  # between two looks at signals and requests
                 if diagnostics is not None and not pace.waits:
-                    diagnostics.close()
+                    self.destroy_subscription(diagnostics)
                     diagnostics = None
                 elif diagnostics is not None:
-                    if any(self._tells_of_samples(each) for each, _ in diagnostics.take_all()):
-                        loop_runs_at = loop_runs_at or now
+                    serve_polled(diagnostics)
                     # Fast DDS may miss a process of another machine for good that starts at the
                     # same moment.
-                    if loop_runs_at is not None and now > loop_runs_at + UNHEARD_S:
+                    if now > self._loop_runs_at + UNHEARD_S:
                         pace.waits = False
                         self.log.warning(
                             f'{self._io.topics.output} is not heard here, but by the controller: '
@@ -128,13 +132,14 @@ class ReferenceNode(ProcessNode):
             time.sleep(max(min(wake_at, serve_at) - now, 0.0))
             now = time.monotonic()
 
-    def _tells_of_samples(self, message: DiagnosticArray) -> bool:
-        """Whether the controller of this loop has used any."""
+    def _hear_diagnostics(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+        """Note when the controller of this loop has used samples."""
         loop = self.settings.io.joint or self.resolve_topic_name(self._io.topics.control)
-        return any(
+        if any(
             value.key == 'samples' and value.value != '0'
             for status in message.status if status.hardware_id == loop for value in status.values
-        )
+        ):
+            self._loop_runs_at = min(self._loop_runs_at, time.monotonic())
 
     def _take_up(self, before: Parameters) -> None:
         """Use another signal from the next sample on; a sine goes on without a jump."""

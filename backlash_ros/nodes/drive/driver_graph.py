@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rclpy.node import Node
 from rclpy.qos import (
@@ -62,34 +62,31 @@ class DriverGraph:
 
     def in_the_end(self) -> Graph:
         """All that was noted, with topics that may have been meant for v."""
+        listened_to = self._topics(self._node.get_subscriptions_info_by_topic)
         wanted = self._names[topics.CONTROL]
-        listened_to = {
-            topic: types for topic, types in self._topics().items()
-            if self._others(self._node.get_subscriptions_info_by_topic(topic))
-        }
         self._graph.near_control = tuple(similar_topics(wanted, FLOAT64, listened_to))
         return self._graph
 
     def say_what_is_missing(self) -> None:
         """Say which topic is waited for, and which ones there are."""
         wanted = self._names[topics.PLANT_OUTPUT]
-        seen = {
-            topic: types for topic, types in self._topics().items()
-            if self._others(self._node.get_publishers_info_by_topic(topic))
-        }
+        seen = self._topics(self._node.get_publishers_info_by_topic)
         print(f'waiting for {wanted} ({FLOAT64})')
         near = similar_topics(wanted, FLOAT64, seen)
         for topic in near:
             print(f'  sees {topic} ({", ".join(seen[topic])}); if that is it: '
                   f'--ros-args -r {topics.PLANT_OUTPUT}:={topic}')
-        others = sorted(set(seen) - set(near))
-        print(f'  sees {"besides " if near else ""}{", ".join(others) or "no other topic"}',
-              flush=True)
+        others = ', '.join(sorted(seen.keys() - set(near))) or 'no other topic'
+        print(f'  sees {"besides " if near else ""}{others}', flush=True)
 
-    def _topics(self) -> dict[str, list[str]]:
-        """All topics with their types, but for those of ROS itself."""
-        seen = dict(self._node.get_topic_names_and_types())
-        return {topic: seen[topic] for topic in seen.keys() - {'/rosout', '/parameter_events'}}
+    def _topics(
+        self, endpoints: Callable[[str], list[TopicEndpointInfo]],
+    ) -> dict[str, list[str]]:
+        """Topics that others have such endpoints of, with their types, but for those of ROS."""
+        return {
+            topic: types for topic, types in self._node.get_topic_names_and_types()
+            if topic not in ('/rosout', '/parameter_events') and self._others(endpoints(topic))
+        }
 
     def _others(self, endpoints: Sequence[TopicEndpointInfo]) -> list[TopicEndpointInfo]:
         """Without those of this node, of the recorder and of `ros2 topic`."""

@@ -25,11 +25,29 @@ from backlash_ros.nodes.drive.driver_graph import DriverGraph
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.messages import DEPTH
 from backlash_ros.nodes.runtime.process import ProcessNode
-from backlash_ros.options import BAD_INPUT, FAILED
+from backlash_ros.options import BAD_INPUT, FAILED, positive
 
 LOOK_S = 0.1  # between two looks at the graph
 # What a motion is: limits, sample period [s], duration [s], v at its begin.
 MakeMotion = Callable[[Range, float, float, float], Drive]
+
+
+def add_motion_options(parser: argparse.ArgumentParser) -> None:
+    """Add what a MotionNode has to know besides --drive."""
+    for name, default, what in (
+        ('duration', 10.0, 'how long to listen (default: 10)'),
+        ('wait', 10.0, 'how long to wait for a driver (default: 10)'),
+        ('rest', 30.0, 'drive: longest way to rest at the end, after which v is held (default: 30);'
+         ' a signal on that way holds v at once'),
+    ):
+        parser.add_argument(f'--{name}', type=positive, default=default, metavar='SECONDS',
+                            help=what)
+    parser.add_argument('--amplitude', type=positive, metavar='V',
+                        help='drive: keep v within ±V as well')
+    parser.add_argument('--rate', type=positive, metavar='V_PER_S',
+                        help='drive: keep v slower than this as well')
+    parser.add_argument('--output-range', type=float, nargs=2, default=(-inf, inf),
+                        metavar=('LOW', 'HIGH'), help='drive: stop when y leaves this range')
 
 
 class MotionNode(ProcessNode):
@@ -182,7 +200,7 @@ class MotionNode(ProcessNode):
         return known or 0.0
 
     def _come_to_rest(self) -> None:
-        motion, before = self.motion, self.signals
+        motion, before = self.motion, len(self.signals)
         if motion is None:
             return
         deadline = time.monotonic() + self.options.rest
@@ -190,7 +208,7 @@ class MotionNode(ProcessNode):
             self._control.publish(Float64(data=motion.v))
             time.sleep(self.settings.sample_period)
             late = time.monotonic() > deadline
-            if late or self.signals > before:
+            if late or len(self.signals) > before:
                 why = f'not at rest within --rest={self.options.rest:g} s' if late \
                     else 'another signal came'
                 self.say(f'v is held at {motion.v:.6g}: {why}')

@@ -19,7 +19,7 @@ from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REMEMBERED
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.nodes.runtime.executor import Inbox
+from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import DEPTH, message_with, number_of
 from backlash_ros.nodes.runtime.process import ProcessNode
 
@@ -118,7 +118,7 @@ class DriverIo:
         self._node, self._p = node, p
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointState()  # the newest message of references
-        self._reports: Inbox | None = None
+        self._reports: Subscription | None = None
         self._reported: dict[str, deque[tuple[float, int]]] = {
             joint: deque(maxlen=REMEMBERED) for joint in p.joint_names
         }
@@ -258,20 +258,23 @@ class DriverIo:
 
     def listen_to_reports(self) -> None:
         """Keep what the driver reports to have applied until somebody asks for it."""
-        self._reports = Inbox(
-            self._node, self.topics.applied_type, self.topics.applied, REMEMBERED
+        def hear(message: Float64 | JointState, info: dict[str, Any]) -> None:
+            stamp_ns = self.stamp_ns(info)
+            for joint, v in self.values(message).items():
+                self._reported[joint].append((v, stamp_ns))
+
+        self._reports = self._node.listen(
+            self.topics.applied_type, self.topics.applied, hear, REMEMBERED, polled=True
         )
 
     @property
     def has_reports(self) -> bool:
         """Whether the driver reports what it has applied."""
-        return self._reports is not None and self._reports.publishers > 0
+        return self._reports is not None and self._reports.get_publisher_count() > 0
 
     def reports_of(self, joint: str) -> Iterator[tuple[float, int]]:
         """v and stamp [ns] of what the driver has reported of a joint since the last call."""
-        for message, info in self._reports.take_all() if self._reports is not None else ():
-            stamp_ns = self.stamp_ns(info)
-            for each, v in self.values(message).items():
-                self._reported[each].append((v, stamp_ns))
+        if self._reports is not None:
+            serve_polled(self._reports)
         while self._reported[joint]:
             yield self._reported[joint].popleft()

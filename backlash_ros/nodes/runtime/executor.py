@@ -6,13 +6,11 @@ All that looks inside of rclpy, of the version of ROS 2 Jazzy, is in this file.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ShutdownException, SingleThreadedExecutor, TimeoutException
-from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.subscription import Subscription
@@ -22,53 +20,29 @@ WITH_INFO = Subscription.CallbackType.WithMessageInfo
 
 
 class Polled(MutuallyExclusiveCallbackGroup):
-    """Of subscriptions that no executor serves: whoever wants a message takes it."""
+    """Of subscriptions that no executor serves: their messages wait until somebody looks.
+
+    To take a message costs a tenth of what it costs to be woken up by it.
+    """
 
     def can_execute(self, entity: Any) -> bool:
         return False
 
 
 def serve_polled(subscription: Subscription) -> None:
-    """Call the callback of a polled subscription, which wants infos, with all that has come."""
+    """Call the callback of a polled subscription with all that has come, oldest first."""
     take, callback = subscription.handle.take_message, subscription.callback
     while (taken := take(subscription.msg_type, subscription.raw)) is not None:
         callback(*taken)
 
 
-class Inbox:
-    """The newest messages of a topic, at most `depth`, until somebody looks.
-
-    To take a message costs a tenth of what it costs to be woken up by it.
-    """
-
-    def __init__(self, node: Node, message_type: type[Any], topic: str, depth: int) -> None:
-        self._type, self._node = message_type, node
-        untyped: Any = Polled
-        self._subscription = node.create_subscription(
-            message_type, topic, lambda _: None, depth, callback_group=untyped()
-        )
-
-    @property
-    def publishers(self) -> int:
-        """How many there are."""
-        return int(self._subscription.get_publisher_count())
-
-    def take_all(self) -> Iterator[tuple[Any, dict[str, Any]]]:
-        """Message and info (time stamps, number) of all that have arrived, oldest first."""
-        while (taken := self._subscription.handle.take_message(self._type, False)) is not None:
-            yield taken
-
-    def close(self) -> None:
-        """Take no more."""
-        self._node.destroy_subscription(self._subscription)
-
-
 class PromptExecutor(SingleThreadedExecutor):
-    """Serves the subscriptions and guard conditions of one node at once, all else after them.
+    """Serves the subscriptions of one node at once, all else after them.
 
     The executor of rclpy makes a new wait set of every service, timer and event for each single
     message, which takes longer than to answer it. This one keeps a wait set of its own for what is
-    urgent, calls timers when they are due, and every tenth of a second leaves the rest to rclpy.
+    urgent, calls timers when they are due, and five times a second leaves the rest to rclpy. It
+    wakes up as often, for signals.
     """
 
     def __init__(self, node: Node) -> None:
@@ -76,7 +50,6 @@ class PromptExecutor(SingleThreadedExecutor):
         self.add_node(node)
         self._node = node
         self._subscriptions: list[Subscription] = []  # of the wait set, and the polled ones
-        self._guards: list[GuardCondition] = []
         # Of each subscription what is needed between the arrival of a message and its callback:
         # after a pause every attribute of rclpy that is looked up there costs microseconds.
         self._served: list[tuple[Any, ...]] = []
@@ -85,8 +58,7 @@ class PromptExecutor(SingleThreadedExecutor):
 
     def can_execute(self, entity: Any) -> bool:
         """Whether rclpy is to serve it."""
-        return not isinstance(entity, (Subscription, GuardCondition, Timer)) \
-            and bool(super().can_execute(entity))
+        return not isinstance(entity, (Subscription, Timer)) and bool(super().can_execute(entity))
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop serving."""
@@ -110,26 +82,23 @@ class PromptExecutor(SingleThreadedExecutor):
         Returns whether there was any.
         """
         self._prepare()
+        if not self._served:
+            time.sleep(wait_ns * 1e-9)
+            return False
         wait_set = self._wait_set
         wait_set.clear_entities()
         for handle, *_ in self._served:
             wait_set.add_subscription(handle)
-        for guard in self._guards:
-            wait_set.add_guard_condition(guard.handle)
         wait_set.wait(wait_ns)
         ready = wait_set.get_ready_entities('subscription')
         for _, pointer, take, message_type, raw, callback, with_info in self._served:
             if pointer in ready and (taken := take(message_type, raw)) is not None:
                 callback(*taken) if with_info else callback(taken[0])
-        triggered = wait_set.get_ready_entities('guard_condition')
-        for guard in self._guards:
-            if guard.handle.pointer in triggered:
-                guard.callback()
         return bool(ready)
 
     def look_if_due(self, ahead_ns: int = 0) -> None:
         """Serve what is not urgent, if it is due within so long."""
-        look_ns = 100_000_000  # services and events may wait so long
+        look_ns = 200_000_000  # services and signals may wait so long
         now = time.monotonic_ns()
         if now + ahead_ns < self._look_at_ns:
             return
@@ -150,16 +119,16 @@ class PromptExecutor(SingleThreadedExecutor):
 
     def _prepare(self) -> None:
         """Make a wait set for what the node has now."""
-        subscriptions, guards = list(self._node.subscriptions), list(self._node.guards)
-        if subscriptions == self._subscriptions and guards == self._guards:
+        subscriptions = list(self._node.subscriptions)
+        if subscriptions == self._subscriptions and self._wait_set is not None:
             return
-        self._subscriptions, self._guards = subscriptions, guards
+        self._subscriptions = subscriptions
         self._served = [(
             each.handle, each.handle.pointer, each.handle.take_message, each.msg_type, each.raw,
             each.callback, each._callback_type == WITH_INFO,
         ) for each in subscriptions if not isinstance(each.callback_group, Polled)]
         self._wait_set = rclpy_implementation.WaitSet(
-            len(self._served), len(guards), 0, 0, 0, 0, self._node.context.handle
+            len(self._served), 0, 0, 0, 0, 0, self._node.context.handle
         )
 
     def _serve_rest(self) -> bool:

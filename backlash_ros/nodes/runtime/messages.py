@@ -75,12 +75,11 @@ class LabelledArrayPublisher:
 class DiagnosticsPublisher:
     """Publishes the state of one node to /diagnostics, and its changes to the log.
 
-    hardware_id: what the node has to do with. logs: False for a node that says itself what has
-    changed. part: what of the node it is about, empty for all of it.
+    hardware_id: what the node has to do with. part: what of the node it is about, empty for all.
     """
 
-    def __init__(self, node: Node, hardware_id: str, logs: bool = True, part: str = '') -> None:
-        self._node, self._logs, self._part = node, logs, part
+    def __init__(self, node: Node, hardware_id: str, part: str = '') -> None:
+        self._node, self._part = node, part
         self._publisher = node.create_publisher(
             DiagnosticArray, topics.DIAGNOSTICS, 10, event_callbacks=without_events()
         )
@@ -103,7 +102,7 @@ class DiagnosticsPublisher:
         ]
         self._message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(self._message)
-        if self._logs and logs:
+        if logs:
             self._log.take(finding, time.monotonic())
 
     def _write(self, level: Level, text: str) -> None:

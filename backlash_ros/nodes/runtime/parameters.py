@@ -203,15 +203,14 @@ def unused(sections: Sequence[str], executable: str, full_name: str) -> Iterator
     *namespace, own = full_name.strip('/').split('/')
     last = {section: section.rpartition('/')[2] for section in sections}
     meant = [section for section in sections if last[section] in (own, executable)]
-    reached = any(_reaches(section, full_name) for section in meant)
+    if any(_reaches(section, full_name) for section in meant):
+        meant = []
     for section in sections:
-        if section in meant and not reached:
-            of_another_axis = namespace and section.strip('/') != own == last[section]
-            if not of_another_axis:
-                yield section
-        elif last[section] not in NODES and '*' not in last[section] \
-                and difflib.get_close_matches(last[section], [executable], cutoff=0.8):
-            yield section  # a misspelt name rather than somebody else's node
+        of_another_axis = namespace and section.strip('/') != own == last[section]
+        misspelt = last[section] not in (own, *NODES) and '*' not in last[section] \
+            and difflib.get_close_matches(last[section], [executable], cutoff=0.8)
+        if (section in meant and not of_another_axis) or misspelt:
+            yield section
 
 
 def _reaches(section: str, full_name: str) -> bool:

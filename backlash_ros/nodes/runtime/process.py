@@ -11,7 +11,6 @@ import os
 import signal
 import struct
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from math import isfinite
@@ -20,7 +19,7 @@ from typing import Any, cast
 import rclpy
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.exceptions import InvalidHandle, NameValidationException
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import ExternalShutdownException
 from rclpy.logging import LoggingSeverity, get_logger_level, set_logger_level
 from rclpy.node import Node
@@ -71,7 +70,7 @@ class ProcessNode(ParameterNode):
     """A node that is the purpose of its process: parameters checked, then work until stopped.
 
     begun_at: from here on the node finds others and is found, on the steady clock [s]. signals:
-    how many SIGINT and SIGTERM have come. urged: set by a SIGTERM after the first one of them.
+    the SIGINT and SIGTERM that have come, noted in the middle of whatever the node does.
     """
 
     def __init__(
@@ -86,11 +85,18 @@ class ProcessNode(ParameterNode):
         self.log = Node.get_logger(self)
         self.settings = declare_parameters(self, parameters_of or executable, reconfigurable)
         self.steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.stopping = False
-        self.signals = 0
-        self.urged = threading.Event()
+        self.signals: list[int] = []
         self.exit_code = DONE
-        self.stop_request = self.create_guard_condition(self._stop)
+
+    @property
+    def stopping(self) -> bool:
+        """Whether a signal asks the node to end; the executor looks up ten times a second."""
+        return bool(self.signals)
+
+    @property
+    def urged(self) -> bool:
+        """Whether a SIGTERM has come after the first signal: SIGKILL would be the next."""
+        return signal.SIGTERM in self.signals[1:]
 
     def listen(
         self, message_type: type[Any], topic: str,
@@ -134,25 +140,6 @@ class ProcessNode(ParameterNode):
 
         timer = self.create_timer(0.01, look, clock=self.steady_clock)
 
-    def stop_at(self, signals: int) -> None:
-        """Stop when signals arrive or have arrived. signals: descriptor, a number in each byte."""
-        def wait() -> None:
-            while number := os.read(signals, 1):
-                self.signals += 1
-                if self.signals > 1 and number[0] == signal.SIGTERM:
-                    self.urged.set()
-                # The node may be ending by itself.
-                with contextlib.suppress(InvalidHandle):
-                    # An executor that is busy may overlook a single request.
-                    while not self.stopping:
-                        self.stop_request.trigger()
-                        time.sleep(0.1)
-
-        threading.Thread(target=wait, daemon=True).start()
-
-    def _stop(self) -> None:
-        self.stopping = True
-
 
 def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] | None) -> int:
     """Run a node until its work ends, by itself or by SIGINT or SIGTERM; return the exit code.
@@ -161,14 +148,11 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
     """
     goodbye_s = 0.4  # for the middleware to leave the network; a signal ends a node in a second
     arguments = sys.argv[1:] if args is None else args
-    # A signal becomes a callback of the executor: so no callback is torn apart by an exception, and
-    # ROS still works when the node says good-bye. The handlers of rclpy would raise
-    # KeyboardInterrupt anywhere and shut ROS down beneath it.
-    signals, wake_up = os.pipe()
-    os.set_blocking(wake_up, False)
-    signal.set_wakeup_fd(wake_up, warn_on_full_buffer=False)
+    signals: list[int] = []
+    # The handlers of rclpy would raise KeyboardInterrupt anywhere and shut ROS down beneath a node
+    # that still has to say good-bye.
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: None)
+        signal.signal(number, lambda number, frame: signals.append(number))
     try:
         try:
             _initialise(args)
@@ -179,7 +163,7 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
             return BAD_INPUT
         for complaint in complaints(arguments, executable, node.get_fully_qualified_name()):
             node.log.warning(complaint)
-        node.stop_at(signals)
+        node.signals = signals
         distribution = os.environ.get('ROS_DISTRO', 'jazzy')
         if distribution != 'jazzy':
             node.log.warning(
@@ -214,12 +198,10 @@ def run(executable: str, make_node: Callable[[], ProcessNode], args: list[str] |
 def exit_at_the_latest(within_s: float, code: int) -> Iterator[None]:
     """End the process with this exit code where the block takes longer than within_s [s].
 
-    Fast DDS may hang for good while it takes a participant down, if others leave at the same time
-    (DomainParticipant::set_listener spins, seen with 2.14.5: of five participants that leave
-    together in one of some 600 exits, with the profile for loopback in one of some 2,800). It does
-    so with the interpreter locked: no thread of Python and no handler of a signal would ever run.
-    All work is done by then, so a timer of the C library ends the process instead.
-    faulthandler.dump_traceback_later would end it too, but with the exit code of a failure.
+    Fast DDS 2.14 hangs for good in one of some hundreds of exits of participants that leave
+    together (DomainParticipant::set_listener spins), with the interpreter locked: no thread of
+    Python and no handler of a signal would run. All work is done by then, so a timer of the C
+    library ends the process instead.
     """
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError):  # nobody may be reading any more

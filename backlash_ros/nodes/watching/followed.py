@@ -6,16 +6,19 @@ import os
 import re
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from math import inf, isfinite, nan
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rclpy.subscription import Subscription
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
-from backlash_ros.nodes.runtime.executor import Inbox
+from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.topics import BACKLASH
@@ -30,13 +33,14 @@ class ControllerState:
 
     values: of /diagnostics, as they stand there. estimates: value and half width of its band of
     two deviations (nan where there are none). scales: the largest magnitudes that were shown.
-    events: time of day and text, the newest one last. inboxes: of messages below
-    `controller/watch`, by label.
+    events: time of day and text, the newest one last. subscriptions: polled ones, of what stands
+    below `controller/watch`. watched: what has come of these: label, time of arrival [ns], value.
     """
 
     node: str
     joint: str = ''
-    inboxes: Mapping[str, Inbox] = field(default_factory=dict)
+    subscriptions: list[Subscription] = field(default_factory=list)
+    watched: list[tuple[str, int, float]] = field(default_factory=list)
     level: int = 0
     message: str = ''
     heard_at_s: float = -inf  # on the steady clock
@@ -64,13 +68,18 @@ class ControllerState:
         for name in BACKLASH:
             self._set_estimate(name, self.number(name), 2.0 * self.number(f'std_{name}'))
 
-    def watch(self) -> Iterator[tuple[str, int, float]]:
-        """What has come: label, time of arrival [ns], value; m, c_r and c_l are taken in."""
-        for label, inbox in self.inboxes.items():
-            for message, info in inbox.take_all():
-                if label in BACKLASH:
-                    self._set_estimate(label, message.data, self.estimates[label][1])
-                yield label, info['received_timestamp'], message.data
+    def watch(self) -> list[tuple[str, int, float]]:
+        """Take in what has come since the last call, and return it."""
+        self.watched = []
+        for subscription in self.subscriptions:
+            serve_polled(subscription)
+        return self.watched
+
+    def hear_value(self, label: str, message: Float64, info: dict[str, Any]) -> None:
+        """Take in one of the values that are watched."""
+        self.watched.append((label, info['received_timestamp'], message.data))
+        if label in BACKLASH:
+            self._set_estimate(label, message.data, self.estimates[label][1])
 
     def _set_estimate(self, name: str, value: float, half_width: float) -> None:
         self.estimates[name] = (value, half_width)
@@ -127,7 +136,9 @@ class FollowedControllers:
         self._wanted = ['/' + name.strip('/') for name in wanted]
         self.by_name: dict[str, ControllerState] = {}
         # Those of all nodes of the domain: some robots have many.
-        self._diagnostics = Inbox(node, DiagnosticArray, topics.DIAGNOSTICS, depth=100)
+        self._diagnostics = node.listen(
+            DiagnosticArray, topics.DIAGNOSTICS, self._hear, qos=100, polled=True
+        )
         node.create_timer(1.0, self._look, clock=node.steady_clock)
         self._look()
 
@@ -143,10 +154,12 @@ class FollowedControllers:
 
     def take_diagnostics(self) -> None:
         """Take in what has been said of the controllers."""
-        for message, _ in self._diagnostics.take_all():
-            for status in message.status:
-                if state := self.by_name.get(f'/{status.name}'):
-                    state.hear(status, time.monotonic())
+        serve_polled(self._diagnostics)
+
+    def _hear(self, message: DiagnosticArray, info: dict[str, Any]) -> None:
+        for status in message.status:
+            if state := self.by_name.get(f'/{status.name}'):
+                state.hear(status, time.monotonic())
 
     def _look(self) -> None:
         """Whoever publishes what a controller publishes is one."""
@@ -157,10 +170,10 @@ class FollowedControllers:
             state = ControllerState(found['node'], found['joint'] or '')
             if state.name not in self.by_name:
                 folder = topic.removesuffix(BACKLASH[0])
-                state.inboxes = {
-                    label: Inbox(self._node, Float64, folder + label, self._depth)
-                    for label in self._labels
-                }
+                state.subscriptions = [self._node.listen(
+                    Float64, folder + label, partial(state.hear_value, label), self._depth,
+                    polled=True,
+                ) for label in self._labels]
                 self.by_name[state.name] = state
 
     def _is_wanted(self, name: str) -> bool:

@@ -6,7 +6,7 @@ import asyncio
 import json
 import socket
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from math import isfinite
 from pathlib import Path
 
@@ -20,6 +20,11 @@ Curves = dict[str, list[float | None]]
 def rounded(value: float) -> float | None:
     """A number for JSON, which has no nan: None."""
     return float(f'{value:.7g}') if isfinite(value) else None
+
+
+def as_json(content: object) -> str:
+    """Without spaces."""
+    return json.dumps(content, separators=(',', ':'), allow_nan=False)
 
 
 class CurvePoints:
@@ -53,27 +58,6 @@ class CurvePoints:
         return curves
 
 
-class History:
-    """The newest portions as JSON, numbered from 0; whoever is too slow misses the oldest.
-
-    portions: how many are kept.
-    """
-
-    def __init__(self, portions: int) -> None:
-        self._kept: deque[str] = deque(maxlen=portions)
-        self.end = 0  # number of the next portion
-
-    def add(self, curves: Mapping[str, Curves]) -> None:
-        """Append a portion. curves: by controller."""
-        self._kept.append(json.dumps(curves, separators=(',', ':'), allow_nan=False))
-        self.end += 1
-
-    def since(self, number: int) -> list[str]:
-        """What is kept of the portions from this number on."""
-        missed = min(self.end - number, len(self._kept))
-        return list(self._kept)[len(self._kept) - missed:]
-
-
 def bound_socket(port: int) -> socket.socket:
     """A socket that listens on this port of this machine, 0 for a free one; raises OSError."""
     bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -100,15 +84,16 @@ async def for_this_machine(request: web.Request, handler: Handler) -> web.Stream
 class PageServer:
     """Sends every reader what is new, at the pace that it takes it.
 
-    Nothing is queued for a reader: when it has taken one frame it gets the next with all that has
-    been added, as far back as the history goes.
+    Nothing is queued for a reader: when it has taken one frame it gets the next with all portions
+    that have been added, as far back as they are kept.
 
-    frame: what a reader gets that has everything before a portion, and the number of the portion
-    that it needs next.
+    head: what a frame holds besides, as members of a JSON object. kept: how many portions are.
     """
 
-    def __init__(self, bound: socket.socket, frame: Callable[[int], tuple[str, int]]) -> None:
-        self._socket, self._frame = bound, frame
+    def __init__(self, bound: socket.socket, head: Callable[[], str], kept: int) -> None:
+        self._socket, self._head = bound, head
+        self._portions: deque[str] = deque(maxlen=kept)  # each of them JSON
+        self._count = 0  # of portions so far
         self._renewed = asyncio.Condition()
         self._readers = 0
         application = web.Application(middlewares=[for_this_machine])
@@ -124,8 +109,10 @@ class PageServer:
         await self._runner.setup()
         await web.SockSite(self._runner, self._socket).start()
 
-    async def renew(self) -> None:
-        """Send every reader that waits what is new."""
+    async def add(self, portion: str) -> None:
+        """Send it to every reader that waits, and to the others when they can take it."""
+        self._portions.append(portion)
+        self._count += 1
         async with self._renewed:
             self._renewed.notify_all()
 
@@ -150,11 +137,14 @@ class PageServer:
         self._readers += 1
         try:
             await response.prepare(request)
-            known = 0
+            known = 0  # portions that the reader has
             while True:
-                text, known = self._frame(known)
+                missing = list(self._portions)[max(len(self._portions) - self._count + known, 0):]
+                known = self._count
                 # Waits here, and here alone, for a browser that is slow.
-                await response.write(f'data: {text}\n\n'.encode())
+                await response.write(
+                    f'data: {{{self._head()},"portions":[{",".join(missing)}]}}\n\n'.encode()
+                )
                 async with self._renewed:
                     await self._renewed.wait()
         except ConnectionResetError:

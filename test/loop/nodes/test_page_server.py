@@ -7,7 +7,7 @@ from math import nan
 from aiohttp import ClientSession, ClientTimeout
 from live_pages import frames
 
-from backlash_ros.nodes.watching.page_server import CurvePoints, History, PageServer, bound_socket
+from backlash_ros.nodes.watching.page_server import CurvePoints, PageServer, bound_socket
 
 LOOK_S = 0.02
 BIG = 'x' * 200_000
@@ -35,7 +35,7 @@ class ServedFrames:
         self.address = f'http://127.0.0.1:{self.socket.getsockname()[1]}'
         self.number = 0
         self.made = 0
-        self.server = PageServer(self.socket, self._frame)
+        self.server = PageServer(self.socket, self._head, kept=3)
 
     async def run(self) -> None:
         """Renew frames until cancelled."""
@@ -43,14 +43,14 @@ class ServedFrames:
         try:
             while True:
                 self.number += 1
-                await self.server.renew()
+                await self.server.add(str(self.number))
                 await asyncio.sleep(0.002)
         finally:
             await self.server.stop()
 
-    def _frame(self, known: int) -> tuple[str, int]:
+    def _head(self) -> str:
         self.made += 1
-        return f'{{"number":{self.number},"x":"{BIG}"}}', self.number
+        return f'"number":{self.number},"x":"{BIG}"'
 
 
 def test_a_reader_that_takes_nothing_holds_up_nobody_and_is_sent_no_more() -> None:
@@ -78,15 +78,24 @@ def test_a_reader_that_takes_nothing_holds_up_nobody_and_is_sent_no_more() -> No
     asyncio.run(look())
 
 
-def test_a_history_keeps_the_newest_portions_for_whoever_is_slow() -> None:
-    history = History(3)
-    assert history.since(0) == []
-    for value in range(5):
-        history.add({'/c': {'v': [float(value)]}})
-    newest = ['{"/c":{"v":[2.0]}}', '{"/c":{"v":[3.0]}}', '{"/c":{"v":[4.0]}}']
-    assert history.since(0) == newest
-    assert history.since(4) == newest[2:]
-    assert history.since(history.end) == []
+def test_a_reader_gets_the_newest_portions_and_each_of_them_once() -> None:
+    async def look() -> None:
+        served = ServedFrames()
+        await served.server.start()
+        try:
+            for portion in range(5):
+                await served.server.add(str(portion))
+            async with ClientSession(timeout=DEADLINE) as session, session.get(
+                f'{served.address}/events', read_bufsize=2 ** 20
+            ) as response:
+                got = frames(response)
+                assert (await anext(got))['portions'] == [2, 3, 4]
+                await served.server.add('5')
+                assert (await anext(got))['portions'] == [5]
+        finally:
+            await served.server.stop()
+
+    asyncio.run(look())
 
 
 def test_v_and_the_u_after_it_make_a_point_whatever_is_missing() -> None:

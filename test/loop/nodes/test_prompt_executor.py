@@ -1,6 +1,5 @@
 """The executor of the nodes: messages at once, and nothing else forgotten over them."""
 
-import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,7 +13,7 @@ from ros_processes import wait_until
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from backlash_ros.nodes.runtime.executor import Inbox, PromptExecutor
+from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor, serve_polled
 from backlash_ros.tools.bringup.environment import free_domain
 
 
@@ -70,8 +69,16 @@ def test_every_message_is_served_in_order_with_its_number_where_that_is_wanted(l
     assert numbered == [(value, first + value) for value in range(5)]
 
 
-def test_messages_of_an_inbox_wait_until_they_are_taken_and_wake_nobody(loop: Loop) -> None:
-    inbox = Inbox(loop.node, Float64, 'number', 3)
+def test_messages_of_a_polled_subscription_wait_and_wake_nobody(loop: Loop) -> None:
+    taken: list[tuple[float, int]] = []
+
+    def take(message: Float64, info: dict[str, Any]) -> None:
+        taken.append((message.data, info['publication_sequence_number']))
+
+    untyped: Any = take
+    polled = loop.node.create_subscription(
+        Float64, 'number', untyped, 3, callback_group=Polled()
+    )
     other: list[float] = []
     loop.node.create_subscription(Float64, 'other', lambda message: other.append(message.data), 10)
     publisher = loop.node.create_publisher(Float64, 'other', 10)
@@ -80,11 +87,12 @@ def test_messages_of_an_inbox_wait_until_they_are_taken_and_wake_nobody(loop: Lo
     # What is said later and heard already shows that the numbers have come.
     publisher.publish(Float64(data=1.0))
     loop.spin_until(lambda: other, 'the other message')
-    taken = list(inbox.take_all())
-    assert [message.data for message, _ in taken] == [2.0, 3.0, 4.0]
-    numbers = [info['publication_sequence_number'] for _, info in taken]
-    assert numbers == [numbers[0], numbers[0] + 1, numbers[0] + 2]
-    assert list(inbox.take_all()) == []
+    assert taken == []
+    serve_polled(polled)
+    assert [value for value, _ in taken] == [2.0, 3.0, 4.0]
+    assert [number - taken[0][1] for _, number in taken] == [0, 1, 2]
+    serve_polled(polled)
+    assert len(taken) == 3
 
 
 def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> None:
@@ -111,12 +119,3 @@ def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> No
     loop.spin_until(answered.done, 'an answer')
     assert answered.result().success
     assert ticks[-1] > ticks[0]  # the messages went on as well
-
-
-def test_a_guard_condition_of_another_thread_ends_a_long_wait(loop: Loop) -> None:
-    called: list[bool] = []
-    guard = loop.node.create_guard_condition(lambda: called.append(True))
-    loop.executor.spin_once(timeout_sec=0.0)
-    threading.Thread(target=guard.trigger).start()
-    loop.spin_until(lambda: called, 'the guard condition')
-    assert called == [True]
