@@ -15,12 +15,11 @@ from backlash_ros.core.assembly import (
     build_reference,
 )
 from backlash_ros.core.control.controller import AdaptiveController
-from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.simulated_plant import SimulatedPlant
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 
 
 @dataclass
@@ -43,7 +42,6 @@ class ClosedLoop:
         """Simulate and return every signal; on_sample(k) is called after each sample."""
         values = array('d')  # row by row: NumPy takes longer to take in a row
         lost, v = 0, 0.0
-        newest: Estimate | None = None
         for k in range(samples):
             t = k * self.sample_period
             y = self.plant.measure()
@@ -53,17 +51,10 @@ class ClosedLoop:
             else:
                 step = self.controller.step(y, self.reference(t), lost)
                 self.controller.refine()
-                estimator = self.controller.estimator
                 lost, v = 0, step.v
-                truth = self.plant.backlash
-                u = self.plant.step(v)
-                e = step.estimate
-                if e is not newest:  # which most samples leave as it was
-                    newest, status = e, float(e.status)
-                    stated = e.m, e.c_r, e.c_l, e.f, *stated_deviations(e)
-                values.extend((
-                    t, step.y_m, y, step.u_d, v, u, *stated, estimator.u_hat,
-                    estimator.innovation, status, truth.m, truth.c_r, truth.c_l,
+                u, truth = self.plant.step(v), self.plant.backlash
+                values.extend(row_of(
+                    t, y, v, u, step, self.controller.estimator, (truth.m, truth.c_r, truth.c_l)
                 ))
             if on_sample is not None:
                 on_sample(k)

@@ -19,7 +19,7 @@ from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.loop.command_history import ReportTrust, report_use
 from backlash_ros.core.loop.learned_model import learned_model_of
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 
 Array = NDArray[np.float64]
 
@@ -80,11 +80,7 @@ def replay(
             applied = list(reports[k])
         step = controller.step(y, y_m, missing, applied, commands=commands)
         controller.refine()
-        estimator, e = controller.estimator, step.estimate
-        rows[k, :len(COLUMNS)] = (
-            t[k], y_m, y, step.u_d, v, np.nan, e.m, e.c_r, e.c_l, e.f, *stated_deviations(e),
-            estimator.u_hat, estimator.innovation, e.status, np.nan, np.nan, np.nan,
-        )
+        rows[k] = row_of(t[k], y, v, np.nan, step, controller.estimator)
         v_before, v_made = v, step.v
         if on_sample is not None:
             on_sample(k)

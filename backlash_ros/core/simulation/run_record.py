@@ -8,8 +8,10 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimates_file import was_given
+from backlash_ros.core.law import Law
 from backlash_ros.core.loop.learned_model import LearnedModel
 
 COLUMNS = (
@@ -25,6 +27,18 @@ def stated_deviations(e: Estimate) -> tuple[float, float, float]:
     Those of constants that are taken as given are nan: nobody has learned how wrong they are.
     """
     return (nan, nan, nan) if was_given(e) else (e.std_m, e.std_c_r, e.std_c_l)
+
+
+def row_of(
+    t: float, y: float, v: float, u: float, step: ControlStep, law: Law,
+    truth: tuple[float, float, float] = (nan, nan, nan),
+) -> tuple[float, ...]:
+    """The row of a sample; v: that was sent, u and truth: nan where nobody knows them."""
+    e = step.estimate
+    return (
+        t, step.y_m, y, step.u_d, v, u, e.m, e.c_r, e.c_l, e.f, *stated_deviations(e), law.u_hat,
+        law.innovation, e.status, *truth,
+    )
 
 
 @dataclass(frozen=True)
