@@ -190,7 +190,7 @@ def _still(problem: Problem, fit: Fit) -> float:
         [[fit.m, fit.theta[1], 2.0 * float(np.ptp(problem.v))], fit.theta[3:]]
     ))
     y = problem.y[problem.known]
-    columns = problem.jacobian(flat, problem.output(flat))[problem.known]
+    columns = problem.jacobian(flat)[problem.known]
     order = columns.shape[1] - 4 - problem.family.count
     chosen = columns[:, [*range(order), order + 2]]  # of X and o
     rest = y - chosen @ np.linalg.lstsq(chosen, y, rcond=1e-12)[0]
@@ -227,7 +227,7 @@ def _learned(
     xi = fit.theta[3:]
     if not family.count:
         return nominal
-    cov = fit.cov[3:, 3:] * fit.inflation + 1e-16 * np.eye(family.count)
+    cov = fit.cov_xi + 1e-16 * np.eye(family.count)
     if 0.5 * float(xi @ np.linalg.solve(cov, xi)) <= LIKELIER:
         return nominal
     return _with_sign(family.model_at(fit.xi), sign)

@@ -8,7 +8,7 @@ Society 44 (1948) 50-57).
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,41 +19,37 @@ from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
-LEAST_KAPPA, LEAST_Z = 0.15, 8.0  # from which on a load coasts
 
+def coasts(problem: Problem, fit: Fit, known: Array | None = None) -> bool:
+    """Whether the load runs on within the gap: that of the fit, or the one known before.
 
-class Coasting(NamedTuple):
-    """The coefficient, and over its standard deviation as if residuals were white."""
-
-    kappa: float
-    z: float
-
-    @property
-    def found(self) -> bool:
-        """Whether the load coasts."""
-        return self.kappa > LEAST_KAPPA and self.z > LEAST_Z
-
-
-def coasting(problem: Problem, fit: Fit) -> Coasting:
-    """The score test for a fit of this problem."""
+    known: m, c_r, c_l (3,). The fit of a load that coasts may have next to no gap.
+    """
+    if known is not None:
+        m, c_r, c_l = known.tolist()
+        theta = np.concatenate([[m, m * c_r, c_r - c_l], fit.theta[3:]])
+        there = replace(fit, theta=theta, p0=float(problem.v[0]) + 0.5 * (c_r - c_l), x=fit.x * 0.0)
+        there = replace(there, x=problem.state(there))
+        rms = float(np.sqrt(np.nanmean(problem.residual(there) ** 2)))
+        if coasts(problem, replace(there, rms=rms)):
+            return True
     p, _ = problem.input(fit)
     b, a = problem.family.at(fit.xi)
-    column = lfilter(b, a, fit.m * run_on(problem.v, p, fit.gap))
-    known = problem.known
+    column = lfilter(b, a, fit.m * _run_on(problem.v, p, fit.gap))
+    seen = problem.known
     y = problem.output(fit)
-    others = problem.jacobian(fit, y)[known]
-    others = others / np.maximum(np.abs(others).max(axis=0), 1e-300)
-    q = np.linalg.qr(others)[0]
-    s = column[known] - q @ (q.T @ column[known])
-    r = (problem.y - y)[known]
+    others = problem.jacobian(fit)[seen]
+    q = np.linalg.qr(others / np.maximum(np.abs(others).max(axis=0), 1e-300))[0]
+    s = column[seen] - q @ (q.T @ column[seen])
     squares = float(s @ s)
     if squares <= 1e-12 * float(column @ column):
-        return Coasting(0.0, 0.0)
-    kappa = float(s @ r) / squares
-    return Coasting(kappa, kappa * squares**0.5 / max(fit.noise, fit.rms))
+        return False
+    kappa = float(s @ (problem.y - y)[seen]) / squares
+    # Over its standard deviation as if residuals were white: they are far from that.
+    return kappa > 0.15 and kappa * squares**0.5 / max(fit.noise, fit.rms) > 8.0
 
 
-def run_on(v: Array, p: Array, gap: float) -> Array:
+def _run_on(v: Array, p: Array, gap: float) -> Array:
     """How far a load that nothing brakes is from p (N,): 0 while a side is engaged."""
     out = [0.0]
     away = speed = 0.0

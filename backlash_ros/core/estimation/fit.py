@@ -14,8 +14,8 @@ say is rows (R, d) on theta = (m, o, g, xi).
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import replace
-from math import isfinite, log, sqrt
+from dataclasses import dataclass, field, replace
+from math import inf, isfinite, log, sqrt
 from types import ModuleType
 
 import numpy as np
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, play, reversals
 from backlash_ros.core.estimation.posterior import Fit, Prior, Start
-from backlash_ros.core.estimation.reading import independence, likelihood, step_of
+from backlash_ros.core.estimation.reading import Likelihood, independence, likelihood, step_of
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
@@ -34,14 +34,24 @@ LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
 KNOTS, KNOT_SAMPLES = 36, 8  # of a walk over a record at most, and samples between them at least
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 FAR_STEPS = 4  # the first of them, over which G is no further off than configured
-REMEMBERED_FITS = 3  # whose p, u and y are not computed again
 # --- guards
 LEAST_MOVE = 0.02  # deviations of the gap that a step may still move it by at the end
-LEAST_GAIN = 1.0  # log-likelihood that a step may still gain at the end
 SHORTEST_STEP = 0.05  # share of a Gauss-Newton step that is tried
 LONGEST_STEP = 2.0  # prior deviations by which G moves at once
 TIGHT = 1e6  # weight of a beginning that is known
 VAGUE = 100.0  # prior deviation of the state before a record, over the largest reading
+
+
+@dataclass
+class _Evaluated:
+    """What a record is by the values of a fit: p, u and y (N,), and what was asked of them."""
+
+    fit: Fit
+    p: Array
+    u: Array
+    y: Array
+    weights: Array | None = None
+    likelihoods: dict[tuple[float, float], Likelihood] = field(default_factory=dict)
 
 
 class Problem:
@@ -54,7 +64,7 @@ class Problem:
 
     def __init__(
         self, family: PlantFamily, v: Array, y: Array, noise_std: float,
-        older: Prior | None = None, start: Start | None = None, most_scale: float = np.inf,
+        older: Prior | None = None, start: Start | None = None, most_scale: float = inf,
         walk_std: float = 0.0,
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
@@ -62,7 +72,7 @@ class Problem:
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
         self.step_of_readings = step_of(y)
-        self._newest: list[tuple[Fit, tuple[Array, Array, Array]]] = []
+        self._newest: list[_Evaluated] = []  # of which nothing is computed again
         self._walk_by(walk_std)
 
     def walking(self, walk_std: float) -> Problem:
@@ -72,43 +82,53 @@ class Problem:
         return other
 
     def _walk_by(self, walk_std: float) -> None:
-        count = len(self.v)
-        self._hats = _hats(count) if walk_std else np.zeros((0, count))
-        self._knot_std = walk_std * sqrt(count / max(len(self._hats), 1))
-        self.walk_std = walk_std
+        self._hats, self.walk_std = _hats(len(self.v) if walk_std else 0), walk_std
+
+    @property
+    def _knot_std(self) -> float:
+        return self.walk_std * sqrt(len(self.v) / max(len(self._hats), 1))
 
     # --- the model -----------------------------------------------------------------------------
 
     def input(self, f: Fit) -> tuple[Array, Array]:
         """p and u = m p - o + d over the record, both (N,)."""
-        return self._evaluated(f)[:2]
+        evaluated = self._evaluated(f)
+        return evaluated.p, evaluated.u
 
     def output(self, f: Fit) -> Array:
         """y that is expected (N,)."""
-        return self._evaluated(f)[2]
+        return self._evaluated(f).y
 
-    def _evaluated(self, f: Fit) -> tuple[Array, Array, Array]:
-        """p, u and y at f; those of the newest values of the unknowns are remembered."""
-        for other, evaluated in self._newest:
-            if (f.x is other.x and f.theta is other.theta and f.knots is other.knots
-                    and f.p0 == other.p0):
-                return evaluated
+    def _evaluated(self, f: Fit) -> _Evaluated:
+        for one in self._newest:
+            if (f.x is one.fit.x and f.theta is one.fit.theta and f.knots is one.fit.knots
+                    and f.p0 == one.fit.p0):
+                return one
         p = play(self.v, max(f.gap, 0.0), f.p0)
         u = f.m * p - f.theta[1]
         if len(f.knots):
             u += walk(f.knots, len(self.v))
         b, a = self.family.at(f.xi)
-        evaluated = p, u, filtered(b, a, u, f.x)
-        self._newest = [(f, evaluated), *self._newest[:REMEMBERED_FITS - 1]]
-        return evaluated
+        one = _Evaluated(f, p, u, filtered(b, a, u, f.x))
+        self._newest = [one, *self._newest[:2]]
+        return one
 
     def residual(self, f: Fit) -> Array:
         """y minus what is expected (N,), nan where it was lost."""
         return np.where(self.known, self.y - self.output(f), np.nan)
 
-    def weights(self, output: Array) -> Array:
-        """How much of an independent reading each one is where this output is expected (N,)."""
-        return independence(self.y, self.known, output, self.step_of_readings)
+    def weights(self, f: Fit) -> Array:
+        """How much of an independent reading each one is where y is as f has it (N,)."""
+        one = self._evaluated(f)
+        if one.weights is None:
+            one.weights = independence(self.y, self.known, one.y, self.step_of_readings)
+        return one.weights
+
+    def _likelihood(self, f: Fit) -> Likelihood:
+        one, how = self._evaluated(f), (f.noise_std, f.step)
+        if how not in one.likelihoods:
+            one.likelihoods[how] = likelihood(self.y - one.y, *how)
+        return one.likelihoods[how]
 
     def log_posterior(self, f: Fit, w: Array | None = None) -> float:
         """Of these values but for constants; -inf where it is no number.
@@ -116,16 +136,14 @@ class Problem:
         w: weights of the readings (N,), the same for all that are compared; None: those of f.
         """
         with np.errstate(all='ignore'):
-            y = self.output(f)
-            r = self.y - y
-            w = self.weights(y) if w is None else w
+            w = self.weights(f) if w is None else w
             if f.step:
-                each = likelihood(r, f.noise_std, f.step).log_density
-                value = float((each * w)[self.known].sum())
+                value = float((self._likelihood(f).log_density * w)[self.known].sum())
             else:
+                r = self.y - self.output(f)
                 squares, count = float((w * r) @ r), float(w.sum()) + 1.0
                 value = -0.5 * count * log((squares + self.nominal**2) / count) \
-                    if isfinite(squares) else -np.inf
+                    if isfinite(squares) else -inf
             if self.older is not None:
                 value -= 0.5 * float(np.sum((self.older.rows @ f.theta - self.older.values) ** 2))
             leaks, scale = self.family.leaks, max(f.scale, LEAST_SCALE)
@@ -135,7 +153,7 @@ class Problem:
             if len(self._hats):
                 moves = np.diff(self._knots_of(f), append=0.0) / self._knot_std
                 value -= 0.5 * float(moves @ moves)
-        return value if isfinite(value) else -np.inf
+        return value if isfinite(value) else -inf
 
     # --- a Gauss-Newton step --------------------------------------------------------------------
 
@@ -145,10 +163,10 @@ class Problem:
         held: whether gap and beginning stay, so that all else fits them. Raises LinAlgError where
         the numbers get too large.
         """
-        x, y = self._around(f)
-        weights = self.weights(y)
-        _, score, information = likelihood(self.y - y, f.noise_std, f.step)
-        jacobian = self.jacobian(f, y)
+        weights = self.weights(f)
+        _, score, information = self._likelihood(f)
+        jacobian = self.jacobian(f)
+        x = _padded(f.x, len(self.family.at(f.xi)[1]) - 1)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
         root = np.sqrt(information * weights)
         target = (jacobian @ beta + score / information) * root
@@ -164,19 +182,14 @@ class Problem:
             min(most_scale, self.most_scale)
         )
 
-    def _around(self, f: Fit) -> tuple[Array, Array]:
-        """State before the record, as long as that of G is now, and y (N,) at f."""
-        x = np.zeros(len(self.family.at(f.xi)[1]) - 1)
-        x[:min(len(x), len(f.x))] = f.x[:len(x)]
-        return x, self.output(f)
-
     def _knots_of(self, f: Fit) -> Array:
         return f.knots if len(f.knots) == len(self._hats) else np.zeros(len(self._hats))
 
-    def jacobian(self, f: Fit, y: Array) -> Array:
-        """Derivatives of y (N,), which is that of f, by X, knots, p0, m, o, g, xi: (N, P)."""
+    def jacobian(self, f: Fit) -> Array:
+        """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P)."""
         b, a = self.family.at(f.xi)
-        p, u = self.input(f)
+        one = self._evaluated(f)
+        p, u, y = one.p, one.u, one.y
         side = engaged(self.v, p, max(f.gap, 0.0))
         # A side that has not moved p yet leaves it where it began.
         side[:int(np.argmax(np.append(p != f.p0, True)))] = NEITHER
@@ -299,7 +312,7 @@ class Problem:
     def fitted(self, f: Fit, steps: int = STEPS) -> Fit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
         for k in range(steps):
-            weights = self.weights(self.output(f))
+            weights = self.weights(f)
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
             most = 1.0 if k < FAR_STEPS < steps else np.inf
@@ -323,7 +336,7 @@ class Problem:
             f = there
             if not f.step:
                 f = replace(f, noise_std=self._noise_of(f))
-            if moved < LEAST_MOVE * (1 if steps > FEW_STEPS else 10) and value - best < LEAST_GAIN:
+            if moved < LEAST_MOVE * (1 if steps > FEW_STEPS else 10) and value - best < 1.0:
                 break
         return f
 
@@ -337,16 +350,15 @@ class Problem:
         return replace(f, theta=theta, p0=min(max(f.p0, first), first + gap))
 
     def _noise_of(self, f: Fit) -> float:
-        y = self.output(f)
-        r = np.where(self.known, self.y - y, 0.0)
-        w = self.weights(y)
+        r = np.where(self.known, self.y - self.output(f), 0.0)
+        w = self.weights(f)
         free = max(float(w.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
         return sqrt((float((w * r) @ r) + self.nominal**2) / (free + 1.0))
 
     def comparable(self, fits: list[Fit]) -> list[Fit]:
         """The same with evidence that counts each reading alike: as the closest fit has it."""
         closest = min(fits, key=lambda f: f.rms)
-        w = self.weights(self.output(closest))
+        w = self.weights(closest)
         return [f if f is closest else self.finished(f, w) for f in fits]
 
     def finished(self, f: Fit, w: Array | None = None) -> Fit:
@@ -354,10 +366,8 @@ class Problem:
 
         w: weights of the readings (N,), None: those of f.
         """
-        p, _ = self.input(f)
-        y = self.output(f)
-        r = np.where(self.known, self.y - y, 0.0)
-        w = self.weights(y) if w is None else w
+        r = np.where(self.known, self.y - self.output(f), 0.0)
+        w = self.weights(f) if w is None else w
         log_density, score, information = likelihood(r, f.noise_std, f.step)
         known = self.known
         count = float(w.sum())
@@ -372,7 +382,7 @@ class Problem:
             f, evidence=float((log_density * w)[known].sum()) + f.volume, correlation=rho,
             inflation=1.0 - rho + count * rho, count=count,
             rms=sqrt(float(r @ r) / max(int(known.sum()), 1)),
-            turns=len(reversals(engaged(self.v, p, max(f.gap, 0.0)))),
+            turns=len(reversals(engaged(self.v, self.input(f)[0], max(f.gap, 0.0)))),
         )
 
     def with_intervals(self, f: Fit) -> Fit:
@@ -411,10 +421,13 @@ class Problem:
 
 def filtered(b: list[float], a: list[float], u: Array, x: Array) -> Array:
     """Output of the filter b / a from the state x before u (N,)."""
-    state = np.zeros(len(a) - 1)
-    length = min(len(state), len(x))
-    state[:length] = x[:length]
-    return lfilter(b, a, u, state)
+    return lfilter(b, a, u, _padded(x, len(a) - 1))
+
+
+def _padded(x: Array, length: int) -> Array:
+    out = np.zeros(length)
+    out[:min(length, len(x))] = x[:length]
+    return out
 
 
 def state_columns(a: list[float], count: int) -> Array:
@@ -435,7 +448,7 @@ def walk(knots: Array, count: int) -> Array:
 
 def _hats(count: int) -> Array:
     """How d depends on its knots, shape (W, count)."""
-    knots = min(max(count // KNOT_SAMPLES, 1), KNOTS)
+    knots = min(max(count // KNOT_SAMPLES, 1), KNOTS) if count else 0
     return np.array([walk(row, count) for row in np.eye(knots)])
 
 
@@ -447,7 +460,7 @@ def _towards(f: Fit, new: Fit, share: float = 1.0) -> Fit:
     furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
     length = share * (min(LONGEST_STEP / furthest, 1.0) if furthest else 1.0)
     order = max(len(f.x), len(new.x))
-    old, x = (np.pad(each.x, (0, order - len(each.x))) for each in (f, new))
+    old, x = _padded(f.x, order), _padded(new.x, order)
     knots = f.knots if len(f.knots) == len(new.knots) else np.zeros(len(new.knots))
     return replace(
         new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),

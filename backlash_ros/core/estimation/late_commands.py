@@ -19,7 +19,7 @@ from math import log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.explanations import Record, with_swapped
+from backlash_ros.core.estimation.explanations import Record
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import Fit
@@ -48,7 +48,7 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     chosen: set[int] = set()
     y = problem.output(fit)
     known = problem.known.astype(np.float64)
-    jacobian = problem.jacobian(fit, y) * known[:, None]
+    jacobian = problem.jacobian(fit) * known[:, None]
     size = np.maximum(np.abs(jacobian).max(axis=0), 1e-300)
     q = np.linalg.qr(jacobian / size)[0]
     residual = (problem.y - y) * known
@@ -96,4 +96,4 @@ def likelier(problem: Problem, fit: Fit, record: Record, since: int, back: froze
              ) -> tuple[Record, frozenset[int]]:
     """The record as it is likelier, and the numbers of all samples over which others acted."""
     found = swapped(problem, fit, record, since, back)
-    return with_swapped(record, found), back ^ found
+    return record.swapped(found), back ^ found

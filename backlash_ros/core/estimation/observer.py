@@ -1,35 +1,43 @@
-"""State of G between two solutions of the fit: an observer with a constant gain.
+"""Between two fits: u from the play operator, the state of G from an observer with a constant gain.
 
-In the observer form, whose first state is y, a step costs a few products:
-
+    p(k) = min(max(p(k-1), v), v + gap),   u = m (p - c_r)
     x_i(k+1) = x_{i+1}(k) - a_i x_1(k) + b_i u(k) + k_i (y(k) - x_1(k))
 
-The gain is that of the stationary Kalman filter for white noise on u of the size at which the
-innovations are as large as they are (R. K. Mehra, On the identification of variances and adaptive
-Kalman filtering, IEEE Trans. Automatic Control 15 (1970) 175-184).
+In this observer form, whose first state is y, a step costs a few products. The gain is that of the
+stationary Kalman filter for white noise on u of the size at which the innovations are as large as
+they are (R. K. Mehra, On the identification of variances and adaptive Kalman filtering, IEEE Trans.
+Automatic Control 15 (1970) 175-184).
 """
 
 from __future__ import annotations
 
-from math import sqrt
+from collections import deque
+from math import isnan, nan, sqrt
 from operator import mul
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimate import Estimate
+from backlash_ros.core.estimation.explanations import Record
+from backlash_ros.core.estimation.fit import walk
+from backlash_ros.core.estimation.play import play
+from backlash_ros.core.estimation.posterior import Fit
+from backlash_ros.core.estimation.settings import GATE, OUTLIERS
+from backlash_ros.core.law import Interval
+from backlash_ros.core.laws.fixed import FixedBacklash
+from backlash_ros.core.plant.backlash import clamp
 from backlash_ros.core.plant.riccati import lyapunov, riccati
-from backlash_ros.core.plant.state_model import StateModel
+from backlash_ros.core.plant.state_model import StateModel, powers
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
 # Noise on u, as its stationary share of y in units of the noise of y, that gains are made for.
-RATIO_STEP = 10.0  # ratio of neighbours
-RATIOS = tuple(RATIO_STEP**exponent for exponent in range(-4, 5))
-INNOVATIONS = 100  # samples over which innovations are averaged
-NOISIER = 1.15  # ratio of their deviation to the expected one that chance explains
-# --- guards
+RATIOS = tuple(10.0**exponent for exponent in range(-4, 5))
 REGULAR = 1e-9  # noise on every state beside that on u: keeps the Riccati equation regular
+REMEMBERED = 1500  # samples from which the state of a G is found, at most
 
 
 class Gain(NamedTuple):
@@ -43,6 +51,9 @@ class Gain(NamedTuple):
     innovation: float
     cov: Array
     quiet: float
+
+
+Gains = dict[float, Gain | None]
 
 
 def gain_of(model: StateModel, ratio: float) -> Gain | None:
@@ -59,9 +70,7 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
         column = p[:, 0] * model.c / variance
         # Error of the prediction with this gain: P = (A - A k c) P (A - A k c)' + A k k' A' + Q.
         after = model.a @ column
-        quiet = lyapunov(
-            model.a - np.outer(after, c), np.outer(after, after) + noise * RATIO_STEP**-2
-        )
+        quiet = lyapunov(model.a - np.outer(after, c), np.outer(after, after) + noise * 10.0**-2)
     except np.linalg.LinAlgError:
         return None
     return Gain(
@@ -69,9 +78,6 @@ def gain_of(model: StateModel, ratio: float) -> Gain | None:
         p - np.outer(column, column) * variance,
         sqrt(float(model.c * quiet[0, 0] * model.c) + 1.0),
     )
-
-
-Gains = dict[float, Gain | None]
 
 
 def gains_of(model: StateModel) -> Gains:
@@ -90,12 +96,10 @@ class Observer:
         self, model: StateModel, noise_std: float, before: Observer | None = None,
         gains: Gains | None = None,
     ) -> None:
-        self.model = model
+        self.model, self.noise_std = model, noise_std
         self._gains: Gains = {} if gains is None else gains
-        self._transfer = model.transfer_function
-        self._n = model.order
-        self._x = [0.0] * self._n
-        self.noise_std = noise_std
+        self._advance = model.transfer_function.advance
+        self._x = [0.0] * model.order
         self._level = len(RATIOS) // 2
         if before is not None:
             self._level = min(before._level, self._level)
@@ -128,23 +132,23 @@ class Observer:
 
     def predict(self, u: float) -> float:
         """Take u over one period and return the y that is expected after it."""
-        return self._transfer.advance(self._x, u)
+        return self._advance(self._x, u)
 
     def correct(self, innovation: float) -> None:
         """Take in y minus what was expected."""
         x = self._x
         for i, k in enumerate(self._gain.gain):
             x[i] += k * innovation
-        self.variance += (innovation * innovation - self.variance) / INNOVATIONS
+        self.variance += (innovation * innovation - self.variance) / 100.0
 
     def settle(self, noise_std: float) -> None:
         """Go a step towards the smallest gain that explains the innovations.
 
         noise_std: of y from now on.
         """
-        self.noise_std = noise_std
-        gain = self._gain
-        if self.variance > (NOISIER * gain.innovation * noise_std) ** 2:
+        self.noise_std, gain = noise_std, self._gain
+        # What chance explains: 15 % of the deviation.
+        if self.variance > (1.15 * gain.innovation * noise_std) ** 2:
             self._level = min(self._level + 1, len(RATIOS) - 1)
         elif self.variance < gain.innovation * gain.quiet * noise_std**2:
             self._level = max(self._level - 1, 0)
@@ -155,8 +159,156 @@ class Observer:
         ratio = RATIOS[level]
         if ratio not in self._gains:
             self._gains[ratio] = gain_of(self.model, ratio)
-        gain = self._gains[ratio]
-        if gain is None:
-            n = self._n
-            return Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
-        return gain
+        n = self.model.order
+        return self._gains[ratio] or Gain((0.0,) * n, 1.0, np.eye(n), 1.0)
+
+
+class Place(NamedTuple):
+    """Where play and G stand after the samples of a fit.
+
+    p: of the play operator. u, y: over the newest samples (M,). x: state of `model` in the observer
+    form.
+    """
+
+    p: float
+    u: Array
+    y: Array
+    x: Array
+    model: TransferFunction
+
+
+def place_of(fit: Fit, record: Record, model: TransferFunction, memory: int) -> Place:
+    """Where this fit of the record says that play and this G stand after it.
+
+    memory: of G [samples].
+    """
+    p = play(record.v, max(fit.gap, 0.0), fit.p0)
+    count = min(len(p), 4 * memory, REMEMBERED)
+    u, y = fit.m * p - fit.theta[1], record.y[-count:]
+    if len(fit.knots):
+        u += walk(fit.knots, len(u))
+    u = u[-count:]
+    return Place(float(p[-1]), u, y, state_after(model, u, y), model)
+
+
+def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
+    """The state of this G (observer form) that explains y (M,), nan where lost, after u (M,)."""
+    a, b, c = model.state_space()
+    responses = powers(a, b, len(u))
+    forced = np.convolve(responses @ c, u)[:len(u)]
+    columns = powers(a.T, a.T @ c, len(u))  # of the state before them
+    known = np.isfinite(y)
+    before = np.linalg.lstsq(columns[known], (y - forced)[known], rcond=1e-12)[0]
+    return np.asarray(np.linalg.matrix_power(a, len(u)) @ before + u[::-1] @ responses)
+
+
+class Following:
+    """Follows play operator and state of G from sample to sample.
+
+    model: G of the structure that asks for the state. gains: of its observer, None where they are
+    made one by one. before: gives the state until a backlash is known. observer: that does so from
+    then on. u: before the newest y; nan before a backlash is known. innovation: of the newest y.
+    since_motion: samples since p, or v before a backlash is known, moved. outliers: readings that
+    did not move the state. beyond: as many in a row, and those after them.
+    """
+
+    def __init__(self, model: StateModel, before: FixedBacklash | None) -> None:
+        self.model, self.before = model, before
+        self.gains: Gains | None = None
+        self.observer: Observer | None = None
+        self.u = self.innovation = nan
+        self.since_motion = self.outliers = self.beyond = 0
+        self._p = nan  # v until a backlash is known
+        self._u: deque[float] = deque(maxlen=REMEMBERED)  # over the newest samples
+        self._y: deque[float] = deque(maxlen=REMEMBERED)
+
+    @property
+    def surprised(self) -> bool:
+        """Whether the newest reading made so many beyond the gate in a row that they are none."""
+        return self.beyond == OUTLIERS and not isnan(self.innovation)
+
+    @property
+    def x_hat(self) -> list[float]:
+        """State of G in the coordinates of `model`, n values."""
+        if self.observer is not None:
+            return self.observer.state
+        state: list[float] = [0.0] * self.model.order if self.before is None \
+            else self.before.x_hat.tolist()
+        return state
+
+    def change_model(self, model: StateModel, gains: Gains | None) -> None:
+        """Give the state of this G from now on; gains: of its observer."""
+        self.model, self.gains = model, gains
+        if self.before is not None:
+            self.before = self.before.with_model(model)
+        if self.observer is not None:
+            self.observer = Observer(model, self.observer.noise_std, self.observer, gains)
+            y = np.array(self._y)
+            if np.isfinite(y).sum() > model.order:
+                x = state_after(model.transfer_function, np.array(self._u), y)
+                self.observer.place(x, True)
+
+    def is_of(self, place: Place) -> bool:
+        """Whether a place is one of this G."""
+        own, of = self.model.transfer_function, place.model
+        return of is own or (
+            np.array_equal(of.denominator, own.denominator)
+            and np.array_equal(of.numerator, own.numerator)
+        )
+
+    def step(self, y: float | None, interval: Interval, estimate: Estimate) -> None:
+        """Take in y(k), None if it was lost, and v of the interval before it."""
+        observer = self.observer
+        p = v = interval.v
+        if observer is not None:
+            p = clamp(self._p, v, v + estimate.c_r - estimate.c_l)
+        self.since_motion = self.since_motion + 1 if p == self._p else 0
+        self._p = p
+        if observer is None:
+            if self.before is not None:
+                self.before.update(y, interval)
+            return
+        self.u = u = estimate.m * (p - estimate.c_r)
+        self._u.append(u)
+        self._y.append(nan if y is None else y)
+        expected = observer.predict(u)
+        if y is None:
+            self.innovation = nan
+            return
+        self.innovation = innovation = y - expected
+        inside = innovation * innovation <= GATE**2 * observer.variance
+        self.beyond = 0 if inside else self.beyond + 1
+        if inside or self.beyond >= OUTLIERS:  # so many in a row are none
+            observer.correct(innovation)
+        else:
+            self.outliers += 1
+
+    def go_on_from(
+        self, place: Place, newer: Array, estimate: Estimate, noise_std: float, known: bool,
+    ) -> None:
+        """Let play and observer stand where a fit says that they stood, and step to now.
+
+        newer: v and y of the samples since then (2, M). known: whether the fit explains all of its
+        samples, so that it knows the state better than the newest of them do.
+        """
+        if self.observer is None:
+            self.observer = Observer(self.model, noise_std, None, self.gains)
+        else:
+            self.observer.settle(noise_std)
+        observer, gap, p = self.observer, estimate.c_r - estimate.c_l, place.p
+        for remembered, values in ((self._u, place.u), (self._y, place.y)):
+            remembered.clear()
+            remembered.extend(values.tolist())
+        follows = self.is_of(place)
+        if follows:
+            observer.place(place.x, known)
+        for v, y in newer.T.tolist():
+            p = clamp(p, v, v + gap)
+            u = estimate.m * (p - estimate.c_r)
+            self._u.append(u)
+            self._y.append(y)
+            if follows:
+                innovation = y - observer.predict(u)
+                if innovation * innovation <= GATE**2 * observer.variance:  # not where y was lost
+                    observer.correct(innovation)
+        self._p, self.u = p, estimate.m * (p - estimate.c_r)

@@ -78,6 +78,11 @@ class Fit:
         return out
 
     @property
+    def cov_xi(self) -> Array:
+        """Covariance of xi (K, K)."""
+        return self.cov[3:, 3:] * self.inflation
+
+    @property
     def crossings(self) -> Array:
         """m, c_r, c_l, shape (3,)."""
         m, o, g = self.theta[:3].tolist()

@@ -26,8 +26,7 @@ ROOMS = (
 )
 ESTIMATION = (
     'settings', 'plant_family', 'play', 'reading', 'posterior', 'fit', 'search', 'explanations',
-    'late_commands', 'coasting', 'belief', 'forgetting', 'publishing', 'learning', 'observer',
-    'following', 'estimator',
+    'late_commands', 'coasting', 'belief', 'learning', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
