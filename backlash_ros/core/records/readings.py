@@ -14,9 +14,8 @@ Flags = NDArray[np.bool_]
 
 FEWEST_CHANGES = 12  # of y, beyond all rounding, that tell a slower sensor
 NEARLY_ALL = 0.9  # share of what speaks for an explanation
-FAILED_STEPS = 6.0  # usual steps of y that a failed read is away from the rows around
 # Whole turns: degrees, radians, gradians, steps of encoders.
-TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
+WHOLE_TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
 TURN_TOLERANCE = 0.02  # relative, of the jump of an angle that begins anew
 
 
@@ -86,7 +85,7 @@ def failed(y: Array) -> tuple[Flags, float]:
         between = np.interp(np.flatnonzero(at), others, values[others])
         # From one true reading to the next, as far as a motion goes.
         usual = float(np.percentile(np.abs(np.diff(values[others])), 75.0))
-        far = np.abs(between - value) > FAILED_STEPS * max(usual, 1e-9 * float(np.ptp(values)))
+        far = np.abs(between - value) > 6.0 * max(usual, 1e-9 * float(np.ptp(values)))
         if np.mean(runs <= 2) >= NEARLY_ALL and np.mean(far) >= 0.5:
             rows[known[at]] = True
             return rows, value
@@ -104,7 +103,7 @@ def unwrapped(values: Array) -> tuple[Array, float]:
         return values, 0.0
     steps, reach = np.diff(values[known]), float(np.ptp(values[known]))
     usual = float(np.percentile(np.abs(steps), 95.0))
-    for turn in TURNS:
+    for turn in WHOLE_TURNS:
         jumps = np.abs(steps) > 0.6 * turn  # no motion from row to row
         fills = 0.9 * turn <= reach <= (1.0 + TURN_TOLERANCE) * turn
         if not fills or not jumps.any() or usual > 0.1 * turn:

@@ -12,12 +12,12 @@ from backlash_ros.core.records.samples import TO_STD
 
 Array = NDArray[np.float64]
 
-FEWEST_READINGS = 20  # that tell anything
+FEWEST_VALUES = 20  # that tell anything
 
 
 def _residuals(t: Array, s: Array, reach: int) -> Array:
     """Error of predicting each value from `reach` neighbours on each side, per unit of noise."""
-    if len(s) < FEWEST_READINGS:
+    if len(s) < FEWEST_VALUES:
         return np.empty(0)
     t = t - t[0]
     sides = [*range(-reach, 0), *range(1, reach + 1)]
@@ -56,7 +56,7 @@ def rougher(t: Array, other: Array, signal: Array) -> float:
     """
     known = np.isfinite(signal)
     squares = [_residuals(each[known], signal[known], 1)**2 for each in (t, other)]
-    if min(map(len, squares)) < FEWEST_READINGS:
+    if min(map(len, squares)) < FEWEST_VALUES:
         return 0.0
     # Steps are as rough over any instants.
     sizes = [float(np.mean(np.minimum(each, np.percentile(each, 98.0)))) for each in squares]

@@ -11,10 +11,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 CURE = 'choose another column for t with --columns, or leave t out and give --period S'
-WINDOW = 11  # rows: up to five stamps in a row may be wrong
-BAD_STAMP = 50.0  # periods that a stamp is away from its neighbours
 EPOCH = ((1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms'))  # stamps of this century
-UNITS_S = (1e-3, 1e-6, 1e-9, 60.0)  # that stamps may count, beside seconds
 
 
 def in_seconds(
@@ -42,12 +39,13 @@ def in_seconds(
     step = typical_step(known if known[-1] > known[0] else known[::-1])
     whole = bool((known == np.round(known)).all())
     if period is None:
-        if whole and step >= 1.0:
+        # Seconds since 1970, of dates as well, speak for themselves.
+        if whole and step >= 1.0 and np.median(np.abs(known)) < 1e9:
             said.append(
                 't, in whole numbers, is taken as seconds; if it counts something else: --period'
             )
         return t
-    for scale in UNITS_S:
+    for scale in (1e-3, 1e-6, 1e-9, 60.0):
         if abs(step * scale / period - 1.0) < 0.3:
             said.append(f't counts {seconds(scale)}')
             return t * scale
@@ -112,7 +110,7 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
 
 
 def _far_off(t: Array) -> NDArray[np.bool_]:
-    """Which stamps (N,) lie far from those of the rows around."""
-    size = min(WINDOW, len(t) - 1 + len(t) % 2)
+    """Which stamps (N,) lie far from those of the rows around; up to five in a row may."""
+    size = min(11, len(t) - 1 + len(t) % 2)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(t, size // 2, 'reflect'), size)
-    return np.asarray(np.abs(t - np.median(around, axis=1)) > BAD_STAMP * typical_step(t))
+    return np.asarray(np.abs(t - np.median(around, axis=1)) > 50.0 * typical_step(t))

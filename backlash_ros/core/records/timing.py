@@ -25,13 +25,10 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-EVEN = 0.02  # of a period that stamps of even samples may be off
+NEARLY_EVEN = 0.02  # of a period that stamps of even samples may be off
 BREAK = 3.0  # periods from row to row that are a gap
-MOST_LOST = 0.3  # share of the numbers without a row, beyond which rows cannot be numbered
-DECIDED = 0.05  # log of the roughness that tells late stamps from true ones
 HIDDEN, LEAST = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
-MOST_SHARED = 0.02  # share of the readings that may fall onto one instant
-LONGEST = 1_000_000  # samples of a grid
+MOST_SAMPLES = 1_000_000  # of a grid
 LONG_BREAK = 100.0  # periods of a gap that ends a stretch
 
 
@@ -64,7 +61,8 @@ def on_grid(rows: Rows, period: float | None = None) -> Record:
     steps = np.diff(rows.t) / guess
     found = _numbering(rows.t, steps, guess)
     used = period or found.period
-    if np.abs(found.off).max() <= EVEN * guess and abs(found.period / used - 1.0) <= EVEN:
+    if np.abs(found.off).max() <= NEARLY_EVEN * guess and \
+            abs(found.period / used - 1.0) <= NEARLY_EVEN:
         said = f'{len(rows.t)} rows, one every {seconds(used)}'
         return _numbered_grid(rows, found.numbers, used, cut + said)
     inner = steps[steps <= BREAK]
@@ -98,11 +96,11 @@ def _period(t: Array) -> float:
 def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
     """Without what lies far before and after, where the time between holds no rows; said so."""
     t, span = rows.t, rows.t[-1] / period
-    if span < min(20.0 * len(t) + LONG_BREAK, LONGEST):
+    if span < min(20.0 * len(t) + LONG_BREAK, MOST_SAMPLES):
         return rows, ''
     ends = [0, *(np.flatnonzero(np.diff(t) > LONG_BREAK * period) + 1).tolist(), len(t)]
     begin, end = max(pairwise(ends), key=lambda part: part[1] - part[0])
-    if end - begin < 2 or t[end - 1] - t[begin] >= LONGEST * period:
+    if end - begin < 2 or t[end - 1] - t[begin] >= MOST_SAMPLES * period:
         raise RecordError(
             f'spans {span:.3g} periods of {seconds(period)} with {len(t)} rows: cut out one motion '
             'with --from and --to, or give --period'
@@ -166,12 +164,11 @@ def _risen(numbers: Array) -> Numbers:
 
 def _are_late(rows: Rows, found: Numbering) -> bool:
     """Whether the samples were even and only their stamps are late."""
-    if found.numbers[-1] + 1 > (1.0 + MOST_LOST) * len(rows.t) or \
-            np.std(found.off) > found.period:
-        return False
+    if found.numbers[-1] + 1 > 1.3 * len(rows.t) or np.std(found.off) > found.period:
+        return False  # too many are missing, or too late, to be numbered
     even = found.numbers.astype(float)
     y = np.where(rows.own, rows.y, np.nan)
-    return rougher(rows.t, even, y) + rougher(rows.t, even, rows.v) > DECIDED
+    return rougher(rows.t, even, y) + rougher(rows.t, even, rows.v) > 0.05
 
 
 def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:
@@ -200,7 +197,7 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
         step = period / parts
         index, values = np.round(t / step).astype(np.int64), y
         off = index * step - t
-        shared = np.mean(np.diff(index) == 0) > MOST_SHARED if len(index) > 1 else False
+        shared = np.mean(np.diff(index) == 0) > 0.02 if len(index) > 1 else False
         # A standard deviation, but for steps: nine tenths of normal values stay within 1.64.
         moved = np.percentile(np.abs(np.gradient(y, t) * off), 90.0) / 1.64 if len(t) > 1 else 0.0
         if not shared and moved <= HIDDEN * noise:

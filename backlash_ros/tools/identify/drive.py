@@ -31,8 +31,6 @@ from backlash_ros.tools.config import write_config
 from backlash_ros.tools.identify.outcome import identifying_record
 from backlash_ros.tools.records.messages import FEWEST_MESSAGES, from_messages
 
-LOOK_S = 0.25  # between two looks at the record
-FIRST_LOOK_S = 3.0  # of motion before the first estimate
 SHARE_OF_TIME = 0.25  # of the time that estimates may take: the actuator needs the processor
 
 
@@ -136,14 +134,14 @@ def _follow(
     stop: StopRequests,
 ) -> None:
     """Show progress until the motion ends, is precise enough, or is to be stopped."""
-    next_look, said = FIRST_LOOK_S, ''
+    next_look, said = 3.0, ''  # [s] of motion before an estimate
     estimate: _Estimate | None = None
     with tqdm(
         total=options.duration, file=sys.stderr, disable=None, leave=False,
         bar_format='{desc} {percentage:3.0f} % |{bar:16}| {postfix}', desc='moving',
     ) as bar:
         while child.poll() is None and not stop.count:
-            time.sleep(LOOK_S)
+            time.sleep(0.25)
             record = messages.record()
             if record is None:
                 continue

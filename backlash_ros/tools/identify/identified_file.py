@@ -18,17 +18,13 @@ from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PLANT
 from backlash_ros.tools.config import ANY, EVERY_NODE, config_text
 
-LEAST_DEVIATION = 1e-6  # relative: a deviation of 0 would say that a constant was given
 WIDER = 3.0  # bounds of the estimates, in times of what was found
 # Parameters of the file that the user gave which do not go on: of the simulation, of one run.
 NOT_TAKEN_OVER = (
     'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
     'bag', 'lockstep', 'wait_for_subscribers', 'wait_for_publishers', 'axes',
 )
-# Of the reference, in times of what v reaches beyond the gap: usually, and at most to show the gap.
-SHARE_OF_REACH, MOST_OF_REACH = 0.4, 0.8
 USUAL_FREQUENCY = np.pi / 10.0  # [rad/sample] at which tracking.input_weight takes |G|
-PREVIEW, LONGEST_PREVIEW = 6.0, 600  # radians of that motion; samples
 
 
 def identified_parameters(
@@ -103,7 +99,7 @@ def _reference(found: Identification, details: Details) -> dict[str, Value]:
     middle = 0.0 if found.integrator else 0.5 * float(np.percentile(y, 5) + np.percentile(y, 95))
     gain = float(np.abs(response(details.fit, found.frequencies[:1]))[0])
     reach = 0.5 * (float(np.ptp(found.v)) - found.gap)
-    share = max(SHARE_OF_REACH, min(0.75 * found.gap / reach, MOST_OF_REACH))
+    share = max(0.4, min(0.75 * found.gap / reach, 0.8))
     return {
         'waveform': 'sine', 'amplitude': _short(share * gain * reach), 'bias': _short(middle),
         'frequency': _short(found.frequencies[0] / found.sample_period),
@@ -129,17 +125,19 @@ def _weights(found: Identification, details: Details) -> dict[str, Value]:
     assert isinstance(usual_preview, int)
     return {
         'tracking.input_weight': _short(usual_weight * max(gain[last] / gain[-1], 1.0)**2, 2),
-        'tracking.preview': min(max(round(PREVIEW / w[last]), usual_preview), LONGEST_PREVIEW),
+        # Nearly a period of that motion.
+        'tracking.preview': min(max(round(6.0 / w[last]), usual_preview), 600),
     }
 
 
 def as_estimate(found: Identification, parameters: Parameters) -> Estimate:
     """What a controller may begin with, as if it had learned it itself."""
-    least = LEAST_DEVIATION * max(found.gap, abs(found.c_r), abs(found.c_l))
+    # A deviation of 0 would say that a constant was given.
+    least = 1e-6 * max(found.gap, abs(found.c_r), abs(found.c_l))
     initial = parameters.estimator.initial
     return Estimate(
         found.m, initial.c_r, initial.c_l, parameters.proportional.f,
-        max(found.std['m'], LEAST_DEVIATION * found.m), max(found.std['c_r'], least),
+        max(found.std['m'], 1e-6 * found.m), max(found.std['c_r'], least),
         max(found.std['c_l'], least),
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
@@ -34,14 +35,11 @@ from backlash_ros.tools.identify.identified_file import (
     identified_parameters,
     numbers,
 )
-from backlash_ros.tools.identify.pictures import pictures
 from backlash_ros.tools.page import Picture, facts, page, table
 from backlash_ros.tools.records.columns import COMMAND, ROLES
 from backlash_ros.tools.runs.files import result_directory, write_summary, write_table
 
-YAML, JSON, PAGE, ESTIMATES = (
-    'identified.yaml', 'identified.json', 'identify.html', 'estimates.json')
-INTEGRATORS = {'auto': (False, True), 'yes': (True,), 'no': (False,)}
+YAML, JSON, PAGE = 'identified.yaml', 'identified.json', 'identify.html'
 
 
 def identifying_record(
@@ -49,7 +47,8 @@ def identifying_record(
 ) -> Generator[str, None, Identification]:
     """Identify with what the command line says; yields what is being done."""
     found = yield from identifying(record.v, record.y, record.sample_period, Options(
-        options.order, options.delay, INTEGRATORS[options.integrator], options.slope,
+        options.order, options.delay,
+        {'auto': (False, True), 'yes': (True,), 'no': (False,)}[options.integrator], options.slope,
     ))
     return found if record.commands is None else with_actuator(found, record.commands)
 
@@ -74,18 +73,22 @@ def write_outcome(
 ) -> bool:
     """Write the files, print the outcome; returns whether the backlash is known."""
     out = result_directory(options.out)
-    text = None
+    estimates, text = out.resolve() / 'estimates.json', None
     if found.usable:
-        (out / ESTIMATES).unlink(missing_ok=True)  # of a record before, if any
+        estimates.unlink(missing_ok=True)  # of a record before, if any
         try:
-            parameters = identified_parameters(found, given, out.resolve() / ESTIMATES)
+            parameters = identified_parameters(found, given, estimates)
             text = commented_yaml(parameters, found, record.source, options.axis)
             write_atomically(out / YAML, text)
-            save_estimate(out / ESTIMATES, as_estimate(found, parameters), parameters)
+            save_estimate(estimates, as_estimate(found, parameters), parameters)
         except ParameterError as error:
             found = replace(found, reasons=(f'the controller does not take it: {error}',))
     write_summary({**numbers(found), 'timing': record.timing, 'notes': record.notes}, out / JSON)
     write_record(record, out / 'record.csv')
+    # A Ctrl-C waits while Matplotlib is loaded, which would take it for a part that is missing.
+    signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+    from backlash_ros.tools.identify.pictures import pictures
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT,))
     drawn = list(pictures(found))
     for picture in drawn:
         write_atomically(out / picture.name, picture.data)

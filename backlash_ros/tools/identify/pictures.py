@@ -28,8 +28,7 @@ from backlash_ros.tools.page import Picture
 
 Array = NDArray[np.float64]
 
-SURE = 2.0  # standard deviations that bands reach
-LAGS = 60  # of the autocorrelation
+BAND_STDS = 2.0  # standard deviations that bands reach
 LOOP_POINTS = 4000  # samples that the curves over v show
 
 
@@ -106,13 +105,13 @@ def draw_profile(figure: Figure, found: Identification, details: Details) -> Non
     whole, near = figure.subplots(1, 2)
     gaps, std = details.profile.gaps, found.std['gap']
     rms = np.sqrt(details.profile.squares / max(details.profile.best.rows, 1))
-    close = np.abs(gaps - found.gap) <= max(0.21 * found.gap, 2.0 * SURE * std)
+    close = np.abs(gaps - found.gap) <= max(0.21 * found.gap, 2.0 * BAND_STDS * std)
     for axes, chosen in ((whole, np.full(len(gaps), True)), (near, close)):
         axes.plot(gaps[chosen], rms[chosen], '.-', color=HUES['m'], markersize=4)
         axes.axvline(found.gap, color=HUES['c_r'], linewidth=1.0)
     whole.set_yscale('log')
-    near.axvspan(found.gap - SURE * std, found.gap + SURE * std, color=HUES['c_r'], alpha=0.2,
-                 linewidth=0)
+    near.axvspan(found.gap - BAND_STDS * std, found.gap + BAND_STDS * std, color=HUES['c_r'],
+                 alpha=0.2, linewidth=0)
     label(whole, 'Over the swing of v', 'RMS of the residual', 'gap [v]')
     label(near, f'Near {found.gap:.4g} ± {std:.2g}', '', 'gap [v]')
 
@@ -127,10 +126,10 @@ def draw_residual(figure: Figure, found: Identification, details: Details) -> No
     t = found.sample_period * np.arange(samples.first, samples.last, dtype=float)
     curve(over_time, t, residual, HUES['e'], width=0.8)
     label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME_LABEL)
-    bound = SURE / np.sqrt(np.isfinite(residual).sum())
-    r = autocorrelation(residual, LAGS)[1:]
+    bound = BAND_STDS / np.sqrt(np.isfinite(residual).sum())
+    r = autocorrelation(residual, 60)[1:]
     correlated.axhspan(-bound, bound, color='#bbbbbb', alpha=0.5, linewidth=0)
-    correlated.vlines(np.arange(1, LAGS + 1), 0.0, r, color=HUES['e'], linewidth=1.5)
+    correlated.vlines(np.arange(1, len(r) + 1), 0.0, r, color=HUES['e'], linewidth=1.5)
     correlated.set_ylim(*limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
     label(correlated, f'Autocorrelation (Ljung–Box p = {found.ljung_box:.2g})', '', 'lag [samples]')
     v = samples.delayed(samples.v, details.fit.structure.delay)
@@ -151,7 +150,7 @@ def draw_bode(figure: Figure, found: Identification, details: Details) -> None:
     rooms = figure.subplots(2, 1, sharex=True)
     w = np.geomspace(max(found.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
     value = response(details.fit, w) * np.exp(-1j * w * found.delay)
-    spread = SURE * response_std(details.fit, details.covariance, w)
+    spread = BAND_STDS * response_std(details.fit, details.covariance, w)
     f, size, phase = w / (2.0 * np.pi * found.sample_period), np.abs(value), np.degrees(
         np.unwrap(np.angle(value)))
     turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))

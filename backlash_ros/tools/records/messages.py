@@ -16,14 +16,14 @@ from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
 from backlash_ros.core.records.rows_to_record import usable
 from backlash_ros.core.records.stamps import in_order
-from backlash_ros.core.records.timing import LONGEST, numbered, rounded
+from backlash_ros.core.records.timing import MOST_SAMPLES, numbered, rounded
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs.bag import choose_namespace, read_topics
 
 Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
 
 NUMBER, NUMBERS = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
-JOINTS = 'sensor_msgs/msg/JointState'
+JOINT_STATE = 'sensor_msgs/msg/JointState'
 COMMAND_WORDS = ('command', 'cmd', 'goal', 'target', 'setpoint')
 SIMULATED_BEFORE_NS = 10**17  # stamps: the clock of a machine is far beyond
 FEWEST_MESSAGES = 3  # that are a motion
@@ -86,7 +86,7 @@ def from_messages(
     if not step > 0.0:
         raise RecordError('its stamps do not tell the sample period: give --period S')
     index = numbered(times / step)
-    if index[-1] >= LONGEST:
+    if index[-1] >= MOST_SAMPLES:
         raise RecordError(f'spans {index[-1]:.3g} sample periods of {seconds(step)}: cut it')
     if period is None:
         # All stamps together tell it better than one step does, but for how late the ends were:
@@ -153,7 +153,7 @@ def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     def is_command(topic: str) -> bool:
         return any(word in topic.lower() for word in COMMAND_WORDS)
 
-    content = read_topics(path, lambda topic: topic.message_type in (NUMBER, JOINTS) or (
+    content = read_topics(path, lambda topic: topic.message_type in (NUMBER, JOINT_STATE) or (
         topic.message_type == NUMBERS and is_command(topic.name)))
     series: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
     for topic, messages in sorted(content.messages.items()):
