@@ -166,11 +166,13 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     kinds = {cause.kind for cause in causes}
     state = next(_finding(row) for row in _states_beside(kinds, f) if row[2])
     if state.kind == 'model':
-        # What the fit has found out itself says more than what is late or missing, and a sign more
-        # than the rate of a driver that is held up.
-        explained = f.law.wrong_sign or f.law.coasts or f.unexplained
-        lesser = (*LATENESS, *(['unreported'] if explained else ()),
-                  *(['rate'] if f.law.wrong_sign else ()))
+        # What the fit has found out itself says more than what is late or missing; a wrong sign
+        # drives v into its limits besides, and comes of no clock.
+        lesser = list(LATENESS)
+        if f.law.wrong_sign or f.law.coasts or f.unexplained:
+            lesser += ['unreported']
+        if f.law.wrong_sign:
+            lesser += ['rate', 'stamps', 'clock', 'reference silent', 'limited']
         late = [cause for cause in causes if cause.kind in lesser]
         return [cause for cause in causes if cause not in late] + [state, *late]
     return [*causes, state] if state.level != OK or not causes else causes

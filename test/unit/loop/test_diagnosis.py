@@ -168,6 +168,16 @@ def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
         assert [finding.kind for finding in findings_of(figures)] == ['model', 'unreported']
 
 
+@pytest.mark.parametrize('changes', [
+    {'limited': 400}, {'age_s': 0.05}, {'late': 60}, {'lost': 66}, {'unreported': 60},
+    {'period': Period(0.00506, 1e-7, 0.005)}, {'intervals_s': (0.02, 0.02, 0.02)},
+])
+def test_a_wrong_sign_is_named_before_what_it_or_a_busy_machine_leads_to(changes):
+    found = findings_of(replace(INCONSISTENT, law=LawReport(wrong_sign=True), **changes))
+    assert found[0].kind == 'model'
+    assert len(found) == 2
+
+
 def test_a_rival_whose_name_is_not_known_yet_is_no_line_of_the_log_at_once() -> None:
     for standing_down in (False, True):
         unnamed = first(replace(WELL, rivals=(UNNAMED,), standing_down=standing_down))
