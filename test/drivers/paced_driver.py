@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.publisher import Publisher
 from ros_processes import NodeProcess, Probe, RosWorld, wait_until
@@ -34,8 +33,7 @@ def as_measured(k: int, y: float) -> list[float]:
 class PacedDriver:
     """Applies the newest v and publishes y every sample period, and the reference with it.
 
-    sent: what of y(k) leaves the driver, as many messages as it likes. heard: which of the
-    controls the driver gets. referred: whether y_m is published.
+    sent: what of y(k) leaves the driver, as many messages as it likes.
     """
 
     def __init__(self, probe: Probe, reports_applied: bool = False) -> None:
@@ -44,10 +42,7 @@ class PacedDriver:
         })
         self.probe = probe
         self.plant, self._signal = build_plant(p), build_reference(p)
-        self.rng = np.random.default_rng(7)
         self.sent: Sent = as_measured
-        self.heard: Callable[[], bool] = lambda: True
-        self.referred = True
         self.k = 0
         self.v = 0.0
         self.y: list[float] = []
@@ -56,7 +51,6 @@ class PacedDriver:
         self.estimates = probe.collect(topics.ESTIMATES, Float64MultiArray)
         self.signals = probe.collect(topics.SIGNALS, Float64MultiArray)
         self._diagnostics = probe.collect(topics.DIAGNOSTICS, DiagnosticArray)
-        self._taken = 0
         self.reference = probe.publisher(topics.REFERENCE, Float64)
         self.applied: Publisher | None = None
         if reports_applied:
@@ -137,10 +131,8 @@ class PacedDriver:
         while (left := self._start + (self.k + 1) * PERIOD_S - time.monotonic()) > 0.0:
             self.probe.spin(left)
         self.probe.spin(0.0)
-        for message in self.controls[self._taken:]:
-            if self.heard():
-                self.v = message.data
-        self._taken = len(self.controls)
+        if self.controls:
+            self.v = self.controls[-1].data
         # The plant does not wait for a test that was held up, which then has nothing to send.
         passed = (time.monotonic() - self._start) / PERIOD_S
         while self.k < int(passed):
@@ -151,8 +143,7 @@ class PacedDriver:
         self.y.append(y)
         for value in self.sent(self.k, y):
             self.output.publish(Float64(data=value))
-        if self.referred:
-            self.reference.publish(Float64(data=self._signal((self.k + 1) * PERIOD_S)))
+        self.reference.publish(Float64(data=self._signal((self.k + 1) * PERIOD_S)))
 
     def _advance(self) -> None:
         if self.applied is not None:

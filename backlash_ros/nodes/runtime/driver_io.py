@@ -37,34 +37,22 @@ class DriverTopics(NamedTuple):
     applied_type: type[Any]
 
 
-IO_STYLES = {
-    'native': DriverTopics(
-        topics.REFERENCE, Float64, topics.PLANT_OUTPUT, Float64, topics.CONTROL, Float64,
-        topics.APPLIED_CONTROL, Float64,
-    ),
-    'ros2_control': DriverTopics(
-        topics.REFERENCE, Float64, topics.JOINT_STATES, JointState, topics.JOINT_COMMANDS,
-        Float64MultiArray, topics.APPLIED_CONTROL, Float64,
-    ),
-    'joint_state_topic': DriverTopics(
-        topics.ROBOT_COMMAND, JointState, topics.ROBOT_STATES, JointState,
-        topics.JOINT_STATE_COMMANDS, JointState, topics.APPLIED_JOINT_COMMANDS, JointState,
-    ),
-}
-
-
 def driver_topics(p: Parameters) -> DriverTopics:
     """The topics and types that io.style, io.command and joints ask for."""
-    found = IO_STYLES[p.io.style]
-    if p.io.style == 'joint_state_topic':
-        if p.io.command == 'array':
-            found = found._replace(control=topics.JOINT_COMMANDS, control_type=Float64MultiArray)
-    elif p.joints:
-        found = found._replace(
-            reference_type=JointState, applied=topics.APPLIED_JOINT_COMMANDS,
-            applied_type=JointState,
+    style, to = p.io.style, topics
+    of_joints = bool(p.joints) or style == 'joint_state_topic'
+    applied = (to.APPLIED_JOINT_COMMANDS, JointState) if of_joints \
+        else (to.APPLIED_CONTROL, Float64)
+    array = to.JOINT_COMMANDS, Float64MultiArray
+    if style == 'joint_state_topic':
+        control = array if p.io.command == 'array' else (to.JOINT_STATE_COMMANDS, JointState)
+        return DriverTopics(
+            to.ROBOT_COMMAND, JointState, to.ROBOT_STATES, JointState, *control, *applied
         )
-    return found
+    reference = to.REFERENCE, JointState if of_joints else Float64
+    if style == 'ros2_control':
+        return DriverTopics(*reference, to.JOINT_STATES, JointState, *array, *applied)
+    return DriverTopics(*reference, to.PLANT_OUTPUT, Float64, to.CONTROL, Float64, *applied)
 
 
 def output_qos(p: Parameters, depth: int) -> QoSProfile:

@@ -20,19 +20,13 @@ def chosen(environment: dict[str, str]) -> str | None:
     return environment.get(VARIABLE)
 
 
-def test_profile_is_taken_where_nobody_else_is_to_be_met() -> None:
-    assert chosen({**HERE}) == str(PROFILE)
-    assert PROFILE.is_file()
-
-
-def test_named_machines_are_reached_with_the_profile_of_the_network() -> None:
-    assert chosen({**HERE, 'ROS_STATIC_PEERS': '192.168.0.2'}) == str(NETWORK_PROFILE)
-    assert NETWORK_PROFILE.is_file()
-
-
-@pytest.mark.parametrize('environment', [{}, {'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}])
-def test_other_machines_stay_within_reach(environment: dict[str, str]) -> None:
-    assert chosen(environment) is None
+@pytest.mark.parametrize(('environment', 'profile'), [
+    (HERE, PROFILE), ({**HERE, 'ROS_STATIC_PEERS': '192.168.0.2'}, NETWORK_PROFILE),
+    ({}, None), ({'ROS_AUTOMATIC_DISCOVERY_RANGE': 'SUBNET'}, None),
+])
+def test_a_profile_follows_from_who_is_to_be_met(environment, profile) -> None:
+    assert chosen({**environment}) == (profile and str(profile))
+    assert profile is None or profile.is_file()
 
 
 def test_a_profile_of_the_user_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
