@@ -112,14 +112,13 @@ def _print(found: Identification, record: Record) -> None:
         print('\n'.join(found.verdict.lines))
     if found.details is not None:
         print(format_table(('', 'found', '±'), [
-            (name, f'{value:.6g}', f'{found.std[name]:.2g}')
-            for name, value in (('gap', found.gap), ('c_r', found.c_r), ('c_l', found.c_l))
+            (name, f'{getattr(found, name):.6g}', f'{found.std[name]:.2g}')
+            for name in ('gap', 'c_r', 'c_l')
         ]))
-        print(f'G(z): {len(found.denominator) - 1} poles'
-              + (', one of them an integrator' if found.integrator else '')
-              + f', delay {found.delay}{alike(found)}'
-              + f', known to {100.0 * found.response_std.max():.2g} %; noise of y '
-              + f'{found.noise_std:.3g}')
+        integrator = ', one of them an integrator' if found.integrator else ''
+        print(f'G(z): {len(found.denominator) - 1} poles{integrator}, delay {found.delay}'
+              f'{alike(found)}, known to {100.0 * found.response_std.max():.2g} %; noise of y '
+              f'{found.noise_std:.3g}')
     if found.actuator is not None:
         actuator = found.actuator
         print(f'L(z), from control to applied_control: {actuator.lag.order} poles, gain '
@@ -157,16 +156,14 @@ def _page(
 
 
 def _numbers(found: Identification) -> str:
-    rows = [
-        (symbol, f'{value:.6g}', f'{found.std[name]:.2g}', unit)
-        for name, symbol, value, unit in (
-            ('gap', 'gap, c<sub>r</sub> − c<sub>l</sub>', found.gap, 'of v'),
-            ('c_r', 'c<sub>r</sub>', found.c_r, 'of v'),
-            ('c_l', 'c<sub>l</sub>', found.c_l, 'of v'),
-            ('m', 'm (told, or 1; deviation: of the gain of m G)', found.m, 'of u/v'),
+    return table(('', 'found', 'std. deviation', 'unit'), [
+        (symbol, f'{getattr(found, name):.6g}', f'{found.std[name]:.2g}', unit)
+        for name, symbol, unit in (
+            ('gap', 'gap, c<sub>r</sub> − c<sub>l</sub>', 'of v'),
+            ('c_r', 'c<sub>r</sub>', 'of v'), ('c_l', 'c<sub>l</sub>', 'of v'),
+            ('m', 'm (told, or 1; deviation: of the gain of m G)', 'of u/v'),
         )
-    ]
-    return table(('', 'found', 'std. deviation', 'unit'), rows)
+    ])
 
 
 def _facts(found: Identification, record: Record) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 from backlash_ros.tools.cli import InputError
 
@@ -40,16 +39,6 @@ UNITS_S = {
 }
 
 
-class Columns(NamedTuple):
-    """Names of the columns; '' for none. said: what was guessed, '' for nothing."""
-
-    t: str
-    v: str
-    y: str
-    command: str = ''
-    said: str = ''
-
-
 def parse_columns(text: str) -> dict[str, str]:
     """`t=NAME,v=NAME,y=NAME`, in any order, as a dictionary; raises ValueError."""
     parts = re.split(rf'(?:^|,)\s*({"|".join((*ROLES, COMMAND))})=', text)
@@ -61,10 +50,13 @@ def parse_columns(text: str) -> dict[str, str]:
     return given
 
 
-def choose_columns(names: Sequence[str], given: Mapping[str, str], source: object) -> Columns:
-    """The columns of a table with these names; given: by role, as the user says.
+def choose_columns(
+    names: Sequence[str], given: Mapping[str, str], source: object,
+) -> tuple[dict[str, str], str]:
+    """The columns of a table with these names by role, and what was guessed, '' for nothing.
 
-    Raises InputError that names the columns where one is missing or several may be meant.
+    given: by role, as the user says. Raises InputError that names the columns where one is missing
+    or several may be meant.
     """
     for role, name in given.items():
         if name not in names:
@@ -82,8 +74,7 @@ def choose_columns(names: Sequence[str], given: Mapping[str, str], source: objec
         found.setdefault(COMMAND, COMMAND)
     said = ', '.join(f'{role} is {found[role]!r}' for role in ROLES
                      if role not in given and found.get(role, role) != role)
-    return Columns(found.get('t', ''), found['v'], found['y'], found.get(COMMAND, ''),
-                   f'columns: {said}; --columns chooses others' if said else '')
+    return found, f'columns: {said}; --columns chooses others' if said else ''
 
 
 def columns_of(names: Sequence[str]) -> str:

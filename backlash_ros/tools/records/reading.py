@@ -13,7 +13,7 @@ from backlash_ros.core.records.rows_to_record import record_of, record_of_sample
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.config import effective_parameters
-from backlash_ros.tools.records.columns import choose_columns, unit_of
+from backlash_ros.tools.records.columns import COMMAND, choose_columns, unit_of
 from backlash_ros.tools.records.table import Table, read_table
 from backlash_ros.tools.runs.files import RECORD_FILE, SAMPLE_COLUMNS, SAMPLES_FILE, Run
 
@@ -67,15 +67,11 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
 
 
 def _from_table(table: Table, period: float | None, given: Mapping[str, str]) -> Record:
-    chosen = choose_columns(table.names, given, table.path)
-    record = record_of(
-        table.numbers(chosen.t, times=True) if chosen.t else None,
-        table.numbers(chosen.v), table.numbers(chosen.y), period,
-        unit_of(chosen.t) if chosen.t else None,
-        table.numbers(chosen.command) if chosen.command else None,
-    )
-    said = [chosen.said] if chosen.said else []
-    return replace(record, notes=(*said, *table.notes, *record.notes))
+    chosen, said = choose_columns(table.names, given, table.path)
+    signals = {role: table.numbers(name, times=role == 't') for role, name in chosen.items()}
+    record = record_of(signals.get('t'), signals['v'], signals['y'], period,
+                       unit_of(chosen.get('t', '')), signals.get(COMMAND))
+    return replace(record, notes=(*filter(None, [said]), *table.notes, *record.notes))
 
 
 def _is_table(path: Path) -> bool:

@@ -12,7 +12,7 @@ from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
 from backlash_ros.core.loop.sample_counter import Output, SampleCounter
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, stated_deviations
+from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.replay import main
 from backlash_ros.tools.runs.read_run import read_run
@@ -61,14 +61,8 @@ class LimitingDriver:
         step = loop.answer(output)
         assert step is not None
         loop.core.refine()
-        e, estimator = step.estimate, loop.core.estimator
-        row = {
-            't': 0.01 * loop.counter.index, 'y_m': step.y_m, 'y': step.y, 'u_d': step.u_d,
-            'v': step.v, 'm': e.m, 'c_r': e.c_r, 'c_l': e.c_l, 'f': e.f, 'status': e.status,
-            'u_hat': estimator.u_hat, 'innovation': estimator.innovation,
-            **dict(zip(('std_m', 'std_c_r', 'std_c_l'), stated_deviations(e), strict=True)),
-        }
-        self._rows.append(tuple(float(row.get(name, np.nan)) for name in COLUMNS))
+        self._rows.append(row_of(0.01 * loop.counter.index, step.y, step.v, np.nan, step,
+                                 loop.core.estimator))
 
     def write(self, folder: Path, run: RunRecord, without: str = '') -> Path:
         """The folder of a run with its bag; without: a topic that was not recorded."""

@@ -18,10 +18,6 @@ from backlash_ros.tools.identify.command import main
 from backlash_ros.tools.records.reading import read_record
 
 QUICK = ('--order', '1-2', '--delay', '0-1')
-FILES = {
-    'identified.yaml', 'identified.json', 'identify.html', 'estimates.json', 'record.csv',
-    'held_out.png', 'loop.png', 'gap.png', 'residual.png', 'bode.png',
-}
 
 
 def write_csv(path: Path, v: np.ndarray, y: np.ndarray) -> Path:
@@ -53,11 +49,11 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / 'out'
 
 
-def test_all_files_are_written(result: Path) -> None:
-    assert {path.name for path in result.iterdir()} == FILES
-
-
-def test_numbers_are_those_of_the_actuator(result: Path) -> None:
+def test_all_files_are_written_with_the_numbers_of_the_actuator(result: Path) -> None:
+    assert {path.name for path in result.iterdir()} == {
+        'identified.yaml', 'identified.json', 'identify.html', 'estimates.json', 'record.csv',
+        'held_out.png', 'loop.png', 'gap.png', 'residual.png', 'bode.png',
+    }
     found = json.loads((result / 'identified.json').read_text())
     assert found['usable'] is True
     assert found['reasons'] == []

@@ -69,8 +69,7 @@ def _begin(record: Record, t: Array) -> float:
 
 
 def test_steps_that_vary_from_row_to_row_are_true_instants() -> None:
-    steps = PERIOD_S * np.random.default_rng(3).choice([1.0, 1.0, 1.0, 1.4], COUNT)
-    t = np.append(0.0, np.cumsum(steps[1:]))
+    t = np.cumsum(PERIOD_S * np.random.default_rng(3).choice([1.0, 1.0, 1.0, 1.4], COUNT))
     record = log(t)
     assert off(record, t[0] + _begin(record, t)) < 2e-3
 
@@ -131,18 +130,12 @@ def test_without_a_time_rows_are_counted_with_the_period_alone(stamps: Array | N
     assert record_of(stamps, v, y, PERIOD_S).v.tolist() == v.tolist()
 
 
-def shuffled(t: Array) -> Array:
-    """A few neighbours swapped."""
-    order = np.arange(len(t))
-    for k in (100, 300, 500):
-        order[[k, k + 1]] = order[[k + 1, k]]
-    return order
-
-
 def test_rows_in_any_order_are_sorted() -> None:
-    t = even()
+    t, shuffled = even(), np.arange(COUNT)
+    for k in (100, 300, 500):
+        shuffled[[k, k + 1]] = shuffled[[k + 1, k]]
     expected = log(t, noise=0.0).y.tolist()
-    for order, said in ((np.arange(COUNT)[::-1], 'turned around'), (shuffled(t), 'sorted')):
+    for order, said in ((np.arange(COUNT)[::-1], 'turned around'), (shuffled, 'sorted')):
         record = record_of(t[order], command(t)[order], position(t)[order])
         assert record.y.tolist() == expected
         assert said in record.timing
