@@ -6,20 +6,20 @@ import importlib
 import sys
 from pathlib import Path
 
-PACKAGE = 'backlash_ros'
 DEFAULT_CONFIG = 'paper_example.yaml'
 
 
 def config_folders() -> list[Path]:
     """Folders that may hold the shipped YAML files, the best one first."""
+    package = 'backlash_ros'
     # The source tree first: beside the code that runs lies the configuration written for it.
     places = [Path(__file__).resolve().parents[1] / 'config']
     try:
         ament_index = importlib.import_module('ament_index_python.packages')
-        places.append(Path(ament_index.get_package_share_directory(PACKAGE)) / 'config')
+        places.append(Path(ament_index.get_package_share_directory(package)) / 'config')
     except (ImportError, LookupError, OSError):
         pass  # no ament index here, or the package is not in it
-    places.append(Path(sys.prefix) / 'share' / PACKAGE / 'config')
+    places.append(Path(sys.prefix) / 'share' / package / 'config')
     return places
 
 

@@ -29,7 +29,6 @@ from backlash_ros.options import LARGEST_PORT, OptionParser
 from backlash_ros.topics import BACKLASH
 
 LIVE = 'live'
-FRAME_PERIOD_S = 0.1  # between two frames of the page
 SHOWN_S = 10.0  # width of the curves
 LIVE_LABELS = (
     *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
@@ -56,7 +55,8 @@ class LiveNode(ProcessNode):
         asyncio.run(self._serve(executor))
 
     async def _serve(self, executor: PromptExecutor) -> None:
-        server = PageServer(self._socket, self._head, kept=round(SHOWN_S / FRAME_PERIOD_S))
+        frame_period_s = 0.1  # between two frames of the page
+        server = PageServer(self._socket, self._head, kept=round(SHOWN_S / frame_period_s))
         await server.start()
         address = f'http://{HOST}:{self._socket.getsockname()[1]}'
         if ENABLED:
@@ -72,7 +72,7 @@ class LiveNode(ProcessNode):
                     name: self._points.setdefault(name, CurvePoints(self._start_ns))
                     .take(state.watch()) for name, state in self._followed.by_name.items()
                 }))
-                due_s = max(due_s + FRAME_PERIOD_S, time.monotonic())
+                due_s = max(due_s + frame_period_s, time.monotonic())
                 await asyncio.sleep(due_s - time.monotonic())
         finally:
             await server.stop()

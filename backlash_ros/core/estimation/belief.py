@@ -26,8 +26,6 @@ from backlash_ros.core.estimation.posterior import Fit, Prior, Start
 
 Array = NDArray[np.float64]
 
-REPLACING = 0.05  # std of the gap over the gap, from which samples alone replace what was known
-
 
 class State(Enum):
     """How the fit stands to the newest samples; learning.py has the table of transitions."""
@@ -133,6 +131,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
     What the samples leave unexplained may be gap as well, and the lost motion of a gear differs
     from one motion to another.
     """
+    replacing = 0.05  # std of the gap over the gap, from which samples alone replace what was known
     doubt = (fit.unexplained * fit.gap) ** 2 / 2.0
     cov = fit.crossings_cov + doubt * np.diag([0.0, 1.0, 1.0])
     gap = known.crossings[1] - known.crossings[2]
@@ -144,7 +143,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
         std = sqrt(fit.gap_std**2 + 2.0 * doubt)
         # A gear that is no play leaves systematic residuals, and denies nothing.
         white = not fit.systematic and not noisier(setup, fit)
-        sure = std < REPLACING * fit.gap and white and fit.turns >= settings.HELD_REVERSALS
+        sure = std < replacing * fit.gap and white and fit.turns >= settings.HELD_REVERSALS
         if sure and belief.predicted >= belief.must_predict:
             belief = replace(belief, inherited=None)  # it was that of another plant
         return replace(belief, reason=Status.INCONSISTENT)

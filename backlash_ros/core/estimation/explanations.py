@@ -19,7 +19,6 @@ from backlash_ros.core.estimation.search import search
 Array = NDArray[np.float64]
 
 CANDIDATES, APART = 6, 0.02  # best gaps of a search that are fitted, and their relative distance
-BEGINNINGS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
 WALKS = (0.005, 0.02, 0.08)  # of u over the whole record, over m times the gap, that are compared
 FAR_BEHIND = 30.0  # log-likelihood by which a candidate, or no walk of u, is given up
 BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
@@ -166,9 +165,10 @@ def with_walk(p: Problem, f: Fit) -> Fit:
 
 def _begun_elsewhere(p: Problem, f: Fit) -> Fit:
     """The fit, or one with another beginning: y has a minimum wherever v has turned meanwhile."""
+    beginnings = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
     likeliest, value = f, p.log_posterior(f) + 1.0
     weights = p.weights(f)
-    for share in BEGINNINGS:
+    for share in beginnings:
         other = replace(f, p0=float(p.v[0]) + share * f.gap, x=np.zeros(len(f.x)))
         other = replace(other, x=p.state(other))
         of_other = p.log_posterior(other, weights)

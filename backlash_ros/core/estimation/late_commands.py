@@ -28,9 +28,6 @@ from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
-MOST = 200  # swaps of one look
-OWN_NOISE = 0.25  # of correlated residuals: what is noise of readings
-
 
 def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozenset[int],
             ) -> frozenset[int]:
@@ -39,6 +36,7 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     problem: of the record. back: of the samples over which the other one acts already, so that its
     odds are the reverse.
     """
+    own_noise = 0.25  # of correlated residuals: what is noise of readings
     open_ = np.flatnonzero(np.isfinite(record.other))
     open_ = open_[open_ >= since - record.first]
     if not len(open_) or fit.m <= 0.0:
@@ -53,12 +51,12 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     q = np.linalg.qr(jacobian / size)[0]
     residual = (problem.y - y) * known
     # Correlated residuals are for the most part made by the commands that are looked for.
-    noise = fit.noise * (OWN_NOISE if fit.systematic else 1.0)
+    noise = fit.noise * (own_noise if fit.systematic else 1.0)
     noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))
     v, other = record.v.copy(), record.other.copy()
     p = play(v, fit.gap, fit.p0)
     odds = log(COMMAND_ODDS)
-    for _ in range(MOST):
+    for _ in range(200):  # swaps of one look
         rest = residual - q @ (q.T @ residual)
         best, place, change = 0.0, -1, residual[:0]
         for k in open_.tolist():

@@ -49,7 +49,6 @@ from backlash_ros.core.estimation.settings import FEWEST, GROWTH, MISFIT, PREDIC
 Array = NDArray[np.float64]
 
 SHORT_SEARCH = 400  # samples of a record in which other gaps are looked for again
-SHORTEST = 50  # samples of a part of a record that is searched alone
 
 
 def learn(setup: Setup, record: Record, before: Belief) -> Belief:
@@ -78,13 +77,14 @@ def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
 
 
 def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
+    shortest = 50  # samples of a part of a record that is searched alone
     count = len(record.v)
     after = replace(before, end=record.end,
                     next_at=record.end + max(int(count * (GROWTH - 1.0)), FEWEST))
     found = afresh(setup, record, also=before.candidate or before.tried, walks=True)
     part = shorter = record
     why = _why(setup, found, record, before)
-    while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 3 * SHORTEST:
+    while why in (Status.INCONSISTENT, Status.NOT_EXCITED) and len(shorter.v) >= 3 * shortest:
         # What happened at its beginning may have spoilt a record.
         shorter = shorter.between(shorter.end - len(shorter.v) // 3)
         newest = afresh(setup, shorter)

@@ -25,12 +25,7 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-WIDEST = 0.125  # width of what acts half a sample late
 LEAK = 5e-3  # prior deviation of the leak of an integrator, per sample and unit of uncertainty
-LATEST = 40.0  # samples of lag, at most
-FURTHEST = 3.0  # by which ln Omega and ln D may be off, at most
-MOST_LEAK = 0.1  # per sample
-SLOPE_STEP = 1e-5  # of xi, for the derivatives of the coefficients
 
 
 class PlantFamily:
@@ -44,6 +39,7 @@ class PlantFamily:
     """
 
     def __init__(self, model: TransferFunction, uncertainty: float) -> None:
+        widest = 0.125  # width of what acts half a sample late
         b = np.trim_zeros(model.numerator, 'f')
         self.model, self.uncertainty = model, uncertainty
         self._delay = len(model.denominator) - len(b)
@@ -62,7 +58,7 @@ class PlantFamily:
         if uncertainty > 0.0:
             leak = [LEAK * uncertainty] if self._integrators else []
             self._scales = [
-                *leak, uncertainty * late, WIDEST, *([uncertainty] * len(self._nominal))
+                *leak, uncertainty * late, widest, *([uncertainty] * len(self._nominal))
             ]
         self.leaks = int(bool(self._scales) and self._integrators > 0)
         self.count = len(self._scales)
@@ -79,18 +75,21 @@ class PlantFamily:
         y(k) is the output after the interval over which u(k) acted, so that b_0 is what acts with
         the smallest delay there is.
         """
+        most_leak = 0.1  # per sample
+        furthest = 3.0  # by which ln Omega and ln D may be off, at most
+        latest = 40.0  # samples of lag, at most
         lag = width = leak = 0.0
         logs = self._nominal
         if self.count:
             moved = [x * scale for x, scale in zip(xi, self._scales, strict=True)]
             if self.leaks:
-                leak = min(max(moved.pop(0), -MOST_LEAK), MOST_LEAK)
+                leak = min(max(moved.pop(0), -most_leak), most_leak)
             lag, width, *apart = moved
             logs = [
-                x + min(max(dx, -FURTHEST), FURTHEST) for x, dx in zip(logs, apart, strict=True)
+                x + min(max(dx, -furthest), furthest) for x, dx in zip(logs, apart, strict=True)
             ]
         a = self._stable(logs)
-        lag = min(max(lag, -LATEST), LATEST)
+        lag = min(max(lag, -latest), latest)
         whole = max(floor(lag), 1 - self._delay)
         late, gain = [1.0 - lag + whole, lag - whole], sum(a) / self._gain
         b, wide = _product(self._b, late), _product(self._wide, late)
@@ -109,10 +108,11 @@ class PlantFamily:
 
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
         """Derivatives of b and a by each xi, both of shape (K, n + 1)."""
+        slope_step = 1e-5  # of xi, for the derivatives of the coefficients
         rows = []
         for j in range(self.count):
             ends = []
-            for step in (SLOPE_STEP, -SLOPE_STEP):
+            for step in (slope_step, -slope_step):
                 moved = list(xi)
                 moved[j] += step
                 ends.append(self.at(moved))
@@ -123,7 +123,7 @@ class PlantFamily:
             for part, above, below in ((0, b1, b0), (1, a1, a0)):
                 out[part, j, :len(above)] += above
                 out[part, j, :len(below)] -= below
-        out /= 2.0 * SLOPE_STEP
+        out /= 2.0 * slope_step
         return out[0], out[1]
 
     def model_at(self, xi: list[float]) -> TransferFunction:

@@ -24,11 +24,6 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-EVEN = 1e-3  # share of a step by which distances of readings may be off a whole number of them
-FEWEST_READINGS = 8  # different ones that tell a step
-SAME_PLACE = 16  # parts of a step within which an output counts as standing still
-REACH, PLACES = 6, 200  # of the average information: steps to both sides, and places within one
-
 
 class Likelihood(NamedTuple):
     """Of each reading (N,): log of its density, its derivative by the output, and information."""
@@ -40,13 +35,14 @@ class Likelihood(NamedTuple):
 
 def step_of(y: Array) -> float:
     """The step of which all distances between readings (N,) are multiples; 0 for none."""
+    even = 1e-3  # share of a step by which distances of readings may be off a whole number of them
     different = np.unique(y[np.isfinite(y)])
-    if len(different) < FEWEST_READINGS:
+    if len(different) < 8:  # different ones that tell a step
         return 0.0
     apart = np.diff(different)
-    apart = apart[apart > EVEN * np.median(apart)]  # one reading may be rounded in two ways
+    apart = apart[apart > even * np.median(apart)]  # one reading may be rounded in two ways
     steps = apart / apart.min()
-    return float(apart.min()) if abs(steps - np.round(steps)).max() < EVEN else 0.0
+    return float(apart.min()) if abs(steps - np.round(steps)).max() < even else 0.0
 
 
 def likelihood(r: Array, noise_std: float, step: float) -> Likelihood:
@@ -84,10 +80,11 @@ def mean_information(ratio: float) -> float:
 
     ratio: step over the deviation of the noise.
     """
+    reach, places = 6, 200  # of the average information: steps to both sides, and places within one
     from scipy.special import ndtr  # as above
 
-    edges = np.arange(-REACH, REACH + 2) - 0.5
-    arguments = (edges - ((np.arange(PLACES) + 0.5) / PLACES - 0.5)[:, None]) * ratio
+    edges = np.arange(-reach, reach + 2) - 0.5
+    arguments = (edges - ((np.arange(places) + 0.5) / places - 0.5)[:, None]) * ratio
     likelihood = np.diff(ndtr(arguments))
     slope = np.diff(np.exp(-0.5 * arguments**2)) * ratio / sqrt(2.0 * pi)
     each = np.divide(slope**2, likelihood, out=np.zeros_like(slope), where=likelihood > 0.0)
@@ -100,11 +97,12 @@ def independence(y: Array, known: Flags, output: Array, step: float) -> Array:
     Equal readings, one after the other, count as one while the output (N,), as the fit has it,
     stays within a small part of the step.
     """
+    same_place = 16  # parts of a step within which an output counts as standing still
     weights = known.astype(np.float64)
     where = np.flatnonzero(known)
     if not step or not len(where):
         return weights
-    seen, place = y[where], np.floor(output[where] * (SAME_PLACE / step))
+    seen, place = y[where], np.floor(output[where] * (same_place / step))
     changes = (np.diff(seen) != 0.0) | (np.diff(place) != 0.0)
     begins = np.flatnonzero(np.append(True, changes))
     lengths = np.diff(np.append(begins, len(where)))

@@ -21,14 +21,8 @@ from backlash_ros.core.plant.filtering import lfilter
 Array = NDArray[np.float64]
 
 GAPS, STARTS = 32, 5  # that are compared, and beginnings within each
-PEAKS = 3  # that come first
-SMALLEST = 0.01  # gap that is compared, over the swing of v
 # Gaps of the second look, over the best of the first.
 ZOOM: Array = np.array([0.8 + 0.025 * k for k in range(17)])
-SCALES = (0.03, 0.3, 1.0)  # of the error of G that are weighed
-AT_ONCE = 2_000_000  # numbers that are held at once
-# --- guards
-NONE = 1e-9  # gap that counts as none, over the swing of v
 
 
 class Hypothesis(NamedTuple):
@@ -49,17 +43,20 @@ def search(
 
     v, y: (N,), y nan where lost. widest: gap that is considered.
     """
+    none = 1e-9  # gap that counts as none, over the swing of v
+    smallest = 0.01  # gap that is compared, over the swing of v
+    peaks = 3  # that come first
     compared = _Comparison(family, v, y, noise_std)
     swing = float(np.ptp(v))
     top = min(swing, widest)
-    gaps: Array = np.append(NONE * swing, np.geomspace(SMALLEST * min(swing, top), top, GAPS))
+    gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, GAPS))
     starts: Array = np.arange(STARTS) / (STARTS - 1.0)
     found = [h for h in compared.evidence(gaps, starts) if isfinite(h.evidence)]
     if not found:
         return [], compared.null
     between = 0.5 * (starts[1:] + starts[:-1])
     closer = compared.evidence(max(found).gap * ZOOM, np.append(starts, between))
-    first = sorted({max([*closer, max(found)]), *_peaks(found)}, reverse=True)[:PEAKS]
+    first = sorted({max([*closer, max(found)]), *_peaks(found)}, reverse=True)[:peaks]
     return [*first, *sorted({*closer, *found} - {*first}, reverse=True)], compared.null
 
 
@@ -102,7 +99,7 @@ class _Comparison:
     def evidence(self, gaps: Array, shares: Array) -> list[Hypothesis]:
         """The best beginning of each gap; shares: places of it within the gap."""
         out = []
-        each = max(AT_ONCE // (len(shares) * len(self._v)), 1)
+        each = max(2_000_000 // (len(shares) * len(self._v)), 1)  # numbers that are held at once
         for first in range(0, len(gaps), each):
             out += self._evidence(gaps[first:first + each], shares)
         return out
@@ -140,7 +137,7 @@ class _Comparison:
             return -0.5 * freedom * np.log(noise**2 * freedom / self._rows)
         best = np.full(len(r), -np.inf)
         i = np.arange(k)
-        for scale in SCALES:
+        for scale in (0.03, 0.3, 1.0):  # of the error of G that are weighed
             weight = noise / (scale * m + 1e-30)
             prior = np.zeros((len(r), k, k + 2))
             prior[:, i, i + 1] = weight[:, None]

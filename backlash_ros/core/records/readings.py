@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-FEWEST_CHANGES = 12  # of y, beyond all rounding, that tell a slower sensor
 NEARLY_ALL = 0.9  # share of what speaks for an explanation
 # Whole turns: degrees, radians, gradians, steps of encoders.
 WHOLE_TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
-TURN_TOLERANCE = 0.02  # relative, of the jump of an angle that begins anew
 
 
 def quantum(y: Array) -> float:
@@ -37,18 +35,19 @@ def own_readings(t: Array, y: Array) -> tuple[Flags, float]:
     t (N,): instants [s], rising. A y that moves by several quanta a reading changes in every row,
     unless rows repeat it. At rest a reading looks like its repetition: one a period is taken.
     """
+    fewest_changes = 12  # of y, beyond all rounding, that tell a slower sensor
     known = np.flatnonzero(np.isfinite(y))
     every = np.isfinite(y), 0.0
     values, times = y[known], t[known]
     moves = np.diff(values)
     changed = np.flatnonzero(moves != 0.0) + 1
-    if not FEWEST_CHANGES <= len(changed) <= 0.7 * len(values):
+    if not fewest_changes <= len(changed) <= 0.7 * len(values):
         return every
     least = quantum(values) or 1e-9 * float(np.ptp(values))
     clear = np.abs(moves[changed - 1]) >= 3.0 * least
     inner = changed[clear & (changed > 1) & (changed < len(values) - 1)]
     alone = (moves[inner - 2] == 0.0) & (moves[inner] == 0.0)
-    if len(inner) < FEWEST_CHANGES or np.mean(alone) < NEARLY_ALL:
+    if len(inner) < fewest_changes or np.mean(alone) < NEARLY_ALL:
         return every
     # During a motion: from each clear change to the one before it, whichever that is.
     since = np.diff(times[changed], prepend=np.nan)[np.isin(changed, inner)]
@@ -98,6 +97,7 @@ def unwrapped(values: Array) -> tuple[Array, float]:
     A turn is certain where the values fill it and no more, and every large jump is a whole turn to
     a few usual steps, with the motion around it the other way.
     """
+    turn_tolerance = 0.02  # relative, of the jump of an angle that begins anew
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < 10:
         return values, 0.0
@@ -105,12 +105,12 @@ def unwrapped(values: Array) -> tuple[Array, float]:
     usual = float(np.percentile(np.abs(steps), 95.0))
     for turn in WHOLE_TURNS:
         jumps = np.abs(steps) > 0.6 * turn  # no motion from row to row
-        fills = 0.9 * turn <= reach <= (1.0 + TURN_TOLERANCE) * turn
+        fills = 0.9 * turn <= reach <= (1.0 + turn_tolerance) * turn
         if not fills or not jumps.any() or usual > 0.1 * turn:
             continue
         off = np.abs(np.abs(steps[jumps]) - turn)
         motion = np.convolve(np.where(jumps, 0.0, steps), np.ones(7), mode='same')[jumps]
-        if (off <= max(TURN_TOLERANCE * turn, 5.0 * usual)).all() and \
+        if (off <= max(turn_tolerance * turn, 5.0 * usual)).all() and \
                 np.mean(motion * np.sign(steps[jumps]) < 0.0) >= 0.8:
             out = values.copy()
             out[known[1:]] -= turn * np.cumsum(np.where(jumps, np.sign(steps), 0.0))

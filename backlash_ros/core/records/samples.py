@@ -10,7 +10,6 @@ from backlash_ros.core.estimation.settings import GATE, OUTLIER_SHARE
 Array = NDArray[np.float64]
 
 SEARCHED_AT_MOST = 6000  # samples of a record that a search for the gap looks at
-MOTION = (0.1, 0.9)  # shares of the power of the moves of y below which its frequencies lie
 TO_STD = 1.4826  # median absolute deviation of a normal distribution to its standard deviation
 
 
@@ -47,10 +46,11 @@ def outliers(residual: Array, least_std: float) -> NDArray[np.bool_]:
 
 def frequencies_of(y: Array) -> tuple[float, float]:
     """Lowest and highest frequency between which y (N,) moves [rad/sample]; nan where lost."""
+    motion = (0.1, 0.9)  # shares of the power of the moves of y below which its frequencies lie
     known = np.flatnonzero(np.isfinite(y))
     filled = np.interp(np.arange(len(y)), known, y[known])
     moves = np.diff(filled)
     power = np.abs(np.fft.rfft((moves - moves.mean()) * np.hanning(len(moves)))) ** 2
     total = np.cumsum(power)
-    low, high = np.searchsorted(total, np.array(MOTION) * total[-1]) * (2.0 * np.pi / len(moves))
+    low, high = np.searchsorted(total, np.array(motion) * total[-1]) * (2.0 * np.pi / len(moves))
     return float(low), float(high)

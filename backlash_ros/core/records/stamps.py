@@ -10,9 +10,6 @@ from backlash_ros.core.records.record import RecordError, seconds
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-CURE = 'choose another column for t with --columns, or leave t out and give --period S'
-EPOCH = ((1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms'))  # stamps of this century
-
 
 def in_seconds(
     t: Array | None, count: int, period: float | None, unit_s: float | None, said: list[str],
@@ -22,6 +19,7 @@ def in_seconds(
     unit_s: of the stamps, None where the log does not say it: then years since 1970 tell it, or the
     period. What was guessed is added to said. Raises RecordError where the period is needed.
     """
+    epoch = ((1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms'))  # stamps of this century
     known = np.empty(0) if t is None else t[np.isfinite(t)]
     if t is None or np.unique(known).size < 2:
         what = 'there is no column for t' if t is None else 't does not move'
@@ -31,7 +29,7 @@ def in_seconds(
         return np.asarray(period * np.arange(count, dtype=float))
     if unit_s is not None:
         return np.asarray(t * unit_s)
-    for least, scale, unit in EPOCH:
+    for least, scale, unit in epoch:
         if np.median(np.abs(known)) > least:
             said.append(f't counts {unit} since 1970')
             # Exact differences of numbers that hardly fit.
@@ -70,6 +68,7 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
     what: name of a row in said, to which is added what was done. Raises RecordError where the
     stamps make no sense.
     """
+    cure = 'choose another column for t with --columns, or leave t out and give --period S'
     def count(number: int, of: str = what) -> str:
         return f'{number} {of}{"" if number == 1 else "s"}'
 
@@ -84,7 +83,7 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
         said.append(f'the newest {what} stood first: turned around')
     bad = _far_off(t[rows])
     if np.mean(bad) > 0.1:
-        raise RecordError(f't jumps to and fro in {bad.sum()} of {len(rows)} {what}s: {CURE}')
+        raise RecordError(f't jumps to and fro in {bad.sum()} of {len(rows)} {what}s: {cure}')
     if bad.any():
         said.append(f'{count(int(bad.sum()))} with a stamp far off left out')
         rows = rows[~bad]
@@ -94,7 +93,7 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
     if len(parts) > 1:
         kept = max(parts, key=len)
         if len(kept) < 0.2 * len(rows):
-            raise RecordError(f't falls back {len(parts) - 1} times: {CURE}')
+            raise RecordError(f't falls back {len(parts) - 1} times: {cure}')
         said.append(
             f't begins anew {count(len(parts) - 1, "time")}: the longest of {len(parts)} parts, '
             f'{len(kept)} {what}s, is used'
@@ -102,7 +101,7 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
         rows = kept
     moved = int(np.count_nonzero(np.diff(t[rows]) < 0.0))
     if moved > 0.2 * len(rows):
-        raise RecordError(f't falls back in {moved} of {len(rows)} {what}s: {CURE}')
+        raise RecordError(f't falls back in {moved} of {len(rows)} {what}s: {cure}')
     if moved:
         rows = rows[np.argsort(t[rows], kind='stable')]
         said.append(f'{count(moved)} out of order sorted by time')

@@ -25,11 +25,8 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-NEARLY_EVEN = 0.02  # of a period that stamps of even samples may be off
 BREAK = 3.0  # periods from row to row that are a gap
-HIDDEN, LEAST = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
 MOST_SAMPLES = 1_000_000  # of a grid
-LONG_BREAK = 100.0  # periods of a gap that ends a stretch
 
 
 class Rows(NamedTuple):
@@ -56,13 +53,14 @@ def on_grid(rows: Rows, period: float | None = None) -> Record:
 
     Raises RecordError where there are too few, or they are spread over too long a time.
     """
+    nearly_even = 0.02  # of a period that stamps of even samples may be off
     guess = period or _period(rows.t)
     rows, cut = _longest_stretch(rows, guess)
     steps = np.diff(rows.t) / guess
     found = _numbering(rows.t, steps, guess)
     used = period or found.period
-    if np.abs(found.off).max() <= NEARLY_EVEN * guess and \
-            abs(found.period / used - 1.0) <= NEARLY_EVEN:
+    if np.abs(found.off).max() <= nearly_even * guess and \
+            abs(found.period / used - 1.0) <= nearly_even:
         said = f'{len(rows.t)} rows, one every {seconds(used)}'
         return _numbered_grid(rows, found.numbers, used, cut + said)
     inner = steps[steps <= BREAK]
@@ -95,10 +93,11 @@ def _period(t: Array) -> float:
 
 def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
     """Without what lies far before and after, where the time between holds no rows; said so."""
+    long_break = 100.0  # periods of a gap that ends a stretch
     t, span = rows.t, rows.t[-1] / period
-    if span < min(20.0 * len(t) + LONG_BREAK, MOST_SAMPLES):
+    if span < min(20.0 * len(t) + long_break, MOST_SAMPLES):
         return rows, ''
-    ends = [0, *(np.flatnonzero(np.diff(t) > LONG_BREAK * period) + 1).tolist(), len(t)]
+    ends = [0, *(np.flatnonzero(np.diff(t) > long_break * period) + 1).tolist(), len(t)]
     begin, end = max(pairwise(ends), key=lambda part: part[1] - part[0])
     if end - begin < 2 or t[end - 1] - t[begin] >= MOST_SAMPLES * period:
         raise RecordError(
@@ -184,6 +183,7 @@ def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Reco
 
 def _true_instants(rows: Rows, period: float, said: str) -> Record:
     """v averaged over each period, y where it was read."""
+    hidden, least = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
     t, y = rows.t[rows.own], rows.y[rows.own]
     equal = int(np.count_nonzero(np.diff(rows.t) == 0.0))
     said += f'; {equal} rows with equal stamps' if equal else ''
@@ -192,7 +192,7 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
     noise = noise_of(t, y)
     bend = curvature_of(t, y, noise)
     swing = float(np.ptp(np.percentile(y, [5.0, 95.0])))
-    noise = max(noise, 12.0**-0.5 * quantum(y), 0.01 * LEAST * swing)
+    noise = max(noise, 12.0**-0.5 * quantum(y), 0.01 * least * swing)
     for parts in (1, 2, 4):
         step = period / parts
         index, values = np.round(t / step).astype(np.int64), y
@@ -200,13 +200,13 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
         shared = np.mean(np.diff(index) == 0) > 0.02 if len(index) > 1 else False
         # A standard deviation, but for steps: nine tenths of normal values stay within 1.64.
         moved = np.percentile(np.abs(np.gradient(y, t) * off), 90.0) / 1.64 if len(t) > 1 else 0.0
-        if not shared and moved <= HIDDEN * noise:
+        if not shared and moved <= hidden * noise:
             break
         # Along the line to the next reading on that side.
         values = np.interp(index * step, t, y)
         share = np.clip(np.abs(off) / np.maximum(np.gradient(t), step), 0.0, 0.5)
         error = bend * float(np.sqrt(np.mean((4.0 * share * (1.0 - share))**2)))
-        if error <= max(HIDDEN * noise, LEAST * swing):
+        if error <= max(hidden * noise, least * swing):
             if shared and parts == 1:
                 # Every instant of the grid between two readings that are near enough.
                 index = np.arange(int(t[0] / step + 1.0 - 1e-9), int(t[-1] / step + 1e-9) + 1)

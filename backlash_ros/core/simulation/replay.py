@@ -23,8 +23,6 @@ from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 
 Array = NDArray[np.float64]
 
-COMPARED = ('m', 'c_r', 'c_l')
-
 
 class Parting(NamedTuple):
     """Where a replay parts from the estimates that the run had published.
@@ -94,17 +92,18 @@ def replay(
 
 def parting(recorded: RunRecord, replayed: RunRecord) -> Parting | None:
     """Where the estimates differ by a bit for the first time; None where they never do."""
-    own = np.column_stack([recorded.column(name) for name in COMPARED])
-    again = np.column_stack([replayed.column(name) for name in COMPARED])
+    compared = ('m', 'c_r', 'c_l')
+    own = np.column_stack([recorded.column(name) for name in compared])
+    again = np.column_stack([replayed.column(name) for name in compared])
     differs = (own != again) & ~(np.isnan(own) & np.isnan(again)) & ~np.isnan(own)
     rows = np.flatnonzero(differs.any(axis=1))
     if not len(rows):
         return None
     k = int(rows[0])
     i = int(np.argmax(differs[k]))
-    std = np.column_stack([recorded.column(f'std_{name}') for name in COMPARED])
+    std = np.column_stack([recorded.column(f'std_{name}') for name in compared])
     scale = np.where(np.isfinite(std) & (std > 0.0), std, np.maximum(np.abs(own), 1e-300))
     return Parting(
-        k, float(recorded.column('t')[k]), COMPARED[i], float(own[k, i]), float(again[k, i]),
+        k, float(recorded.column('t')[k]), compared[i], float(own[k, i]), float(again[k, i]),
         float(np.nanmax(np.where(differs, np.abs(own - again) / scale, 0.0))),
     )

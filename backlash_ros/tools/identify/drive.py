@@ -31,8 +31,6 @@ from backlash_ros.tools.config import write_config
 from backlash_ros.tools.identify.outcome import identifying_record
 from backlash_ros.tools.records.messages import FEWEST_MESSAGES, from_messages
 
-SHARE_OF_TIME = 0.25  # of the time that estimates may take: the actuator needs the processor
-
 
 def drive(
     options: argparse.Namespace, given: Mapping[str, Value], ros_arguments: Sequence[str],
@@ -134,6 +132,7 @@ def _follow(
     stop: StopRequests,
 ) -> None:
     """Show progress until the motion ends, is precise enough, or is to be stopped."""
+    share_of_time = 0.25  # of the time that estimates may take: the actuator needs the processor
     next_look, said = 3.0, ''  # [s] of motion before an estimate
     estimate: _Estimate | None = None
     with tqdm(
@@ -153,7 +152,7 @@ def _follow(
             if estimate is None or estimate.found is None:
                 continue
             found, said = estimate.found, _said(estimate.found)
-            next_look, estimate = moved + max(estimate.took_s / SHARE_OF_TIME, 1.0), None
+            next_look, estimate = moved + max(estimate.took_s / share_of_time, 1.0), None
             line = f'{moved:5.1f} s  {said}'
             if bar.disable:
                 print(line, file=sys.stderr, flush=True)

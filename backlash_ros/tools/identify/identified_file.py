@@ -18,7 +18,6 @@ from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PLANT
 from backlash_ros.tools.config import ANY, EVERY_NODE, config_text
 
-WIDER = 3.0  # bounds of the estimates, in times of what was found
 # Parameters of the file that the user gave which do not go on: of the simulation, of one run.
 NOT_TAKEN_OVER = (
     'truth', 'backlash', 'output_noise_std', 'output_quantum', 'input_disturbance', 'estimates',
@@ -35,9 +34,10 @@ def identified_parameters(
     estimates: file of what the controller is to begin with. Raises ParameterError where the
     controller does not take it.
     """
+    wider = 3.0  # bounds of the estimates, in times of what was found
     assert found.details is not None
     reach = max(abs(found.c_r), abs(found.c_l)) + found.std['c_r']
-    scale = _short(max(WIDER * max(found.gap, reach), 1e-9))
+    scale = _short(max(wider * max(found.gap, reach), 1e-9))
     c_r, c_l = _short(found.c_r, 6), _short(found.c_l, 6)
     lag = found.actuator and found.actuator.lag
     right, left = found.actuator.wind_up if found.actuator else (0.0, 0.0)
@@ -64,7 +64,7 @@ def identified_parameters(
         'actuator.wind_up': (_short(right, 6), _short(left, 6)),
         'estimator.initial.m': found.m,
         'estimator.initial.c_r': c_r, 'estimator.initial.c_l': c_l,
-        'estimator.bounds.m': (_short(found.m / WIDER), _short(found.m * WIDER)),
+        'estimator.bounds.m': (_short(found.m / wider), _short(found.m * wider)),
         'estimator.bounds.c_r': (-scale, scale), 'estimator.bounds.c_l': (-scale, scale),
         'estimator.output_noise_std': _short(max(found.noise_std, 1e-12)),
         # The simulated plant is the one that was found, so that the file can be tried out.

@@ -29,7 +29,6 @@ from backlash_ros.tools.page import Picture
 Array = NDArray[np.float64]
 
 BAND_STDS = 2.0  # standard deviations that bands reach
-LOOP_POINTS = 4000  # samples that the curves over v show
 
 
 def pictures(found: Identification) -> Iterator[Picture]:
@@ -88,11 +87,12 @@ def draw_held_out(figure: Figure, found: Identification, details: Details) -> No
 
 def draw_loop(figure: Figure, found: Identification, details: Details) -> None:
     """y over v, and v - u / m over v, between the crossings."""
+    loop_points = 4000  # samples that the curves over v show
     left, right = figure.subplots(1, 2)
-    v = details.samples.v[-LOOP_POINTS:]
-    curve(left, v, details.samples.whole_y[-LOOP_POINTS:], HUES['y'], width=0.8)
+    v = details.samples.v[-loop_points:]
+    curve(left, v, details.samples.whole_y[-loop_points:], HUES['y'], width=0.8)
     label(left, 'As measured', 'y', 'v')
-    curve(right, v, v - details.fit.p[-LOOP_POINTS:] + found.c_r, HUES['u'], width=0.8)
+    curve(right, v, v - details.fit.p[-loop_points:] + found.c_r, HUES['u'], width=0.8)
     for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):
         right.axhline(value, color=HUES[name], linewidth=4.0, alpha=0.5,
                       label=f'${name}$ = {value:.4g}')

@@ -23,9 +23,6 @@ from backlash_ros.tools.runs.bag import choose_namespace, read_topics
 Messages = tuple[NDArray[np.int64], NDArray[np.float64]]  # stamps [ns] and values
 
 NUMBER, NUMBERS = 'std_msgs/msg/Float64', 'std_msgs/msg/Float64MultiArray'
-JOINT_STATE = 'sensor_msgs/msg/JointState'
-COMMAND_WORDS = ('command', 'cmd', 'goal', 'target', 'setpoint')
-SIMULATED_BEFORE_NS = 10**17  # stamps: the clock of a machine is far beyond
 FEWEST_MESSAGES = 3  # that are a motion
 
 
@@ -46,6 +43,7 @@ def read_bag_record(
     None where only the signals of a controller tell them: stamps of a simulated time do not say
     what came first within a sample. Raises InputError and RecordError.
     """
+    simulated_before_ns = 10**17  # stamps: the clock of a machine is far beyond
     signals, damage = _signals(path)
     of_joints = any(each.joint or each.commanded for each in signals.values())
     native = any(f'/{name}'.endswith(f'/{topics.PLANT_OUTPUT}') for name in signals)
@@ -56,7 +54,7 @@ def read_bag_record(
     else:
         heard, note = _native(signals, axis)
         stamps = heard.get(topics.PLANT_OUTPUT, (np.empty(0),))[0]
-        if len(stamps) < FEWEST_MESSAGES or np.median(stamps) < SIMULATED_BEFORE_NS:
+        if len(stamps) < FEWEST_MESSAGES or np.median(stamps) < simulated_before_ns:
             return None
         of_axis = f' of axis {axis}' if axis else ''
     record = from_messages(heard, period, of_axis)
@@ -150,10 +148,12 @@ def _joint_pair(
 
 def _signals(path: Path) -> tuple[dict[str, Signal], str]:
     """Every number of a bag that may be v or y, by name, and what is wrong with the bag."""
+    command_words = ('command', 'cmd', 'goal', 'target', 'setpoint')
+    joint_state = 'sensor_msgs/msg/JointState'
     def is_command(topic: str) -> bool:
-        return any(word in topic.lower() for word in COMMAND_WORDS)
+        return any(word in topic.lower() for word in command_words)
 
-    content = read_topics(path, lambda topic: topic.message_type in (NUMBER, JOINT_STATE) or (
+    content = read_topics(path, lambda topic: topic.message_type in (NUMBER, joint_state) or (
         topic.message_type == NUMBERS and is_command(topic.name)))
     series: dict[tuple[str, str, str], list[tuple[int, float]]] = {}
     for topic, messages in sorted(content.messages.items()):

@@ -23,15 +23,10 @@ from backlash_ros.tools.records.columns import columns_of
 
 Array = NDArray[np.float64]
 
-SEPARATORS = ('\t', ';', ',', '|', ' ')
-COMMENTS = ('#', '%', '//')
 NOT_KNOWN = {
     '', 'nan', 'null', 'none', 'na', 'n/a', '-', '--', 'nil', '?', '#n/a', 'bad', 'missing',
 }
-LOOKED_AT = 200  # lines by which the separator is told, from the middle of the file
 MOST_BROKEN = 0.1  # share of the lines that may be broken, and of the cells that are no number
-NO_TABLE = 'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs'
-UTF_16 = (b'\xff\xfe', b'\xfe\xff')
 
 
 @dataclass(frozen=True)
@@ -100,7 +95,7 @@ def read_table(path: Path) -> Table:
         raise InputError(f'{path}: cannot be read: {error}') from None
     if data[:4] == b'PAR1':
         return _from_parquet(path)
-    wide = data[:2] in UTF_16
+    wide = data[:2] in (b'\xff\xfe', b'\xfe\xff')
     if b'\0' in data[:4096] and not wide:
         raise InputError(f'{path}: is no text: give a CSV, a Parquet file, or the folder of a bag')
     for encoding in ('utf-16',) if wide else ('utf-8-sig', 'latin-1'):
@@ -112,6 +107,7 @@ def read_table(path: Path) -> Table:
 
 
 def _from_text(path: Path, text: str) -> Table:
+    no_table = 'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs'
     lines = text.replace('\0', '').splitlines()
     separator, count = _separator(lines)
     rows = [_split(line, separator) for line in lines]
@@ -126,7 +122,7 @@ def _from_text(path: Path, text: str) -> Table:
     # A last row may be torn; trailing separators may be missing.
     data = [count - 1 <= len(row) <= count + 1 and has_number(row) for row in rows]
     if not count or not any(data):
-        raise InputError(f'{path}: {NO_TABLE}')
+        raise InputError(f'{path}: {no_table}')
     # From the middle of the file upwards: a table may stand below other ones.
     head = min(np.flatnonzero(data).tolist(), key=lambda k: abs(k - len(rows) // 2))
     filled = sum(map(bool, rows[head]))
@@ -154,7 +150,7 @@ def _from_text(path: Path, text: str) -> Table:
 
 
 def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(COMMENTS)
+    return line.lstrip().startswith(('#', '%', '//'))
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -170,11 +166,12 @@ def _split(line: str, separator: str) -> list[str]:
 
 def _separator(lines: list[str]) -> tuple[str, int]:
     """What separates the cells, and how many a row has; 0 where there is no table."""
-    begin = max(len(lines) // 2 - LOOKED_AT // 2, 0)
-    part = [line for line in lines[begin:begin + LOOKED_AT]
+    looked_at = 200  # lines by which the separator is told, from the middle of the file
+    begin = max(len(lines) // 2 - looked_at // 2, 0)
+    part = [line for line in lines[begin:begin + looked_at]
             if any(sign.isdigit() for sign in line) and not _is_comment(line)]
     best, most = (',', 0), 0.5
-    for separator in SEPARATORS:
+    for separator in ('\t', ';', ',', '|', ' '):
         rows = [_split(line, separator) for line in part]
         counts = Counter(
             len(row) for row in rows

@@ -28,7 +28,6 @@ SAFER = (1.0, *np.geomspace(1.1, 100.0, 60).tolist())
 # Plants that bear less are led astray by any feedback that would help, and learn faster than they
 # go astray without.
 WRONG_SLOPE = 1.35
-REST_BANDWIDTH = 1.0 / 80.0  # rad per sample, up to which y is corrected while the reference rests
 HORIZON = 300  # samples within which a wrong u must matter, and u* answers to a reference
 LOOK_AHEAD = 20  # samples, at most, for which u* is known ahead
 SAFE_MARGIN = 0.5  # modulus margin that is safe in any case: no sensitivity above 2
@@ -96,6 +95,8 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
 
     weight_factor: see `feedback_around`. Raises ParameterError where no gains exist.
     """
+    # rad per sample, up to which y is corrected while the reference rests
+    rest_bandwidth = 1.0 / 80.0
     rho = input_weight(model, weights)
     gains = lq_gains(model, rho, weights.integral_weight, weights.preview)
     feedback = feedback_around(model, weights, weight_factor)
@@ -103,7 +104,7 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
         lq_gains(model, max(more, weight_factor) * rho).state.tolist() for more in SCHEDULE
     )]
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
-    gentle = lq_gains(model, power_gain(model.transfer_function, REST_BANDWIDTH)).state
+    gentle = lq_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
     ahead, later = (powers(model.a, model.b, k).sum(axis=0) for k in (LOOK_AHEAD, HORIZON))
     return TrackingDesign(
         model, gains, feedback, tuple(schedule),

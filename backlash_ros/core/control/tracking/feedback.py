@@ -24,8 +24,6 @@ from backlash_ros.core.plant.noise_level import NoiseLevel
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
-STIFFEN_AFTER = 20  # samples without a limit after which feedback takes a step back to full
-WIDENING = 1.03  # per sample, of the bound on feedback while the backlash is unknown
 
 
 @dataclass
@@ -163,6 +161,7 @@ class StateFeedback:
 
         held_back: whether v met its limits, or is on its way across the gap.
         """
+        widening = 1.03  # per sample, of the bound on feedback while the backlash is unknown
         state, most = self.state, self.most
         if self.trust.begun:
             feedback = dot(self._gain(held_back or state.bounded), deviation)
@@ -171,7 +170,7 @@ class StateFeedback:
             feedback = dot(self._design.acquisition or (), deviation)
             if not -most < feedback < most:
                 # A gap wider than the first guess has to be crossed some day.
-                state.width = min(WIDENING * state.width, LARGEST_IN_ACQUISITION)
+                state.width = min(widening * state.width, LARGEST_IN_ACQUISITION)
         if self.trust.full:
             feedback += self._design.feedback.integral * state.integral
         within = -most <= feedback <= most
@@ -220,11 +219,12 @@ class StateFeedback:
 
     def _gain(self, held_back: bool) -> Gain:
         """K, or the less of it the longer v does not follow, and the newer the estimate."""
+        stiffen_after = 20  # samples without a limit after which feedback takes a step back to full
         state, schedule = self.state, self._design.schedule
         state.free = 0 if held_back else state.free + 1
         if held_back:
             state.level = min(state.level + 1, len(schedule) - 1)
-        elif state.level > 0 and state.free % STIFFEN_AFTER == 0:
+        elif state.level > 0 and state.free % stiffen_after == 0:
             state.level -= 1
         unproven = len(schedule) - 1 - self.trust.held_for * len(schedule) // TRUSTED_AFTER
         return schedule[max(state.level, unproven)]

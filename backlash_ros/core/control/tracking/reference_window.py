@@ -11,7 +11,6 @@ from backlash_ros.core.plant.noise_level import NoiseLevel
 
 Array = NDArray[np.float64]
 
-WIDTHS = (3, 8, 20)  # samples to either side, of the averages to choose from
 # Mean square of what is left of the references beside a parabola, in those of the noise, up to
 # which they are taken for one, and from which on they are not: at a step, or a sharp turn.
 PARABOLA, NO_PARABOLA = 1.8, 3.0
@@ -25,7 +24,7 @@ def parabolas(preview: int) -> tuple[Array, ...]:
     row says what an average changes.
     """
     found = []
-    for w in WIDTHS:
+    for w in (3, 8, 20):  # samples to either side, of the averages to choose from
         if 3 * w <= preview:
             powers = np.arange(-w, w + 1.0)[:, None] ** np.arange(3)
             weighted = powers * np.hanning(2 * w + 3)[1:-1, None]
