@@ -9,7 +9,7 @@ from math import inf, nan
 from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.limits import LARGEST, Limits, at_rest, plausible
+from backlash_ros.core.control.limits import LARGEST_SIGNAL, Limits, at_rest, plausible
 from backlash_ros.core.control.protocol import ControlInput, Structure
 from backlash_ros.core.control.redesign import Redesign
 from backlash_ros.core.control.serial_plant import SerialPlant
@@ -74,7 +74,7 @@ class AdaptiveController:
         if not all(map(plausible, (y, y_m, *applied, *commands))):
             raise ValueError(
                 f'y={y!r}, y_m={y_m!r}, applied={applied!r} and commands={commands!r} must be '
-                f'finite and no larger than {LARGEST:g}'
+                f'finite and no larger than {LARGEST_SIGNAL:g}'
             )
         if any(values and len(values) != lost + 1 for values in (applied, alternatives, commands)):
             raise ValueError(

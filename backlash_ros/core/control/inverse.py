@@ -7,8 +7,6 @@ from math import inf, nan
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Region, clamp
 
-LEFT, GAP, RIGHT = Region.LEFT, Region.GAP, Region.RIGHT
-
 
 class BacklashInverse:
     """v = BI(u_d): crosses the gap whenever u_d turns, equations (2.2) and (2.3).
@@ -33,7 +31,7 @@ class BacklashInverse:
         if not take_up > 0.0:
             raise ParameterError('inverse.take_up_rate', take_up, 'must be > 0')
         self.direction_band, self.take_up = direction_band, take_up
-        self.v, self.side, self.extreme = 0.0, GAP, 0.0
+        self.v, self.side, self.extreme = 0.0, Region.GAP, 0.0
         self.taking_up = self.limited = False
         self._slowed = False  # whether v is on its way until it is where u_d wants it
         self._play = nan, nan, nan  # m, c_r, c_l in use the sample before
@@ -42,9 +40,9 @@ class BacklashInverse:
     def direction(self, u_d: float, band: float) -> Region:
         """Line on which u_d lies: RIGHT going up, LEFT going down, GAP where v is held."""
         move = u_d - self.extreme
-        side = RIGHT if move > 0.0 else LEFT if move < 0.0 else GAP
+        side = Region.RIGHT if move > 0.0 else Region.LEFT if move < 0.0 else Region.GAP
         # Only a turn has to leave the band; going on in the same direction is never noise.
-        return side if band == 0.0 or side is self.side or abs(move) > band else GAP
+        return side if band == 0.0 or side is self.side or abs(move) > band else Region.GAP
 
     def step(
         self, u_d: float, m: float, c_r: float, c_l: float, band: float | None = None,
@@ -56,13 +54,13 @@ class BacklashInverse:
         if band is None:
             band = self.direction_band
         side = self.direction(u_d, band)
-        if self.taking_up and self.side is not GAP:
+        if self.taking_up and self.side is not Region.GAP:
             # u is held until v arrives: it turns only where u_d lies on the other side of that.
             self._note_on_the_way()
             side = Region(-self.side) if (self._u - u_d) * self.side > band else self.side
-        elif side is GAP:
+        elif side is Region.GAP:
             return self.v
-        elif self.side is GAP:
+        elif self.side is Region.GAP:
             self.side, self._u, self.taking_up = side, self.extreme, True
         return self.follow(side, u_d, m, c_r, c_l)
 
@@ -71,9 +69,9 @@ class BacklashInverse:
 
         On this line v only goes on: where u_d comes back, u is held.
         """
-        if side is GAP:
+        if side is Region.GAP:
             return self.v
-        if self.side is GAP:
+        if self.side is Region.GAP:
             self._u = u_d  # nobody knows what u is
         elif self.taking_up:
             self._note_on_the_way()
@@ -106,17 +104,17 @@ class BacklashInverse:
         Other parameters have moved the line that is engaged: on the new one, v stands for another
         u than on the one that has led it there.
         """
-        if self.side is not GAP and self._play != (m, c_r, c_l):
-            self.extreme = m * (self.v - (c_r if self.side is RIGHT else c_l))
+        if self.side is not Region.GAP and self._play != (m, c_r, c_l):
+            self.extreme = m * (self.v - (c_r if self.side is Region.RIGHT else c_l))
             self.taking_up = self._slowed = False
             self._play = m, c_r, c_l
         return self.extreme
 
     def start_from(self, v: float) -> None:
         """Say which v acts before the next step, whatever was sent."""
-        if v != self.v and self.side is not GAP:
+        if v != self.v and self.side is not Region.GAP:
             m, c_r, c_l = self._play
-            self.extreme = m * (v - (c_r if self.side is RIGHT else c_l))
+            self.extreme = m * (v - (c_r if self.side is Region.RIGHT else c_l))
         self.v = v
 
     def applied(self, v: float) -> None:
@@ -137,7 +135,7 @@ class BacklashInverse:
 
     def _approach(self, m: float, c_r: float, c_l: float) -> float:
         """Go to the line in use, no faster than the gap is crossed until v moves u."""
-        crossing = c_r if self.side is RIGHT else c_l
+        crossing = c_r if self.side is Region.RIGHT else c_l
         # Where v begins to move u, or would have stood if these parameters had been in use before.
         until = self.extreme if self._slowed else self._u
         way = until / m + crossing - self.v

@@ -10,13 +10,13 @@ from typing import NamedTuple
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
-LARGEST = 1e12  # no unit makes a measurement larger; squares of it still are numbers
+LARGEST_SIGNAL = 1e12  # no unit makes a measurement larger; squares of it still are numbers
 ROUNDING = 1e-14  # relative, of a v that has arrived at its target
 
 
 def plausible(value: float) -> bool:
     """Whether a value can be a measurement at all; nan, inf and absurd magnitudes are not."""
-    return abs(value) <= LARGEST
+    return abs(value) <= LARGEST_SIGNAL
 
 
 class Motion(NamedTuple):
@@ -76,7 +76,7 @@ class Limits:
         if isnan(v):
             v = before.v
         # Beyond the largest measurement nobody could tell what v does.
-        target = min(max(v, self.low, -LARGEST), self.high, LARGEST)
+        target = min(max(v, self.low, -LARGEST_SIGNAL), self.high, LARGEST_SIGNAL)
         if self.acceleration == inf:
             sent = min(max(target, before.v - self.move), before.v + self.move)
             return Motion(sent, sent - before.v, target)

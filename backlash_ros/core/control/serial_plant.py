@@ -27,8 +27,6 @@ Array = NDArray[np.float64]
 
 # Share of the motion of u that may not be what the backlash says, before and after it was learned.
 DOUBT, LITTLE_DOUBT = 0.5, 0.1
-# Innovations of whose rms, beyond how much, y is an outlier: they come in bursts, when v crosses.
-GATE, AVERAGED = 100.0, 100
 
 
 class SerialPlant:
@@ -102,12 +100,14 @@ class SerialPlant:
         self._follow(y, u)
 
     def _follow(self, y: float | None, u: float) -> None:
+        # innovations, of whose rms y may differ: they come in bursts, when v crosses
+        averaged = 100
         observer = self._observer
         ahead = observer.predicted(u)
-        if y is not None and self._taken >= AVERAGED:
+        if y is not None and self._taken >= averaged:
             least = max(self._variance, self._noise_std**2)
             # So many outliers in a row are none.
-            if (y - ahead) ** 2 > GATE**2 * least and self._refused < OUTLIERS:
+            if (y - ahead) ** 2 > 100.0**2 * least and self._refused < OUTLIERS:
                 self._refused += 1
                 y = None
         observer.update(y, Interval(u, nan, nan, nan))
@@ -115,7 +115,7 @@ class SerialPlant:
             self._refused = 0
             self._taken += 1
             change = observer.innovation**2 - self._variance
-            self._variance += change / min(self._taken, AVERAGED)
+            self._variance += change / min(self._taken, averaged)
 
 
 def _played(held: float, v: float, estimate: Estimate) -> float:

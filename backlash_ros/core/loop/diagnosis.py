@@ -20,9 +20,11 @@ TROUBLE, PATIENCE_S = 0.01, 3.0
 UNNAMED = 'a node without a name'
 SKEW = 0.5  # of a period: time from stamp to arrival that only a wrong clock or a slow way explains
 OK, WARN, ERROR = Level.OK, Level.WARN, Level.ERROR
-LATENESS = ('late', 'lost', 'unsent')
+LATE_KINDS = ('late', 'lost', 'unsent')
 # Kinds of findings that pass by themselves as a rule.
-LASTING = frozenset((*LATENESS, 'waiting for output', 'waiting for reference', 'unheard', 'clock'))
+PASSING_KINDS = frozenset((
+    *LATE_KINDS, 'waiting for output', 'waiting for reference', 'unheard', 'clock',
+))
 # Kinds of findings about the messages, which are the same for all joints of a controller.
 OF_MESSAGES = frozenset((
     'control type', 'control qos', 'rivals', 'second driver', 'second reference', 'unheard', 'rate',
@@ -168,7 +170,7 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     if state.kind == 'model':
         # What the fit has found out itself says more than what is late or missing; a wrong sign
         # drives v into its limits besides, and comes of no clock.
-        lesser = list(LATENESS)
+        lesser = list(LATE_KINDS)
         if f.law.wrong_sign or f.law.coasts or f.unexplained:
             lesser += ['unreported']
         if f.law.wrong_sign:
@@ -181,7 +183,7 @@ def findings_of(f: LoopFigures) -> list[Finding]:
 def _finding(row: Row) -> Finding:
     kind, level, _, text = row
     # Most nodes get their name soon after they are found.
-    lasting = kind in LASTING or UNNAMED in text
+    lasting = kind in PASSING_KINDS or UNNAMED in text
     text = text if len(text) <= LONGEST_TEXT else text[:LONGEST_TEXT - 1] + '…'
     return Finding(level, kind, text, lasting)
 
@@ -290,7 +292,7 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
     y, status, share = f.output, f.status, 100.0 * f.law.unexplained
     # Neither rate nor lateness turns a sign.
     held = status == Status.INCONSISTENT and not f.law.wrong_sign
-    late = not causes.isdisjoint(LATENESS) and f.inconsistent_s < PATIENCE_S
+    late = not causes.isdisjoint(LATE_KINDS) and f.inconsistent_s < PATIENCE_S
     return (
         ('held', WARN, held and 'rate' in causes,
          f'{y} does not follow from v at this rate: estimates held'),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.limits import LARGEST
+from backlash_ros.core.control.limits import LARGEST_SIGNAL
 from backlash_ros.core.records.readings import failed, own_readings, quantum, unwrapped
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.stamps import in_order, in_seconds
@@ -90,7 +90,7 @@ def usable(record: Record) -> Record:
     if commands is not None:
         commands = _held(commands)[first:]
         commands = np.where(np.isnan(commands), v[0], commands)
-        commands = commands if np.abs(commands).max() <= LARGEST else None
+        commands = commands if np.abs(commands).max() <= LARGEST_SIGNAL else None
     period = float(f'{record.sample_period:.9g}')
     return replace(record, v=v, y=y, sample_period=period, commands=commands)
 
@@ -101,10 +101,11 @@ def _check(**signals: Array) -> None:
         if not np.isfinite(values).any():
             raise RecordError(f'{name} holds no number')
         largest, swing = np.nanmax(np.abs(values)), np.nanmax(values) - np.nanmin(values)
-        if largest > LARGEST or 0.0 < swing < 1.0 / LARGEST:
+        if largest > LARGEST_SIGNAL or 0.0 < swing < 1.0 / LARGEST_SIGNAL:
             raise RecordError(
                 f'{name} reaches {largest:.3g} and swings by {swing:.3g}, beyond '
-                f'{1.0 / LARGEST:g} to {LARGEST:g}: choose another unit, drop what is no reading'
+                f'{1.0 / LARGEST_SIGNAL:g} to {LARGEST_SIGNAL:g}: choose another unit, drop what '
+                'is no reading'
             )
 
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from backlash_ros.core.simulation.run_record import RunRecord
 
 SETTLING_TOLERANCE = 0.01  # of the true value
-NO_GAP = 1e-6  # a true gap narrower than this [unit of v] counts as none
 
 
 def settling_time(
@@ -102,6 +101,6 @@ def gap_crossings_per_reversal(run: RunRecord, since: float = 0.0) -> float | No
     y_m, v = run.column('y_m')[rows], run.column('v')[rows]
     gap = run.column('true_c_r')[rows] - run.column('true_c_l')[rows]
     reversals = turns(y_m, 0.0)
-    if reversals == 0 or not np.all(np.isfinite(gap)) or float(gap.max()) < NO_GAP:
+    if reversals == 0 or not np.all(np.isfinite(gap)) or float(gap.max()) < 1e-6:
         return None
     return turns(v, 0.5 * float(gap.max())) / reversals

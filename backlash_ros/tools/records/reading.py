@@ -17,7 +17,6 @@ from backlash_ros.tools.records.columns import COMMAND, choose_columns, unit_of
 from backlash_ros.tools.records.table import Table, read_table
 from backlash_ros.tools.runs.files import RECORD_FILE, SAMPLE_COLUMNS, SAMPLES_FILE, Run
 
-NO_TABLES = ('.npz', '.mcap', '.db3', '.zstd', '.zst')  # files of results and bags
 NO_COLUMNS: Mapping[str, str] = {}
 
 
@@ -75,7 +74,8 @@ def _from_table(table: Table, period: float | None, given: Mapping[str, str]) ->
 
 
 def _is_table(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() not in NO_TABLES
+    no_tables = ('.npz', '.mcap', '.db3', '.zstd', '.zst')  # files of results and bags
+    return path.is_file() and path.suffix.lower() not in no_tables
 
 
 def read_run_or_log(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.control.limits import LARGEST, Limits, at_rest, last_commands
+from backlash_ros.core.control.limits import LARGEST_SIGNAL, Limits, at_rest, last_commands
 
 
 @given(st.one_of(st.floats(), st.just(1e300)), st.floats(-10.0, 10.0), st.floats(-20.0, 5.0),
@@ -21,7 +21,7 @@ def test_whatever_is_asked_what_is_sent_is_a_number_that_keeps_the_limits(
     assert abs(sent - v) <= move * (1.0 + 1e-12)
     outside, outside_before = (max(low - x, x - low - width, 0.0) for x in (sent, v))
     assert outside <= max(outside_before - move, 0.0) + 1e-12
-    assert abs(Limits(move=move).apply(asked, at_rest(v)).v) <= LARGEST
+    assert abs(Limits(move=move).apply(asked, at_rest(v)).v) <= LARGEST_SIGNAL
 
 
 @pytest.mark.parametrize(('told', 'known', 'begins'), [
