@@ -35,7 +35,7 @@ from backlash_ros.core.loop.sample_counter import (
 )
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
-from backlash_ros.core.parameters.table import CONTROLLER, JOINTS
+from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.control.joint import Joint
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
@@ -411,7 +411,7 @@ def _check_style(p: Parameters) -> None:
             'set joint_state_topic or ros2_control',
         )
     if style == 'joint_state_topic' and not (p.joints or p.io.joint):
-        raise ParameterError(JOINTS, (), 'is empty', f'name them, io.style is {style}')
+        raise ParameterError('joints', (), 'is empty', f'name them, io.style is {style}')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -24,7 +24,6 @@ from backlash_ros.core.parameters.table import (
     BRINGUP,
     BY_NAME,
     CONTROLLER,
-    JOINTS,
     NODES,
     PARAMETERS,
 )
@@ -71,7 +70,7 @@ class Configuration:
     @property
     def joints(self) -> tuple[str, ...]:
         """The joints of one controller, empty for a file without."""
-        return () if self.axes else _listed(self.path, self.sections, JOINTS)
+        return () if self.axes else _listed(self.path, self.sections, 'joints')
 
     def parameters(self, axis: str = '') -> Parameters:
         """Return the complete set of one loop: defaults, the file, then --set, then --seed.
@@ -119,7 +118,7 @@ def read_configuration(
     path = find_config(config)
     sections = _read_sections(path)
     parsed = [parse_setting(setting) for setting in settings]
-    axes, joints = (_listed(path, sections, name) for name in ('axes', JOINTS))
+    axes, joints = (_listed(path, sections, name) for name in ('axes', 'joints'))
     for _, name, value in parsed:
         if name == 'axes':
             axes = Parameters({'axes': value}).axes
@@ -237,7 +236,7 @@ def _read_sections(path: Path) -> list[Section]:
         sections = {str(name): _section_values(content) for name, content in document.items()}
         # What is wrong with the values of a joint, all values together tell.
         joints = [joint for values in sections.values()
-                  for joint in Parameters({JOINTS: values.get(JOINTS, ())}).joints]
+                  for joint in Parameters({'joints': values.get('joints', ())}).joints]
         return [_checked(name, values, joints) for name, values in sections.items()]
     except (ParameterError, InputError) as error:
         error.args = (f'{path}: {error}',)
@@ -264,7 +263,7 @@ def _flat(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str
 def _checked(name: str, values: Mapping[str, object], joints: Sequence[str]) -> Section:
     """A section of a file; raises InputError for its name, ParameterError for what it holds."""
     axis, node = _address(name)
-    Parameters({JOINTS: joints, **values})  # checks all names and values
+    Parameters({'joints': joints, **values})  # checks all names and values
     checked = {}
     for key, value in values.items():
         entry = entry_of(key)

@@ -21,7 +21,7 @@ REPORTED = 0.9  # share of the samples that reports have to tell of to be believ
 # interval every other time at most: 20 times in a row by a chance of one in a million.
 CONSISTENT = 20
 # Commands and reports that may wait: more than a stall of the controller can leave behind.
-REMEMBERED = 256
+KEPT_COMMANDS = 256
 
 
 class ReportUse(Enum):
@@ -81,8 +81,8 @@ class CommandHistory:
         self._period_ns = sample_period_s * 1e9
         self.output_ns = 0
         self._transit_ns = 0.0  # median time from one node to the other
-        self._published: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
-        self._reported: deque[tuple[int, float]] = deque(maxlen=REMEMBERED)
+        self._published: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
+        self._reported: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
 
     def note_transit(self, passed_ns: float) -> None:
         """Note how long an output was under way: a thousandth of a period moves the median."""

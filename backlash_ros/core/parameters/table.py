@@ -16,7 +16,7 @@ CONTROLLER, PLANT, REFERENCE_NODE, RECORDER = 'controller', 'plant', 'reference'
 BRINGUP = 'bringup'
 # Whose names the sections of a parameter file have.
 NODES = (CONTROLLER, PLANT, REFERENCE_NODE, RECORDER, BRINGUP)
-JOINTS, NOISE = 'joints', 'estimator.output_noise_std'
+NOISE = 'estimator.output_noise_std'
 
 of_both = partial(option, used_by=(CONTROLLER, PLANT))
 simulated = partial(option, used_by=(PLANT,))

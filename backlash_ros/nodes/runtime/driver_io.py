@@ -16,7 +16,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.command_history import REMEMBERED
+from backlash_ros.core.loop.command_history import KEPT_COMMANDS
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.nodes.runtime.executor import serve_polled
@@ -108,7 +108,7 @@ class DriverIo:
         self._referred = JointState()  # the newest message of references
         self._reports: Subscription | None = None
         self._reported: dict[str, deque[tuple[float, int]]] = {
-            joint: deque(maxlen=REMEMBERED) for joint in p.joint_names
+            joint: deque(maxlen=KEPT_COMMANDS) for joint in p.joint_names
         }
 
     @property
@@ -252,7 +252,7 @@ class DriverIo:
                 self._reported[joint].append((v, stamp_ns))
 
         self._reports = self._node.listen(
-            self.topics.applied_type, self.topics.applied, hear, REMEMBERED, polled=True
+            self.topics.applied_type, self.topics.applied, hear, KEPT_COMMANDS, polled=True
         )
 
     @property
