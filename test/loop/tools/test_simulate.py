@@ -95,6 +95,7 @@ def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
         (['--sweep', 'seed'], 'must be KEY=v1,v2,...'),
         (['--sweep', 'seed=1', '--sweep', 'seed=2'], 'names seed twice'),
         (['--sweep', 'backlash.m=1,-1'], 'backlash.m=-1.0 must be > 0'),
+        (['--cluster', 'tcp://x:1'], 'give --seeds or --sweep as well'),
         (['--nonsense'], 'unrecognized arguments: --nonsense'),
     ],
 )
@@ -164,6 +165,22 @@ def test_run_that_breaks_off_says_why() -> None:
 def test_bad_combination_is_refused_before_anything_runs() -> None:
     with pytest.raises(ParameterError, match=r'backlash\.c_l'):
         batch.make_jobs(Parameters(), [{'seed': 1}, {'backlash.c_l': 5.0}], [1], 1e9)
+
+
+@pytest.mark.parametrize(('address', 'installed', 'cure'), [
+    ('tcp://127.0.0.1:1', True, 'dask scheduler'), ('nonsense://x', True, 'dask scheduler'),
+    ('tcp://x:1', False, "pip install 'backlash_ros[cluster]'"),
+])
+def test_missing_cluster_is_told_in_one_line(address, installed, cure, monkeypatch, capsys):
+    if installed:
+        pytest.importorskip('distributed')
+    else:
+        monkeypatch.setitem(sys.modules, 'distributed', None)
+    monkeypatch.setattr(batch, 'CLUSTER_ANSWER_S', 0.3)
+    assert main(['--duration', '1', *NOISY, '--seeds', '6', '--cluster', address]) == 2
+    said = capsys.readouterr().err
+    assert said.count('\n') == 1
+    assert cure in said
 
 
 def is_gone(group: int) -> bool:

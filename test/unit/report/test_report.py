@@ -9,17 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_bags import LATENCY_S, PARAMETERS, TYPES, believed, write_bag
+from matplotlib.figure import Figure
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
+from backlash_ros.tools import figures
 from backlash_ros.tools import report as report
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.config import write_config
 from backlash_ros.tools.runs import figure_data
 from backlash_ros.tools.runs.bag import read_bag
-from backlash_ros.tools.runs.files import Run, write_run, write_summary
+from backlash_ros.tools.runs.files import Run, write_run
 from backlash_ros.tools.runs.read_run import read_run
 from backlash_ros.tools.runs.summary import summarise
 
@@ -107,17 +109,10 @@ def test_report_without_truth_shows_estimates_and_innovation(run, tmp_path, monk
     assert capsys.readouterr().out.strip().endswith('report.html')
 
 
-def saved(run: RunRecord, folder: Path) -> Path:
-    folder.mkdir()
-    write_run(run, folder)
-    write_config(PARAMETERS, folder / 'parameters.yaml')
-    truth = {'m': 1.3, 'c_r': 3.0, 'c_l': -3.0}
-    write_summary({'truth': truth}, folder / 'summary.json')
-    return folder
-
-
 def test_saved_results_are_read_in_full(run: RunRecord, tmp_path: Path) -> None:
-    source = read_run(saved(run, tmp_path / 'results'))
+    write_run(run, tmp_path)
+    write_config(PARAMETERS, tmp_path / 'parameters.yaml')
+    source = read_run(tmp_path)
     np.testing.assert_array_equal(source.record.rows, run.rows)
     assert source.parameters == PARAMETERS
 
@@ -133,22 +128,15 @@ def other_bag(path: Path, run: RunRecord) -> None:
         writer.add_connection('/chatter', 'std_msgs/msg/String', typestore=TYPES)
 
 
-def empty_bag(path: Path, run: RunRecord) -> None:
-    write_bag(path, RunRecord(run.rows[:0], run.sample_period))
-
-
-def empty_folder(path: Path, run: RunRecord) -> None:
-    path.mkdir()
-
-
 @pytest.mark.parametrize(
     ('make', 'message'),
     [
         (None, 'does not exist'),
         (broken_bag, 'is damaged, and nothing of it can be read'),
         (other_bag, 'holds no controller/signals, only /chatter'),
-        (empty_bag, 'holds no message of /controller/signals'),
-        (empty_folder, 'holds no bag, no record.npz and no samples.csv'),
+        (lambda path, run: write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
+         'holds no message of /controller/signals'),
+        (lambda path, run: path.mkdir(), 'holds no bag, no record.npz and no samples.csv'),
     ],
 )
 def test_unusable_input_is_one_line_and_leaves_nothing(
@@ -196,3 +184,13 @@ def test_moving_rms_is_that_of_the_newest_samples() -> None:
     small = 1e-9 / np.sqrt(2)
     expected = [3.0, 3.0, 4.0, np.sqrt(8.0), small, small]
     np.testing.assert_allclose(figure_data.moving_rms(values, 2), expected, rtol=1e-9)
+
+
+def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
+    other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
+    own, *others = figure_data.compare_laws(run, other)
+    assert own.recorded
+    assert len(own.t) == run.samples
+    assert all('gone.csv' in trace.note for trace in others)
+    part = figure_data.Part('Begin', slice(10))
+    assert isinstance(figures.draw_laws([own, *others], part), Figure)
