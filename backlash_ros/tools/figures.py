@@ -301,21 +301,21 @@ def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     return figure
 
 
-def draw_output(run: RunRecord, end: Part, reference: figure_data.FollowedReference) -> Figure:
-    """Reference and output: on one scale where y follows, else each on its own."""
-    t, y, y_m = run.column('t'), run.column('y'), reference.values
-    late = f', {reference.delay:.4g} s late' if reference.delay else ''
+def draw_output(run: RunRecord, end: Part, y_m: Array, delay: float, followed: bool) -> Figure:
+    """Reference, `delay` [s] late, and output: on one scale where y follows, else on their own."""
+    t, y = run.column('t'), run.column('y')
+    late = f', {delay:.4g} s late' if delay else ''
     rows = {
         '[unit of y]': [
             Line(t, y_m, HUES['y_m'], f'$y_m${late}', '--'), Line(t, y, HUES['y'], 'y'),
         ],
         'y minus reference [unit of y]': [Line(t, y - y_m, HUES['y'])],
-    } if reference.followed else {
+    } if followed else {
         f'reference $y_m$ [unit of $y_m$]{late}': [Line(t, y_m, HUES['y_m'])],
         'output y [unit of y]': [Line(t, y, HUES['y'])],
     }
     figure, grid = draw_panels(5.6, rows, (WHOLE_RUN, end))
-    if reference.followed:
+    if followed:
         for axes in grid[0]:
             legend_above(axes)
     return figure

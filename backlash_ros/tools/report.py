@@ -111,13 +111,13 @@ def _figures(
         'The loop as the last estimates see it: u itself was not measured.',
         figures.draw_hysteresis(run, end),
     )
-    reference = figure_data.followed_reference(run, parameters)
+    y_m, delay, followed = figure_data.followed_reference(run, parameters)
     yield (
         'output.png', 'Reference and output',
-        'y follows y<sub>m</sub>.' if reference.followed else
+        'y follows y<sub>m</sub>.' if followed else
         'Each on its own scale: y does not follow y<sub>m</sub>, nor does the structure '
         'u<sub>d</sub> = y<sub>m</sub> + f v aim at that.',
-        figures.draw_output(run, end, reference),
+        figures.draw_output(run, end, y_m, delay, followed),
     )
     yield (
         'input.png', 'Desired input and control',

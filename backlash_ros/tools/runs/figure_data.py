@@ -57,17 +57,6 @@ class ErrorCurves(NamedTuple):
     tracking: Array | None
 
 
-class FollowedReference(NamedTuple):
-    """values: the reference at each sample, shape (N,), delay [s] late.
-
-    followed: whether y comes close enough to it for both to be drawn on one scale.
-    """
-
-    values: Array
-    delay: float
-    followed: bool
-
-
 def control_error(run: RunRecord) -> Array:
     """e = u - u_d (3.4) of each sample, shape (N,); nan where u is unknown."""
     return run.column('u') - run.column('u_d')
@@ -129,12 +118,15 @@ def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
     return traces
 
 
-def followed_reference(run: RunRecord, parameters: Parameters | None) -> FollowedReference:
-    """What y is to follow: y_m, as late as the structure makes it."""
+def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[Array, float, bool]:
+    """What y is to follow, shape (N,), how late [s], and whether y comes close enough to it.
+
+    Then both are drawn on one scale.
+    """
     delay = reference_delay(parameters)
     error = delayed_tracking_error_rms(run, delay, float(run.column('t')[run.samples // 2]))
-    followed = error is not None and error < 0.5  # of the RMS of the reference
-    return FollowedReference(delayed_reference(run, delay), delay * run.sample_period, followed)
+    close = error is not None and error < 0.5  # of the RMS of the reference
+    return delayed_reference(run, delay), delay * run.sample_period, close
 
 
 def estimated_loop(run: RunRecord) -> Array:

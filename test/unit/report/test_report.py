@@ -170,11 +170,11 @@ def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
 def test_output_is_compared_with_the_reference_as_late_as_the_structure_makes_it() -> None:
     tracking = Parameters({'structure': 'tracking', 'amplitude': 0.2, 'tracking.preview': 60})
     run = build_closed_loop(tracking).run(300)
-    reference = figure_data.followed_reference(run, tracking)
-    assert reference.delay == pytest.approx(0.6)
-    np.testing.assert_array_equal(reference.values[60:], run.column('y_m')[:-60])
-    assert reference.followed
-    assert not figure_data.followed_reference(run, None).followed
+    y_m, delay, followed = figure_data.followed_reference(run, tracking)
+    assert delay == pytest.approx(0.6)
+    np.testing.assert_array_equal(y_m[60:], run.column('y_m')[:-60])
+    assert followed
+    assert not figure_data.followed_reference(run, None)[2]
     late, prompt = (summarise(run, known)['tracking_error_rms'] for known in (tracking, None))
     assert late < 0.5 < prompt
 
