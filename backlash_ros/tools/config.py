@@ -233,7 +233,13 @@ def _read_sections(path: Path) -> list[Section]:
     try:
         if not isinstance(document, dict) or not document:
             raise InputError('must hold "/**: {ros__parameters: {...}}"')
-        sections = {str(name): _section_values(content) for name, content in document.items()}
+        sections = {}
+        for name, content in document.items():
+            if not isinstance(content, dict) or set(content) != {'ros__parameters'}:
+                raise InputError('each section must hold ros__parameters and nothing else')
+            if not isinstance(content['ros__parameters'], dict):
+                raise InputError('ros__parameters must hold "name: value" lines')
+            sections[str(name)] = dict(_flat(content['ros__parameters']))
         # What is wrong with the values of a joint, all values together tell.
         joints = [joint for values in sections.values()
                   for joint in Parameters({'joints': values.get('joints', ())}).joints]
@@ -241,15 +247,6 @@ def _read_sections(path: Path) -> list[Section]:
     except (ParameterError, InputError) as error:
         error.args = (f'{path}: {error}',)
         raise
-
-
-def _section_values(content: object) -> dict[str, object]:
-    """What a section holds, by flat name."""
-    if not isinstance(content, dict) or set(content) != {'ros__parameters'}:
-        raise InputError('each section must hold ros__parameters and nothing else')
-    if not isinstance(content['ros__parameters'], dict):
-        raise InputError('ros__parameters must hold "name: value" lines')
-    return dict(_flat(content['ros__parameters']))
 
 
 def _flat(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:

@@ -79,11 +79,6 @@ class RunPlan:
     out: Path
     live_port: int | None = None
 
-    @property
-    def endless(self) -> bool:
-        """Whether only the user ends it."""
-        return any(axis.parameters.samples == 0 for axis in self.axes)
-
 
 def prepare(options: argparse.Namespace) -> RunPlan:
     """Check all input, then make the result folders; raises ParameterError or InputError.

@@ -181,8 +181,9 @@ class RunWatch:
     @property
     def _over(self) -> bool:
         """Whether the user ends a run that has no other end."""
-        return self._requests.count > 0 and self._plan.endless and \
-            all(axis.made > 0 for axis in self._axes.values())
+        endless = any(axis.parameters.samples == 0 for axis in self._plan.axes)
+        begun = all(axis.made > 0 for axis in self._axes.values())
+        return self._requests.count > 0 and endless and begun
 
     def _wait_until_ready(self) -> None:
         deadline = time.monotonic() + READY_DEADLINE_S

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,9 @@ from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.runs.files import Run
 
 Array = NDArray[np.float64]
-# Messages of an array topic by label, shape (N,) each, and their `stamp` [s].
+# Messages of an array topic by label, shape (N,) each, and their `stamp` [ns] since the first.
 Table = dict[str, Array]
+Fields = dict[str, list[float]]  # of a LearnedModel
 
 # By which a topic is known whose node was renamed.
 ARRAY_LABELS = {
@@ -131,7 +132,7 @@ def read_bag(
     content = read_topics(path, lambda topic: topic.name.rpartition('/')[2] in last_parts
                           and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
-        tables, learned, notes = _find_tables(path, content, axis, span)
+        tables, models, notes = _find_tables(path, content, axis)
     except InputError as error:
         raise InputError(f'{error}; {content.damage}' if content.damage else str(error)) from None
     restarted = _choose_section(tables, span)
@@ -149,6 +150,8 @@ def read_bag(
             f'the sample period of {sample_period:.6g} s was taken from the stamps of the bag, '
             'as no parameters were given'
         )
+    within = [fields for stamp, fields in models
+              if signals['stamp'][0] <= stamp < span.to_s * 1e9]
     columns = {
         **_rows(signals, of_signals), **_rows(estimates, of_estimates),
         't': (count - count[0]) * sample_period,
@@ -163,16 +166,16 @@ def read_bag(
     unknown = np.full(count.size, np.nan)
     record = RunRecord(
         np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
-        int(heard[-1] - heard[0]) + 1 - heard.size, learned,
+        int(heard[-1] - heard[0]) + 1 - heard.size, _learned_model(within[-1:]),
     )
     notes = [content.damage, *notes, restarted]
     return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
 
 
 def _find_tables(
-    path: Path, content: Content, axis: str, span: Span,
-) -> tuple[list[Table], LearnedModel | None, list[str]]:
-    """Signals, estimates and truth of one axis or joint, G as learned, what else is there."""
+    path: Path, content: Content, axis: str,
+) -> tuple[list[Table], list[tuple[int, Fields]], list[str]]:
+    """Signals, estimates and truth of one axis or joint, G with its stamps, what else is there."""
     messages = content.messages.get(choose_namespace(_names_of(content, topics.SIGNALS), '')[0])
     labels = [each.label for each in messages[0][1].layout.dim] if messages else []
     joints = list(dict.fromkeys(label.rpartition('.')[0] for label in labels if '.' in label))
@@ -201,8 +204,10 @@ def _find_tables(
             of_axis = f' of axis {axis}' if axis else ''
             raise InputError(f'{path}: holds no {topic}{of_axis}, only {heard}')
     models = content.messages.get(choose_namespace(_names_of(content, topics.MODEL), axis)[0], ())
-    within = [message for stamp, message in models if 0 <= stamp - begin_ns < span.to_s * 1e9]
-    return tables, _newest_model(within, joint), notes
+    fields = [(stamp - begin_ns, _fields_of(message, joint)) for stamp, message in models]
+    # Of a joint that was not answered there is nothing but nan.
+    known = [each for each in fields if not all(map(isnan, chain(*each[1].values())))]
+    return tables, known, notes
 
 
 def _names_of(content: Content, topic: str) -> list[str]:
@@ -232,7 +237,7 @@ def _tabulate(
         raise InputError(f'{path}: {topic} lacks {", ".join(missing)}')
     # A joint that was not answered has a row of nan.
     answered = ~np.isnan(list(table.values())).all(axis=0)
-    table['stamp'] = np.array([(stamp - begin_ns) * 1e-9 for stamp, _ in messages])
+    table['stamp'] = np.array([stamp - begin_ns for stamp, _ in messages], dtype=np.float64)
     return _rows(table, answered if joint else slice(None))
 
 
@@ -247,7 +252,8 @@ def _choose_section(tables: list[Table], span: Span) -> str:
     Returns what was left out in one sentence, '' for nothing.
     """
     for i, table in enumerate(tables):
-        tables[i] = _rows(table, (table['stamp'] >= span.from_s) & (table['stamp'] < span.to_s))
+        t = table['stamp']
+        tables[i] = _rows(table, (t >= span.from_s * 1e9) & (t < span.to_s * 1e9))
     signals, note = tables[0], ''
     restarts = np.flatnonzero(np.diff(signals['sample']) <= 0) + 1
     # Where the count falls back that often, two nodes are at work.
@@ -258,7 +264,7 @@ def _choose_section(tables: list[Table], span: Span) -> str:
         note = (
             f'the controller restarted its count {restarts.size} time'
             f'{"s" if restarts.size > 1 else ""}: this is what follows the last restart, '
-            f'{cut:.1f} s after the beginning; --from and --to choose another part'
+            f'{cut * 1e-9:.1f} s after the beginning; --from and --to choose another part'
         )
         # Signals by rows, as stamps of a simulated time may be equal.
         tables[:] = [_rows(signals, slice(restarts[-1], None)),
@@ -291,26 +297,24 @@ def _true_columns(v: Array, count: Array, truth: Table) -> Table:
 def _median_period(path: Path, count: Array, stamps: Array) -> float:
     if count.size < 2:
         raise InputError(f'{path}: one sample does not show the sample period: give --config')
-    period = float(np.median(np.diff(stamps) / np.diff(count)))
+    period = float(np.median(np.diff(stamps) / np.diff(count))) * 1e-9
     if not period > 0.0:
         raise InputError(f'{path}: its stamps do not show the sample period: give --config')
     return period
 
 
-def _newest_model(messages: Sequence[Any], joint: str) -> LearnedModel | None:
-    """The last G that was published; one that is not complete is none."""
+def _fields_of(message: Any, joint: str) -> Fields:
+    """What a message tells of G, of several joints what is about one."""
     prefix = f'{joint}.' if joint else ''
-    for message in reversed(messages):
-        ends = np.cumsum([each.size for each in message.layout.dim])
-        fields = {
-            each.label.removeprefix(prefix): values.tolist() for each, values in
-            zip(message.layout.dim, np.split(message.data, ends), strict=False)
-            if each.label.startswith(prefix)
-        }
-        # Of a joint that was not answered there is nothing but nan.
-        if not all(isnan(value) for values in fields.values() for value in values):
-            try:
-                return from_fields(fields)
-            except (KeyError, IndexError, ValueError):
-                return None
-    return None
+    ends = np.cumsum([each.size for each in message.layout.dim])
+    parts = zip(message.layout.dim, np.split(message.data, ends), strict=False)
+    return {each.label.removeprefix(prefix): values.tolist() for each, values in parts
+            if each.label.startswith(prefix)}
+
+
+def _learned_model(newest: Sequence[Fields]) -> LearnedModel | None:
+    """G as it was published last; none where that was not complete."""
+    try:
+        return from_fields(newest[0])
+    except (KeyError, IndexError, ValueError):
+        return None
