@@ -82,9 +82,14 @@ def test_the_file_is_a_complete_configuration(result: Path) -> None:
 
 
 @pytest.mark.usefixtures('undrawn')
-def test_the_loop_with_the_file_follows(result: Path, tmp_path: Path) -> None:
-    out = tmp_path / 'out'
-    assert simulate.main(['--config', str(result / 'identified.yaml'), '--duration', '5',
+@pytest.mark.parametrize('offset', [0.0, 40.0])
+def test_the_loop_with_the_file_follows_wherever_0_of_v_is(tmp_path: Path, offset: float) -> None:
+    v, y = record()
+    source, out = write_csv(tmp_path / 'a.csv', v + offset, y), tmp_path / 'out'
+    assert main([str(source), *QUICK, '--integrator', 'no', '--out', str(tmp_path)]) == 0
+    initial = effective_parameters(tmp_path / 'identified.yaml').estimator.initial
+    assert (initial.c_r, initial.c_l) == pytest.approx((0.5 + offset, -0.4 + offset), abs=0.01)
+    assert simulate.main(['--config', str(tmp_path / 'identified.yaml'), '--duration', '5',
                           '--out', str(out)]) == 0
     assert json.loads((out / 'summary.json').read_text())['tracking_error_rms'] < 0.05
 
