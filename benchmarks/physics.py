@@ -20,9 +20,7 @@ import numpy as np
 from gears.gear_figures import draw_hysteresis
 from gears.gear_runs import (
     MOTIONS,
-    PERIODS,
     PRESETS,
-    STROKES_S,
     Identified,
     Run,
     close_loop,
@@ -37,8 +35,6 @@ from gears.gear_runs import (
 from reporting import ROOT, machine, markdown_table, parallel, processors, text_table
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters.parameter import Value
-from backlash_ros.tools.config import parse_setting
 
 DOCUMENT = ROOT / 'docs' / 'physics.md'
 IMAGES = ROOT / 'docs' / 'images'
@@ -82,36 +78,33 @@ class Case:
         return (self.none - loop.error) / self.none
 
 
-def find(job: tuple[str, bool, float, float]) -> Source:
-    """Identify one preset, at a share of its largest speed, within so many seconds."""
-    preset, encoder, rate, seconds = job
+def find(job: tuple[str, bool]) -> Source:
+    """Identify one preset."""
+    preset, encoder = job
     v, motor, load = quasi_static(PRESETS[preset])
     return Source(
         preset, encoder, lost_motion(motor if encoder else v, load),
-        identified(PRESETS[preset], encoder, rate, seconds),
+        identified(PRESETS[preset], encoder),
     )
 
 
-def judge(job: tuple[str, Source, Source, dict[str, Value], int]) -> Case:
-    """All loops of one motion; those that learn: some parameters changed, so many periods."""
-    motion, command, encoder, changes, periods = job
+def judge(job: tuple[str, Source, Source]) -> Case:
+    """All loops of one motion."""
+    motion, command, encoder = job
     gear, parameters = PRESETS[command.preset], command.identified.parameters
-    none = nan
-    if parameters is not None:
-        none = uncompensated(gear, parameters, motion).error
+    none = nan if parameters is None else uncompensated(gear, parameters, motion).error
     return Case(
-        command.preset, motion, command.lost, none,
-        (_loop(command, motion, changes, periods), _loop(encoder, motion, changes, periods)),
+        command.preset, motion, command.lost, none, (_loop(command, motion), _loop(encoder, motion))
     )
 
 
-def _loop(source: Source, motion: str, changes: dict[str, Value], periods: int) -> Loop:
+def _loop(source: Source, motion: str) -> Loop:
     parameters, gear = source.identified.parameters, PRESETS[source.preset]
     if parameters is None:
         return Loop(nan, nan, nan, '', source.identified.refused)
     try:
-        controller = learning(source.identified.found, parameters.replaced(changes))
-        run = close_loop(gear, controller, motion, source.encoder, periods)
+        controller = learning(source.identified.found, parameters)
+        run = close_loop(gear, controller, motion, source.encoder)
     except (ArithmeticError, ValueError) as error:
         return Loop(nan, nan, nan, '', str(error))
     return Loop(
@@ -196,25 +189,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--preset', action='append', choices=PRESETS)
     parser.add_argument('--motion', action='append', choices=MOTIONS)
-    parser.add_argument('--rate', type=float, default=1.0, metavar='SHARE',
-                        help='of the largest speed, for identification, as `identify --rate`')
-    parser.add_argument('--duration', type=float, default=STROKES_S, metavar='S',
-                        help='of the motion for identification')
-    parser.add_argument('--periods', type=int, default=PERIODS, help='of the motion')
-    parser.add_argument('--parameter', action='append', default=[], metavar='KEY=VALUE',
-                        help='change the identified file for the loops that learn')
     parser.add_argument('--processes', type=int, default=processors(), metavar='N',
                         help='that compute beside each other')
     parser.add_argument('--write', action='store_true', help=f'write into {DOCUMENT.name}')
     options = parser.parse_args()
     presets, motions = options.preset or list(PRESETS), options.motion or list(MOTIONS)
     sources = parallel(
-        find, [(p, e, options.rate, options.duration) for p in presets for e in (False, True)],
+        find, [(preset, encoder) for preset in presets for encoder in (False, True)],
         'identification', options.processes,
     )
-    changes = {one.name: one.value for one in map(parse_setting, options.parameter)}
     cases = parallel(
-        judge, [(motion, *sources[2 * i:2 * i + 2], changes, options.periods)
+        judge, [(motion, *sources[2 * i:2 * i + 2])
                 for i in range(len(presets)) for motion in motions], 'loops', options.processes,
     )
     found, rows, bad = found_rows(sources), rows_of(cases), wrong(cases)
