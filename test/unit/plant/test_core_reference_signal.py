@@ -1,6 +1,7 @@
-"""Reference signals y_m(t)."""
+"""Reference signals y_m(t), from a formula or from a CSV file."""
 
 from math import pi
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -65,3 +66,27 @@ def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(k, period):
 def test_unknown_waveform_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"waveform='sin' must be one of sine, "):
         signal('sin')
+
+
+@pytest.mark.parametrize(
+    ('text', 'complaint'),
+    [
+        ('', 'header t,y_m'),
+        ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
+        ('t,y_m\n0,1\n0.02,2\n', 'line 3 must hold t=0.01'),
+        ('t,y_m\n0,nan\n', 'finite y_m'),
+        ('t,y_m\n', 'at least one sample'),
+    ],
+)
+def test_a_reference_file_is_refused_with_its_line(tmp_path, text, complaint):
+    file = tmp_path / 'reference.csv'
+    file.write_text(text)
+    with pytest.raises(ParameterError, match=complaint):
+        signal('file', file=str(file))
+
+
+def test_a_reference_file_gives_one_value_per_period(tmp_path: Path) -> None:
+    file = tmp_path / 'reference.csv'
+    file.write_text('t,y_m\n0,1\n0.010000001,-2.5\n')
+    reference = signal('file', file=str(file))
+    assert [reference(t) for t in (0.0, 0.01, 7.0)] == [1.0, -2.5, -2.5]
