@@ -15,7 +15,7 @@ def test_documented_table_is_the_one_that_runs() -> None:
     assert {(Phase(a), Event(b)): Phase(c) for a, b, c, _ in rows} == NEXT
 
 
-@pytest.mark.parametrize(('phase', 'event'), product(Phase, Event))
+@pytest.mark.parametrize(('phase', 'event'), list(product(Phase, Event)))
 def test_a_loop_that_stands_down_is_woken_by_nothing_but_the_end_of_its_rival(phase, event):
     following = after(phase, event)
     if phase is Phase.STANDS_DOWN:

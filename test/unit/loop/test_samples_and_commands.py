@@ -1,13 +1,20 @@
 """Which sample a message holds, and which v the plant had: the bookkeeping of the controller."""
 
-from math import isnan
+from math import inf, isnan
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from backlash_ros.core.loop.command_history import CONSISTENT, CommandHistory, ReportUse, report_use
+from backlash_ros.core.loop.command_history import (
+    CONSISTENT,
+    CommandHistory,
+    HeldControl,
+    ReportUse,
+    report_use,
+    v_of_intervals,
+)
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Arrival, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
@@ -29,21 +36,16 @@ def stamps_of(gaps: list[int], delays: list[float]) -> list[int]:
     ]
 
 
-@given(gaps, delays)
-def test_time_stamps_alone_tell_every_missing_sample(gaps: list[int], delays: list[float]) -> None:
+@given(gaps, delays, st.booleans())
+def test_time_stamps_tell_every_missing_sample_though_the_numbers_have_no_gap(gaps, delays, known):
     counter = SampleCounter(PERIOD_S)
-    counted = [counter.count(stamp).missing for stamp in stamps_of(gaps, delays)]
-    assert counted == [0, *gaps]
-    assert counter.index == sum(gaps) + len(gaps)
-
-
-@given(gaps, delays)
-def test_outputs_never_published_show_in_time_though_the_numbers_have_no_gap(gaps, delays):
-    counter = SampleCounter(PERIOD_S)
-    stamps = stamps_of(gaps, delays)
-    arrivals = [counter.count(stamp, 1 + i) for i, stamp in enumerate(stamps)]
+    arrivals = [
+        counter.count(stamp, 1 + i if known else UNNUMBERED)
+        for i, stamp in enumerate(stamps_of(gaps, delays))
+    ]
     assert [arrival.missing for arrival in arrivals] == [0, *gaps]
-    assert [arrival.unsent for arrival in arrivals] == [0, *gaps]
+    assert [arrival.unsent for arrival in arrivals] == [0, *(gaps if known else [0] * len(gaps))]
+    assert counter.index == sum(gaps) + len(gaps)
 
 
 @given(gaps)
@@ -297,3 +299,47 @@ def test_of_two_senders_one_is_used_from_the_start(first, second, offset, number
                 used.append(sender)
     assert len(used) <= 202
     assert len(set(used[10:])) == 1
+
+
+@pytest.mark.parametrize(('periods_ago', 'applied'), [
+    (0.4, [1.0, 1.0, 2.0]), (1.0, [1.0, 2.0, 2.0]), (5.0, [2.0, 2.0, 2.0]),
+])
+def test_control_acts_from_its_arrival_though_the_plant_was_held_up(periods_ago, applied):
+    now_ns = 100 * PERIOD_NS
+    held = HeldControl()
+    for v, ago in ((1.0, 9.0), (2.0, periods_ago)):
+        held.take(v, now_ns - int(ago * PERIOD_NS))
+    ended_ns = [now_ns - 1.5 * PERIOD_NS, now_ns - 0.5 * PERIOD_NS, inf]
+    assert [held.over(each) for each in ended_ns] == applied
+    assert held.newest == 2.0
+
+
+def told(
+    index: list[int], outputs: list[float], stamps: list[float], reported: bool,
+) -> list[float]:
+    """v of the intervals, where the messages of v are numbered from 0; times in sample periods."""
+    v = v_of_intervals(
+        np.array(index), (np.array(outputs) * 1e6).astype(np.int64),
+        (np.array(stamps) * 1e6).astype(np.int64), np.arange(float(len(stamps))), reported,
+    )
+    return np.nan_to_num(v, nan=-1.0).tolist()
+
+
+def test_the_newest_command_acts_that_is_there_when_the_interval_ends() -> None:
+    assert told([0, 1, 2], [0.0, 1.0, 2.0], [0.1, 1.1, 1.2], False) == [0.0, 2.0, 2.0]
+
+
+def test_reports_of_a_driver_that_was_held_up_are_taken_in_their_order() -> None:
+    # It wakes at 4 and reports three intervals at once, of which it has sampled the last only.
+    late = [0.99, 3.97, 3.98, 3.99, 4.99]
+    assert told([0, 1, 4, 5], [0.0, 1.0, 4.0, 5.0], late, True) == [0.0, 1.0, 2.0, 3.0, 4.0, 4.0]
+
+
+def test_a_report_alone_holds_for_all_that_was_not_sampled() -> None:
+    late = [0.99, 3.99, 4.99]
+    assert told([0, 1, 4, 5], [0.0, 1.0, 4.0, 5.0], late, True) == [0.0, 1.0, 1.0, 1.0, 2.0, 2.0]
+
+
+def test_reports_in_any_other_number_are_taken_by_their_time() -> None:
+    late = [0.99, 1.99, 3.99, 4.99]
+    assert told([0, 1, 4, 5], [0.0, 1.0, 4.0, 5.0], late, True) == [0.0, 1.0, 1.0, 2.0, 3.0, 3.0]
