@@ -21,6 +21,8 @@ NOISE = 'estimator.output_noise_std'
 of_both = partial(option, used_by=(CONTROLLER, PLANT))
 simulated = partial(option, used_by=(PLANT,))
 of_reference = partial(option, used_by=(REFERENCE_NODE,))
+of_node = partial(option, per_node=True, fixed=True)
+silence = partial(option, unit='s', low=0.0, high=3600.0, live=True, per_node=True)
 
 
 @dataclass(frozen=True)
@@ -194,15 +196,12 @@ class ControlLimits:
 class Timeouts:
     """How long silences and the last ramp may be."""
 
-    plant_output: float = option(
-        0.5, 'longest silence of plant_output before on_timeout is done, 0 for never', 's',
-        low=0.0, high=3600.0, live=True, per_node=True)
-    reference: float = option(
-        1.0, 'longest silence of reference before it is reported, 0 for never', 's', low=0.0,
-        high=3600.0, live=True, per_node=True)
-    ramp: float = option(
-        0.5, 'longest ramp at the end; a v that is not at zero by then is held', 's', low=0.0,
-        high=3600.0, live=True, per_node=True)
+    plant_output: float = silence(
+        0.5, 'longest silence of plant_output before on_timeout is done, 0 for never')
+    reference: float = silence(
+        1.0, 'longest silence of reference before it is reported, 0 for never')
+    ramp: float = silence(
+        0.5, 'longest ramp at the end; a v that is not at zero by then is held')
 
 
 @dataclass(frozen=True)
@@ -222,30 +221,29 @@ class SavedEstimates:
 class DriverMessages:
     """Messages from and to the driver."""
 
-    style: str = option(
+    style: str = of_node(
         'native', 'native: Float64 on plant_output and control; ros2_control: JointState on '
         'joint_states and Float64MultiArray on forward_command_controller/commands; '
         'joint_state_topic: JointState, references on robot_joint_command, outputs on '
         'robot_joint_states, commands as io.command says',
         choices=('native', 'ros2_control', 'joint_state_topic'),
-        used_by=(CONTROLLER, REFERENCE_NODE, RECORDER), per_node=True, fixed=True)
-    command: str = option(
+        used_by=(CONTROLLER, REFERENCE_NODE, RECORDER))
+    command: str = of_node(
         'joint_state', 'joint_state_topic: JointState on joint_commands, or an array of all '
         'joints on forward_command_controller/commands', choices=('joint_state', 'array'),
-        used_by=(CONTROLLER, RECORDER), per_node=True, fixed=True)
-    together: bool = option(
+        used_by=(CONTROLLER, RECORDER))
+    together: bool = of_node(
         True, 'where one joint is silent for timeout.plant_output, all joints do on_timeout, '
-        'until it is back', per_node=True, fixed=True)
-    joint: str = option(
+        'until it is back')
+    joint: str = of_node(
         '', 'name of the joint in JointState, empty where there is just one',
-        used_by=(CONTROLLER, REFERENCE_NODE), per_node=True, fixed=True)
-    field: str = option(
+        used_by=(CONTROLLER, REFERENCE_NODE))
+    field: str = of_node(
         'position', 'what of the joint is y in JointState',
-        choices=('position', 'velocity', 'effort'), used_by=(CONTROLLER, REFERENCE_NODE),
-        per_node=True, fixed=True)
-    best_effort: bool = option(
+        choices=('position', 'velocity', 'effort'), used_by=(CONTROLLER, REFERENCE_NODE))
+    best_effort: bool = of_node(
         False, 'listen to a driver that publishes best effort, which may lose messages',
-        used_by=(CONTROLLER, REFERENCE_NODE, RECORDER), per_node=True, fixed=True)
+        used_by=(CONTROLLER, REFERENCE_NODE, RECORDER))
 
 
 @dataclass(frozen=True)
@@ -296,13 +294,13 @@ class ParameterTree:
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True)
     plant: PlantModel = PlantModel()
     actuator: ActuatorModel = ActuatorModel()
-    lockstep: bool = option(
+    lockstep: bool = of_node(
         False,
         'run as fast as the machine allows: each sample waits for its reference and its control',
-        used_by=(CONTROLLER, PLANT, REFERENCE_NODE, RECORDER), per_node=True, fixed=True)
-    wait_for_subscribers: int = option(
+        used_by=(CONTROLLER, PLANT, REFERENCE_NODE, RECORDER))
+    wait_for_subscribers: int = of_node(
         0, 'start only when the main topic has this many listeners', low=0,
-        used_by=(CONTROLLER, PLANT, REFERENCE_NODE), per_node=True, fixed=True)
+        used_by=(CONTROLLER, PLANT, REFERENCE_NODE))
     estimator: EstimatorOptions = EstimatorOptions()
     lms: LmsSteps = LmsSteps()
     gradient: GradientStep = GradientStep()
@@ -315,9 +313,7 @@ class ParameterTree:
     inverse: InverseOptions = InverseOptions()
     fixed: FixedDoubt = FixedDoubt()
     control: ControlLimits = ControlLimits()
-    autostart: bool = option(
-        True, 'configure and activate at the start, without being asked', per_node=True,
-        fixed=True)
+    autostart: bool = of_node(True, 'configure and activate at the start, without being asked')
     on_stop: str = option(
         'hold', 'last command at deactivation and at the end: v is held, set to zero as fast as '
         'control.rate_max allows (none: at once), or ramped to zero at control.rate_max, which '
@@ -331,9 +327,9 @@ class ParameterTree:
         choices=('stand_down', 'warn'), live=True, per_node=True)
     timeout: Timeouts = Timeouts()
     estimates: SavedEstimates = SavedEstimates()
-    joints: tuple[str, ...] = option(
+    joints: tuple[str, ...] = of_node(
         (), 'joints of an arm, each a loop of its own in one controller, in the order of their '
-        'commands in an array; empty for one loop', per_node=True, fixed=True)
+        'commands in an array; empty for one loop')
     io: DriverMessages = DriverMessages()
     backlash: SimulatedBacklash = SimulatedBacklash()
     output_noise_std: float = simulated(0.0, 'simulated noise on y', 'y', low=0.0, live=True)
