@@ -139,26 +139,30 @@ def afresh(
         return best
     best = _begun_elsewhere(p, best)
     apart, best = spread(best, fits), p.with_intervals(best)
-    return replace(with_walk(p, best) if walks else best, spread=apart)
+    return replace(with_walk(setup, p, best) if walks else best, spread=apart)
 
 
-def with_walk(p: Problem, f: Fit) -> Fit:
+def with_walk(setup: Setup, p: Problem, f: Fit) -> Fit:
     """The fit, or one where u walks as well if that explains why residuals are correlated.
 
-    One that walks already is compared with one that does not in the same way.
+    One that walks already is compared with one that does not in the same way; a walk that is
+    configured is the least.
     """
-    best = f
-    if f.walk_std:
-        still = p.walking(0.0)
+    best, least = f, setup.walk_std
+    if f.walk_std > least:
+        still = p.walking(least)
         best = still.with_intervals(still.fitted(f.without_intervals))
     if not best.valid or not best.systematic:
         return best
     for share in WALKS:
-        walking = p.walking(share * f.m * f.gap / sqrt(len(p.v)))
+        walk_std = share * f.m * f.gap / sqrt(len(p.v))
+        if walk_std <= least:
+            continue
+        walking = p.walking(walk_std)
         begin = replace(f.without_intervals, knots=np.zeros(0))
         g = walking.with_intervals(walking.fitted(begin, FIRST_STEPS))
         of_best, of_g = (each.evidence for each in walking.comparable([best, g]))
-        if g.valid and of_g > of_best + (0.0 if best.walk_std else FAR_BEHIND):
+        if g.valid and of_g > of_best + (0.0 if best.walk_std > least else FAR_BEHIND):
             best = g
     return best
 

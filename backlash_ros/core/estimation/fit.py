@@ -82,7 +82,8 @@ class Problem:
         return other
 
     def _walk_by(self, walk_std: float) -> None:
-        self._hats, self.walk_std = _hats(len(self.v) if walk_std else 0), walk_std
+        count, self.walk_std = len(self.v), walk_std
+        self._hats = _hats(count) if walk_std else np.zeros((0, count))
 
     @property
     def _knot_std(self) -> float:
@@ -165,18 +166,19 @@ class Problem:
         """
         weights = self.weights(f)
         _, score, information = self._likelihood(f)
-        jacobian = self.jacobian(f)
         x = _padded(f.x, len(self.family.at(f.xi)[1]) - 1)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
-        root = np.sqrt(information * weights)
-        target = (jacobian @ beta + score / information) * root
-        rows = np.empty((len(self.v), len(beta) + 1), order='F')
-        np.multiply(jacobian, root[:, None], out=rows[:, :-1])
-        rows[:, -1] = target
-        stack = np.concatenate([rows, *self._beside(replace(f, x=x), len(beta), held)])
+        beside = np.concatenate(self._beside(replace(f, x=x), len(beta), held))
+        count = len(self.v)
+        stack = np.empty((count + len(beside), len(beta) + 1), order='F')
+        rows, stack[count:] = stack[:count], beside
+        jacobian = self.jacobian(f, rows[:, :-1])
+        rows[:, -1] = jacobian @ beta + score / information
+        rows *= np.sqrt(information * weights)[:, None]
         scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
         scale[-1] = 1.0
-        r = _lapack().dgeqrf(np.asfortranarray(stack / scale))[0][:len(beta) + 1]
+        stack /= scale
+        r = _lapack().dgeqrf(stack, overwrite_a=1)[0][:len(beta) + 1]
         return self._solved(
             f, np.triu(r) * scale, len(x), float(weights.sum()),
             min(most_scale, self.most_scale)
@@ -185,31 +187,33 @@ class Problem:
     def _knots_of(self, f: Fit) -> Array:
         return f.knots if len(f.knots) == len(self._hats) else np.zeros(len(self._hats))
 
-    def jacobian(self, f: Fit) -> Array:
-        """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P)."""
+    def jacobian(self, f: Fit, out: Array | None = None) -> Array:
+        """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P); out: where they are written."""
         b, a = self.family.at(f.xi)
         one = self._evaluated(f)
-        p, u, y = one.p, one.u, one.y
-        side = engaged(self.v, p, max(f.gap, 0.0))
+        side = engaged(self.v, one.p, max(f.gap, 0.0))
         # A side that has not moved p yet leaves it where it began.
-        side[:int(np.argmax(np.append(p != f.p0, True)))] = NEITHER
+        side[:int(np.argmax(np.append(one.p != f.p0, True)))] = NEITHER
         count, order, walks = len(self.v), len(a) - 1, len(self._hats)
-        impulse = np.zeros(count)
-        impulse[0] = 1.0
-        columns = np.array([f.m * (side == NEITHER), p, -np.ones(count), f.m * (side == LEFT),
-                            *self._hats])
-        once = lfilter([1.0], a, np.concatenate([columns, [u, y, impulse]]))
-        out = np.empty((count, order + walks + 4 + self.family.count), order='F')
+        at = order + walks + 4
+        if out is None:
+            out = np.empty((count, at + self.family.count), order='F')
+        columns = np.zeros((walks + 7, count))
+        columns[0], columns[1], columns[2] = side == NEITHER, one.p, -1.0
+        columns[3], columns[4:-3] = side == LEFT, self._hats
+        columns[[0, 3]] *= f.m
+        columns[-3], columns[-2], columns[-1, 0] = one.u, -one.y, 1.0
+        once = lfilter([1.0], a, columns)
         for i in range(order):
             out[:i, i], out[i:, i] = 0.0, once[-1, :count - i]
         forced = lfilter(b, [1.0], once[:-3])
-        out[:, order:order + walks] = forced[4:].T
-        out[:, order + walks:order + walks + 4] = forced[:4].T
-        db, da = self.family.slopes(f.xi)
-        for j in range(self.family.count):
-            out[:, order + walks + 4 + j] = (
-                lfilter(db[j], [1.0], once[-3]) - lfilter(da[j], [1.0], once[-2])
-            )
+        out[:, order:order + walks], out[:, order + walks:at] = forced[4:].T, forced[:4].T
+        if self.family.count:
+            slopes = np.stack(self.family.slopes(f.xi), axis=1)
+            late = np.zeros((*slopes.shape[1:], count))  # u / A and -y / A, so many samples later
+            for i in range(late.shape[1]):
+                late[:, i, i:] = once[-3:-1, :count - i]
+            out[:, at:] = np.tensordot(late, slopes, ((0, 1), (1, 2)))
         return out
 
     def _beside(self, f: Fit, size: int, held: bool) -> list[Array]:
@@ -368,10 +372,10 @@ class Problem:
         """
         r = np.where(self.known, self.y - self.output(f), 0.0)
         w = self.weights(f) if w is None else w
-        log_density, score, information = likelihood(r, f.noise_std, f.step)
+        log_density, score, information = self._likelihood(f)
         known = self.known
         count = float(w.sum())
-        whole = score / sqrt(float(information.mean())) if f.step else r / f.noise_std
+        whole = score / sqrt(float(information[known].mean())) if f.step else r / f.noise_std
         e = whole * np.sqrt(w)
         squares = max(float(e @ e), 1e-300)
         lags = (1, 2, 4, 8) if f.step else (1,)
@@ -448,7 +452,7 @@ def walk(knots: Array, count: int) -> Array:
 
 def _hats(count: int) -> Array:
     """How d depends on its knots, shape (W, count)."""
-    knots = min(max(count // KNOT_SAMPLES, 1), KNOTS) if count else 0
+    knots = min(max(count // KNOT_SAMPLES, 1), KNOTS)
     return np.array([walk(row, count) for row in np.eye(knots)])
 
 

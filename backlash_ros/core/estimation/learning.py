@@ -208,7 +208,8 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
         after = replace(after, thorough_at=int(1.4 * count))
         short = count <= SHORT_SEARCH and before.older is None
         fit = replace(problem.with_intervals(fit), spread=fit.spread * 0.0)
-        fit = with_walk(problem, _beside_others(setup, record, problem, fit) if short else fit)
+        fit = _beside_others(setup, record, problem, fit) if short else fit
+        fit = with_walk(setup, problem, fit)
     else:
         fit = problem.finished(fit)
     after = replace(after, fit=fit)
