@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from math import inf, isfinite
 from typing import Any
 
@@ -27,8 +28,6 @@ from backlash_ros.nodes.runtime.messages import (
 )
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
-
-LATE, MISSED, BAD = 'late controls', 'missed outputs', 'non-finite controls dropped'
 
 
 class PlantTopics:
@@ -90,7 +89,7 @@ class PlantNode(ProcessNode):
         self._started = False
         self._held = HeldControl()  # times of arrival on the monotonic clock
         self._heard = self._expecting = False  # a first v; none since the newest output
-        self._counts = {LATE: 0, MISSED: 0, BAD: 0}
+        self._counts: Counter[str] = Counter()
         self._published = PlantTopics(self)
         self.listen(Float64, topics.CONTROL, self._on_control, 1)
         let_parameters_change(self, build_plant, self._take_up)
@@ -131,7 +130,7 @@ class PlantNode(ProcessNode):
     def _on_control(self, message: Float64, info: dict[str, Any]) -> None:
         v = message.data
         if not isfinite(v):
-            self._counts[BAD] += 1
+            self._counts['non-finite controls dropped'] += 1
             return
         self._held.take(v, arrival_ns(info['received_timestamp']))
         expected, self._expecting, self._heard = self._expecting, False, True
@@ -171,8 +170,8 @@ class PlantNode(ProcessNode):
 
     def _on_tick(self, passed: int, due_ns: int) -> None:
         """Simulate the periods that have passed, the last one until due_ns, and publish y."""
-        self._counts[LATE] += self._expecting and self._heard
-        self._counts[MISSED] += max(passed - 1, 0)
+        self._counts['late controls'] += self._expecting and self._heard
+        self._counts['missed outputs'] += max(passed - 1, 0)
         period_ns = self.settings.sample_period * 1e9
         # Of the intervals that ended while the process was held up, some were over before v came.
         for missed in reversed(range(passed)):
@@ -199,7 +198,7 @@ class PlantNode(ProcessNode):
         if sample > 0 and loss > 0.0 and float(self._loss_rng.random()) < loss:
             return False
         if time.monotonic_ns() > latest_ns:
-            self._counts[MISSED] += 1
+            self._counts['missed outputs'] += 1
             return False
         self._expecting = True
         self._published.publish_output(y, sample, sample * self.settings.sample_period)
