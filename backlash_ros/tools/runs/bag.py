@@ -251,9 +251,12 @@ def _choose_section(tables: list[Table], span: Span) -> str:
 
     Returns what was left out in one sentence, '' for nothing.
     """
+    # In lockstep the stamp is that of the newest tick that the recorder had heard: what belongs to
+    # the first signals may be stamped before them.
+    begin = span.from_s * 1e9 if span.from_s > 0.0 else -np.inf
     for i, table in enumerate(tables):
         t = table['stamp']
-        tables[i] = _rows(table, (t >= span.from_s * 1e9) & (t < span.to_s * 1e9))
+        tables[i] = _rows(table, (t >= begin) & (t < span.to_s * 1e9))
     signals, note = tables[0], ''
     restarts = np.flatnonzero(np.diff(signals['sample']) <= 0) + 1
     # Where the count falls back that often, two nodes are at work.

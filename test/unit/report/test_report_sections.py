@@ -33,6 +33,7 @@ class Piece:
     namespace: str = ''
     node: str = 'controller'
     truth_first: int | None = None
+    truth_early_s: float = 0.0
 
 
 def write_pieces(path: Path, *pieces: Piece) -> Path:
@@ -46,8 +47,9 @@ def write_pieces(path: Path, *pieces: Piece) -> Path:
             (topics.TRUTH, topics.TRUTH_LABELS, 'true_', truth_first),
         ):
             rows = rows_of(piece.run, labels, frozenset(), prefix, first)
+            begin_s = piece.begin_s - (piece.truth_early_s if topic == topics.TRUTH else 0.0)
             messages += [
-                (START_NS + int(piece.begin_s * 1e9) + k * PERIOD_NS, len(messages) + k,
+                (START_NS + int(begin_s * 1e9) + k * PERIOD_NS, len(messages) + k,
                  f'/{piece.namespace}{topic.replace("controller", piece.node)}', raw)
                 for k, raw in rows
             ]
@@ -120,6 +122,11 @@ def test_truth_belongs_to_the_sample_with_its_v_where_the_counts_differ(tmp_path
 
 
 @pytest.mark.usefixtures('undrawn')
+def test_a_truth_that_is_stamped_before_the_first_signals_is_read(tmp_path, first):
+    bag = write_pieces(tmp_path / 'bag', Piece(first, truth_early_s=0.01))
+    np.testing.assert_array_equal(read_bag(bag).record.column('u'), first.column('u'))
+
+
 def test_bag_of_two_axes_gives_a_report_of_either(tmp_path, first, second, capsys):
     bag = write_pieces(
         tmp_path / 'bag', Piece(first, namespace='pan/'), Piece(second, namespace='tilt/')
