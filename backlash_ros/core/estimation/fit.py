@@ -33,13 +33,7 @@ SCALES: Array = np.append(0.0, np.geomspace(1e-3, 10.0, 13))  # of the error of 
 LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
 KNOTS, KNOT_SAMPLES = 36, 8  # of a walk over a record at most, and samples between them at least
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
-FAR_STEPS = 4  # the first of them, over which G is no further off than configured
-# --- guards
-LEAST_MOVE = 0.02  # deviations of the gap that a step may still move it by at the end
-SHORTEST_STEP = 0.05  # share of a Gauss-Newton step that is tried
 LONGEST_STEP = 2.0  # prior deviations by which G moves at once
-TIGHT = 1e6  # weight of a beginning that is known
-VAGUE = 100.0  # prior deviation of the state before a record, over the largest reading
 
 
 @dataclass
@@ -218,6 +212,8 @@ class Problem:
 
     def _beside(self, f: Fit, size: int, held: bool) -> list[Array]:
         """Rows of what is known beside the samples, or what gap and beginning are held at."""
+        vague = 100.0  # prior deviation of the state before a record, over the largest reading
+        tight = 1e6  # weight of a beginning that is known
         first = size - 3 - self.family.count  # place of m
         rows: list[Array] = []
         if self.older is not None:
@@ -229,17 +225,17 @@ class Problem:
         begin = np.zeros((1, size + 1))
         begin[0, first - 1] = 1.0
         if held:
-            wide[0, first + 2], wide[0, -1] = TIGHT, TIGHT * f.gap
-            begin[0, first - 1], begin[0, -1] = TIGHT, TIGHT * f.p0
+            wide[0, first + 2], wide[0, -1] = tight, tight * f.gap
+            begin[0, first - 1], begin[0, -1] = tight, tight * f.p0
         elif self.start is None:  # anywhere within the gap of now
             begin[0, -1] = self.v[0] + 0.5 * f.gap
             begin *= sqrt(12.0) / max(f.gap, 1e-9)
         else:
             begin[0, first + 2], begin[0, -1] = -float(self.start.left), self.start.v
-            begin *= TIGHT
+            begin *= tight
         leak = np.eye(self.family.leaks, size + 1, first + 3)
         # What no reading tells, as where the first ones were lost, would grow without bounds.
-        state = np.eye(len(f.x), size + 1) / (VAGUE * max(float(np.abs(self.y).max()), 1e-300))
+        state = np.eye(len(f.x), size + 1) / (vague * max(float(np.abs(self.y).max()), 1e-300))
         rows += [wide, begin, leak, state]
         if len(self._hats):
             walks = np.zeros((len(self._hats), size + 1))
@@ -315,11 +311,14 @@ class Problem:
 
     def fitted(self, f: Fit, steps: int = STEPS) -> Fit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
+        shortest_step = 0.05  # share of a Gauss-Newton step that is tried
+        least_move = 0.02  # deviations of the gap that a step may still move it by at the end
+        far_steps = 4  # the first of them, over which G is no further off than configured
         for k in range(steps):
             weights = self.weights(f)
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
-            most = 1.0 if k < FAR_STEPS < steps else np.inf
+            most = 1.0 if k < far_steps < steps else np.inf
             new = self._kept(self.step(f, most))
             there = _towards(f, new)
             value = self.log_posterior(there, weights)
@@ -330,7 +329,7 @@ class Problem:
                 if of_again > best:
                     there, value = again, of_again
             length = 1.0
-            while not value > best - 0.5 and length > SHORTEST_STEP:
+            while not value > best - 0.5 and length > shortest_step:
                 length *= 0.3
                 there = _towards(f, new, length)
                 value = self.log_posterior(there, weights)
@@ -340,7 +339,7 @@ class Problem:
             f = there
             if not f.step:
                 f = replace(f, noise_std=self._noise_of(f))
-            if moved < LEAST_MOVE * (1 if steps > FEW_STEPS else 10) and value - best < 1.0:
+            if moved < least_move * (1 if steps > FEW_STEPS else 10) and value - best < 1.0:
                 break
         return f
 
