@@ -21,13 +21,8 @@ FLOAT64 = 'std_msgs/msg/Float64'
 FITS, WRONG, UNKNOWN = '✓', '✗', '–'
 
 FEWEST_SAMPLES = 20  # for a judgement of the timing
-PERIOD_TOLERANCE = 0.01  # what the controller's count of samples follows
-UNSTEADY_TOLERANCE = 0.1  # where samples come in bursts
-LATENESS = 0.5  # of a period: beyond 0.85 the controller takes it for a loss
+MOST_LATE = 0.5  # of a period: beyond 0.85 the controller takes it for a loss
 LOSS = 0.01  # share of lost samples that a driver may have
-DOUBLE = 0.25  # of a period: the same value again within it is the same sample
-MOSTLY = 0.6  # a larger share of equal values is a plant at rest, not repetition
-HELD = 0.2  # share of samples that repeat the one before while y moves
 FINE_STEPS = 5.0  # steps of y larger than this many resolutions need not repeat
 
 
@@ -91,50 +86,38 @@ class Timing:
     fits: bool  # the period is the one of the parameters
 
 
+def finding(subject: str, fits: bool, found: str, cure: str) -> Finding:
+    """A line with its cure where something does not fit."""
+    return Finding(subject, FITS, found) if fits else Finding(subject, WRONG, found, cure)
+
+
 def graph_findings(graph: Graph, accepts_best_effort: bool) -> list[Finding]:
     """Who publishes plant_output and who listens to control, and whether they understand."""
     if graph.publishers == 0:
         return [Finding(
             'publisher', WRONG, 'nobody publishes plant_output', 'start the driver',
         )]
-    findings = [_publishers(graph.publishers)]
+    found = [finding(
+        'publisher', graph.publishers == 1,
+        'one publisher on plant_output' if graph.publishers == 1
+        else f'{graph.publishers} publishers on plant_output',
+        'stop all but one (`ros2 topic info -v plant_output` names them)',
+    )]
     if graph.types != (FLOAT64,):
-        findings.append(Finding(
-            'type', WRONG, f'plant_output is {", ".join(graph.types)}',
-            f'publish y as {FLOAT64}',
-        ))
-    findings.append(_qos(graph, accepts_best_effort))
-    if graph.listeners == 0:
-        near = ', '.join(graph.near_control)
-        findings.append(Finding(
-            'listener', WRONG,
-            'nobody listens to control' + (f', but somebody to {near}' if near else ''),
-            f'let the driver subscribe control as {FLOAT64}, or remap it',
-        ))
-    else:
-        findings.append(Finding('listener', FITS, 'control is subscribed'))
-    return findings
-
-
-def _publishers(count: int) -> Finding:
-    if count > 1:
-        return Finding(
-            'publisher', WRONG, f'{count} publishers on plant_output',
-            'stop all but one (`ros2 topic info -v plant_output` names them)',
-        )
-    return Finding('publisher', FITS, 'one publisher on plant_output')
-
-
-def _qos(graph: Graph, accepts_best_effort: bool) -> Finding:
+        found.append(Finding('type', WRONG, f'plant_output is {", ".join(graph.types)}',
+                             f'publish y as {FLOAT64}'))
     reasons = list(graph.misfits)
     if graph.best_effort and not accepts_best_effort:
         reasons.append('plant_output is best effort, the controller asks for reliable')
-    if not reasons:
-        return Finding('QoS', FITS, 'compatible')
-    return Finding(
-        'QoS', WRONG, '; '.join(reasons),
-        'use reliable, volatile, keep last (the default profile) on both topics',
-    )
+    near = f', but somebody to {", ".join(graph.near_control)}' if graph.near_control else ''
+    return [
+        *found,
+        finding('QoS', not reasons, '; '.join(reasons) or 'compatible',
+                'use reliable, volatile, keep last (the default profile) on both topics'),
+        finding('listener', graph.listeners > 0,
+                'control is subscribed' if graph.listeners else f'nobody listens to control{near}',
+                f'let the driver subscribe control as {FLOAT64}, or remap it'),
+    ]
 
 
 def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
@@ -142,8 +125,7 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
     outputs, repeated = _without_doubles(heard.outputs, sample_period_s)
     if len(outputs) < FEWEST_SAMPLES:
         return None
-    stamps = np.array([message.stamp_ns for message in outputs], dtype=np.int64)
-    rough = max(float(np.median(np.diff(stamps))), 1.0)
+    rough = max(float(np.median(np.diff(stamps_of(outputs)))), 1.0)
     counter = SampleCounter(rough * 1e-9)
     index, missing, samples = [], 0, []
     for message in outputs:
@@ -152,27 +134,31 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing | None:
             missing += arrival.missing
             index.append(counter.index)
             samples.append(message)
-    early = len(outputs) - len(samples)
-    outputs, stamps = samples, np.array([message.stamp_ns for message in samples], dtype=np.int64)
+    times = (stamps_of(samples) - samples[0].stamp_ns) * 1e-9
     numbers = np.array(index, dtype=np.intp) - index[0]
-    slope, offset = np.polyfit(numbers, (stamps - stamps[0]) * 1e-9, 1)
-    late = (stamps - stamps[0]) * 1e-9 - slope * numbers - offset
+    slope, offset = np.polyfit(numbers, times, 1)
+    late = times - slope * numbers - offset
     lateness = float(np.quantile(late, 0.99) - np.quantile(late, 0.01)) / float(slope)
     # A driver that fell silent for good loses samples as well.
-    missing += max(int((heard.end_ns - outputs[-1].stamp_ns) / rough) - 1, 0)
+    missing += max(int((heard.end_ns - samples[-1].stamp_ns) / rough) - 1, 0)
     # Amid bursts the samples cannot be counted for certain; most intervals tell the period still.
-    steady = lateness <= LATENESS
+    steady = lateness <= MOST_LATE
     period = float(slope) if steady else rough * 1e-9
-    tolerance = PERIOD_TOLERANCE if steady else UNSTEADY_TOLERANCE
     return Timing(
-        outputs, numbers, period, missing, repeated, early, lateness,
-        abs(period / sample_period_s - 1.0) <= tolerance,
+        samples, numbers, period, missing, repeated, len(outputs) - len(samples), lateness,
+        abs(period / sample_period_s - 1.0) <= (0.01 if steady else 0.1),
     )
+
+
+def stamps_of(messages: Sequence[Message]) -> NDArray[np.int64]:
+    """When they left [ns]."""
+    return np.array([message.stamp_ns for message in messages], dtype=np.int64)
 
 
 def _without_doubles(
     outputs: Sequence[Message], sample_period_s: float,
 ) -> tuple[list[Message], int]:
+    """Without those that came again within a quarter of a period, and how many these were."""
     kept = list(outputs[:1])
     numbered_doubles = 0  # they must not look like gaps in the numbers
     for message in outputs[1:]:
@@ -180,73 +166,63 @@ def _without_doubles(
             message = message._replace(number=message.number - numbered_doubles)
         before = kept[-1]
         again = message.value == before.value or message.number == before.number != UNNUMBERED
-        if not again or message.stamp_ns - before.stamp_ns > DOUBLE * sample_period_s * 1e9:
+        if not again or message.stamp_ns - before.stamp_ns > 0.25 * sample_period_s * 1e9:
             kept.append(message)
         elif message.number != before.number:
             numbered_doubles += 1
     repeated = len(outputs) - len(kept)
-    if repeated > MOSTLY * len(outputs):
-        return list(outputs), 0
-    return kept, repeated
+    # A larger share of equal values is a plant at rest.
+    return (list(outputs), 0) if repeated > 0.6 * len(outputs) else (kept, repeated)
 
 
 def message_findings(heard: Heard, timing: Timing, sample_period_s: float) -> list[Finding]:
     """Rate, jitter, loss, repetition, clock and numbers of what was heard."""
+    rate = f'{1.0 / timing.period_s:.4g} Hz, a sample every {timing.period_s * 1e3:.4g} ms'
+    total = len(timing.outputs) + timing.missing
+    age = float(np.median([m.received_ns - m.stamp_ns for m in timing.outputs])) * 1e-9
+    bad = {
+        topic: sum(not plausible(message.value) for message in messages)
+        for topic, messages in (('plant_output', heard.outputs), ('control', heard.controls),
+                                ('applied_control', heard.applied))
+    }
     return [
-        _rate(timing, sample_period_s), _jitter(timing), _loss(timing), _repetition(timing),
-        _clock(timing), _numbers(heard),
+        finding('rate', timing.fits,
+                rate if timing.fits
+                else f'{rate}; sample_period says {sample_period_s * 1e3:g} ms',
+                'publish once per sample_period, or set sample_period to what the driver does and '
+                'give G(z) for it'),
+        finding('jitter', timing.lateness <= MOST_LATE,
+                f'{timing.lateness:.0%} of a period (98 % of the samples)',
+                'publish from a timer with absolute deadlines; give the driver a real-time '
+                'priority'),
+        finding('lost samples', timing.missing <= LOSS * total,
+                f'{timing.missing} of {total} samples',
+                'publish every sample, reliable, without skipping any; on a network, use a cable'),
+        _repetition(timing),
+        finding('clock', abs(age) <= SKEW * timing.period_s,
+                f'samples arrive {abs(age) * 1e3:.2g} ms {"before" if age < 0.0 else "after"} '
+                'they left', 'synchronise the clocks of both machines (chrony, PTP), or look for a '
+                'slow network'),
+        finding('values', not any(bad.values()),
+                'all finite' if not any(bad.values()) else 'nan, inf or absurd: '
+                + ', '.join(f'{count} on {topic}' for topic, count in bad.items() if count),
+                'publish nothing where the sensor has no value; the controller steps over it'),
     ]
 
 
-def _rate(timing: Timing, sample_period_s: float) -> Finding:
-    found = f'{1.0 / timing.period_s:.4g} Hz, a sample every {timing.period_s * 1e3:.4g} ms'
-    if timing.fits:
-        return Finding('rate', FITS, found)
-    return Finding(
-        'rate', WRONG, f'{found}; sample_period says {sample_period_s * 1e3:g} ms',
-        'publish once per sample_period, or set sample_period to what the driver does and '
-        'give G(z) for it',
-    )
-
-
-def _jitter(timing: Timing) -> Finding:
-    found = f'{timing.lateness:.0%} of a period (98 % of the samples)'
-    if timing.lateness <= LATENESS:
-        return Finding('jitter', FITS, found)
-    return Finding(
-        'jitter', WRONG, found,
-        'publish from a timer with absolute deadlines; give the driver a real-time priority',
-    )
-
-
-def _loss(timing: Timing) -> Finding:
-    total = len(timing.outputs) + timing.missing
-    found = f'{timing.missing} of {total} samples'
-    if timing.missing <= LOSS * total:
-        return Finding('lost samples', FITS, found)
-    return Finding(
-        'lost samples', WRONG, found,
-        'publish every sample, reliable, without skipping any; on a network, use a cable',
-    )
-
-
 def _repetition(timing: Timing) -> Finding:
-    if timing.repeated:
-        return Finding(
-            'repeated samples', WRONG, f'{timing.repeated} came twice',
-            'publish each sample once: take out what doubles them, a second timer or a relay',
-        )
-    if timing.early > LOSS * len(timing.outputs):
-        return Finding(
-            'repeated samples', WRONG, f'{timing.early} came right after the one before',
-            'let the timer of the driver leave out what it has missed instead of catching up',
-        )
-    share = _held_share(np.array([message.value for message in timing.outputs]))
-    if share > HELD:
-        return Finding(
-            'repeated samples', WRONG, f'{share:.0%} repeat the value before while y moves',
-            'publish when the sensor has a new value; sample_period is that of the sensor',
-        )
+    held = _held_share(np.array([message.value for message in timing.outputs]))
+    for wrong, found, cure in (
+        (timing.repeated > 0, f'{timing.repeated} came twice',
+         'publish each sample once: take out what doubles them, a second timer or a relay'),
+        (timing.early > LOSS * len(timing.outputs),
+         f'{timing.early} came right after the one before',
+         'let the timer of the driver leave out what it has missed instead of catching up'),
+        (held > 0.2, f'{held:.0%} repeat the value before while y moves',
+         'publish when the sensor has a new value; sample_period is that of the sensor'),
+    ):
+        if wrong:
+            return Finding('repeated samples', WRONG, found, cure)
     return Finding('repeated samples', FITS, 'none')
 
 
@@ -259,33 +235,3 @@ def _held_share(y: NDArray[np.float64]) -> float:
         return 0.0
     around = np.abs(y[2:] - y[:-2]) >= FINE_STEPS * moving.min()
     return float(np.mean(steps[1:][around] == 0.0)) if around.any() else 0.0
-
-
-def _clock(timing: Timing) -> Finding:
-    age = float(np.median([m.received_ns - m.stamp_ns for m in timing.outputs])) * 1e-9
-    when = 'before' if age < 0.0 else 'after'
-    found = f'samples arrive {abs(age) * 1e3:.2g} ms {when} they left'
-    if abs(age) <= SKEW * timing.period_s:
-        return Finding('clock', FITS, found)
-    return Finding(
-        'clock', WRONG, found,
-        'synchronise the clocks of both machines (chrony, PTP), or look for a slow network',
-    )
-
-
-def _numbers(heard: Heard) -> Finding:
-    topics = {
-        'plant_output': heard.outputs, 'control': heard.controls,
-        'applied_control': heard.applied,
-    }
-    bad = {
-        topic: sum(not plausible(message.value) for message in messages)
-        for topic, messages in topics.items()
-    }
-    if not any(bad.values()):
-        return Finding('values', FITS, 'all finite')
-    found = ', '.join(f'{count} on {topic}' for topic, count in bad.items() if count)
-    return Finding(
-        'values', WRONG, f'nan, inf or absurd: {found}',
-        'publish nothing where the sensor has no value; the controller steps over it',
-    )

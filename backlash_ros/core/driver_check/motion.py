@@ -5,8 +5,9 @@ Pure: no ROS in here. The whole record is fitted at once, by the fit of the loop
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from math import inf, isnan, nan, pi
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from backlash_ros.core.driver_check.findings import (
     Heard,
     Message,
     Timing,
+    finding,
+    stamps_of,
 )
 from backlash_ros.core.driver_check.record_fit import RecordFit, fit_record
 from backlash_ros.core.identification.verdict import SHOWS
@@ -29,26 +32,21 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-DELAY, SIGN, MODEL, NOISE, BACKLASH = (
+DELAY, SIGN, G_OF_Z, NOISE_ON_Y, SHOWN_BACKLASH = (
     'reaction delay', 'sign and units', 'G(z)', 'noise on y', 'backlash',
 )
-MOTION_SUBJECTS = (DELAY, SIGN, MODEL, NOISE, BACKLASH)
+MOTION_SUBJECTS = (DELAY, SIGN, G_OF_Z, NOISE_ON_Y, SHOWN_BACKLASH)
 
 DECISIVE = 3.0  # log-likelihood by which one delay beats another
-SURE = 10.0  # log-likelihood by which one sample period beats another
-PREDICTED = 0.9  # share of the motion of y that G has to predict
-BOUND_SLACK = 0.01  # of a value that lies outside its bounds without harm
+WELL_PREDICTED = 0.9  # share of the motion of y that G has to predict
 NOISIER = 3.0  # times the given deviation of the noise
 COLOURED = 0.5  # correlation of successive residuals that noise of a sensor does not have
 OTHER_PERIODS = (0.05, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0)  # times T, tried for G
-ALTERED = 0.02  # of the swing of v: applied_control that differs by more was limited
-ALTERED_SHARE = 0.05  # of the samples
 MORE_DELAY = 8  # samples that are tried beyond the expected delay
-FAR = 2.0  # times plant.uncertainty; an error of G beyond may be that of its sample period
+REPORT = 'report v just before each y, or set estimator.use_applied_control: false'
 
 
-@dataclass
-class Record:
+class DriverRecord(NamedTuple):
     """v (N,) from sample k to k+1, y (N,) with nan where lost, and what v was taken from.
 
     lag: samples from control to applied_control; 0 where v is that of control.
@@ -61,48 +59,36 @@ class Record:
 
 def applied_findings(heard: Heard, timing: Timing, p: Parameters) -> list[Finding]:
     """Whether applied_control, where it is published or asked for, is of use."""
-    use = report_use(p)
-    wanted = use is ReportUse.ALWAYS
-    subject = 'applied_control'
+    subject, use = 'applied_control', report_use(p)
     if not heard.applied:
-        return [Finding(
-            subject, WRONG, 'is not published',
-            'report v just before each y, or set estimator.use_applied_control: false',
-        )] if wanted else []
+        return [Finding(subject, WRONG, 'is not published', REPORT)] \
+            if use is ReportUse.ALWAYS else []
     share = len(heard.applied) / len(timing.outputs)
     if use is not ReportUse.NEVER and share < REPORTED:
-        return [Finding(
-            subject, WRONG, f'comes with {share:.0%} of the samples',
-            'report v just before each y, or set estimator.use_applied_control: false',
-        )]
-    applied = _on_grid(heard.applied, timing)
-    control = _on_grid(heard.controls, timing)
+        return [Finding(subject, WRONG, f'comes with {share:.0%} of the samples', REPORT)]
+    applied, control = _on_grid(heard.applied, timing), _on_grid(heard.controls, timing)
     if use is not ReportUse.NEVER or control is None or applied is None:
         return [Finding(subject, FITS, 'is published')]
     moved = _shifted_difference(applied, control, _lag(applied, control))
-    swing = float(np.ptp(control))
-    if np.mean(moved > ALTERED * swing) > ALTERED_SHARE:
-        return [Finding(
-            subject, WRONG, f'differs from control by up to {moved.max():.3g}',
-            'set estimator.use_applied_control: true, or narrow control.min, max, rate_max',
-        )]
-    return [Finding(subject, FITS, 'agrees with control')]
+    # What differs by more than 2 % of the swing was limited, but for 5 % of the samples.
+    limited = np.mean(moved > 0.02 * np.ptp(control)) > 0.05
+    return [finding(
+        subject, not limited,
+        f'differs from control by up to {moved.max():.3g}' if limited else 'agrees with control',
+        'set estimator.use_applied_control: true, or narrow control.min, max, rate_max',
+    )]
 
 
-def record_of(heard: Heard, timing: Timing) -> Record | None:
+def record_of(heard: Heard, timing: Timing) -> DriverRecord | None:
     """v and y sample by sample, from the first known v on; None where no v was heard."""
     v = _on_grid(heard.applied or heard.controls, timing, reported=bool(heard.applied))
     if v is None:
         return None
     y = np.full(len(v), nan)
-    values = np.array([m.value if plausible(m.value) else nan for m in timing.outputs])
-    y[timing.index] = values
-    lag = 0
-    if heard.applied:
-        control = _on_grid(heard.controls, timing)
-        lag = 0 if control is None else _lag(v, control)
+    y[timing.index] = [m.value if plausible(m.value) else nan for m in timing.outputs]
+    control = _on_grid(heard.controls, timing) if heard.applied else None
     known = int(np.argmax(np.isfinite(v)))
-    return Record(v[known:], y[known:], lag)
+    return DriverRecord(v[known:], y[known:], 0 if control is None else _lag(v, control))
 
 
 def _on_grid(messages: list[Message], timing: Timing, reported: bool = False) -> Array | None:
@@ -111,14 +97,10 @@ def _on_grid(messages: list[Message], timing: Timing, reported: bool = False) ->
     if not usable:
         return None
     v = v_of_intervals(
-        timing.index.astype(np.int64), _stamps(timing.outputs), _stamps(usable),
+        timing.index.astype(np.int64), stamps_of(timing.outputs), stamps_of(usable),
         np.array([message.value for message in usable]), reported,
     )
     return v if np.isfinite(v).any() else None
-
-
-def _stamps(messages: list[Message]) -> NDArray[np.int64]:
-    return np.array([message.stamp_ns for message in messages], dtype=np.int64)
 
 
 def _lag(applied: Array, control: Array) -> int:
@@ -134,101 +116,94 @@ def _shifted_difference(applied: Array, control: Array, lag: int) -> Array:
     return known if len(known) else np.full(1, np.inf)
 
 
-def motion_findings(record: Record | None, p: Parameters) -> list[Finding]:
+def motion_findings(record: DriverRecord | None, p: Parameters) -> list[Finding]:
     """What v and y say together."""
     swing = 0.0 if record is None else float(np.ptp(record.v))
     if record is None or swing == 0.0:
-        return _only(BACKLASH, 'v stood still', 'run the controller, or check_driver --drive')
-    model = TransferFunction(p.plant.numerator, p.plant.denominator)
-    fit = _fit(model, record, p)
-    if isnan(fit.evidence):
-        return _only(
-            BACKLASH, f'too few samples after v had swung by {swing:.4g}', 'raise --duration'
-        )
-    if fit.evidence < SHOWS:
-        return _only(
-            BACKLASH, f'y shows nothing of v, which swung by {swing:.4g}',
-            'let v swing wider than the gap; see that the driver applies v',
-        )
-    if fit.reversals == 0 and fit.predicted >= PREDICTED:
-        # Without a turn of the play, lag and delay take up what the gap does.
-        return _only(
-            BACKLASH, f'not identifiable from this motion: v swung by {swing:.4g} on one side',
-            'swing v past the gap in both directions, several times; raise --duration',
-        )
-    unlike = fit.predicted < PREDICTED or _odd(fit, record.lag, p)
-    if unlike or fit.error_scale > FAR:
+        return _only(SHOWN_BACKLASH, 'v stood still', 'run the controller, or check_driver --drive')
+    fit = _fit(TransferFunction(p.plant.numerator, p.plant.denominator), record, p)
+    past = 'swing v past the gap in both directions, several times; raise --duration'
+    unseen = f'not identifiable from this motion: v swung by {swing:.4g}'
+    # Without a turn of the play, lag and delay take up what the gap does.
+    for hidden, found, cure in (
+        (isnan(fit.evidence), f'too few samples after v had swung by {swing:.4g}',
+         'raise --duration'),
+        (fit.evidence < SHOWS, f'y shows nothing of v, which swung by {swing:.4g}',
+         'let v swing wider than the gap; see that the driver applies v'),
+        (fit.reversals == 0 and fit.predicted >= WELL_PREDICTED, f'{unseen} on one side', past),
+    ):
+        if hidden:
+            return _only(SHOWN_BACKLASH, found, cure)
+    noisy = fit.noise_std > NOISIER * p.estimator.output_noise_std
+    delay = _delay(fit, record.lag, p)
+    # A delay that nobody announced together with what is not noise is an odd G as well.
+    odd = noisy and fit.correlation > COLOURED and delay.mark == WRONG
+    unlike = fit.predicted < WELL_PREDICTED or odd
+    if unlike or fit.error_scale > 2.0:
         other = _other_period(fit, record, p)
-        if unlike or other is not None:
-            return _only(MODEL, *_mismatch(fit, other, p))
+        if other is not None:
+            return _only(
+                G_OF_Z, f'is off by far, and less so for a sample period of {other:.3g} s',
+                f'G(z) looks made for a sample period of about {other:.3g} s: discretise it with '
+                f'sample_period, {p.sample_period:g} s')
+        if unlike:
+            return _only(
+                G_OF_Z, f'predicts {max(fit.predicted, 0.0):.0%} of the motion of y',
+                'enter the G(z) of this plant, discretised with sample_period; see that y is '
+                'measured behind the gap and that the driver holds v over the period')
     return [
-        _delay(fit, record.lag, p), _sign(fit, p), _model(fit, p), _noise(fit, p),
-        _backlash(fit, swing),
+        delay, _sign(fit, p), _model(fit, p),
+        finding(NOISE_ON_Y, not noisy, f'deviation {fit.noise_std:.2g}; estimator.output_noise_std '
+                f'says {p.estimator.output_noise_std:.2g}',
+                f'set estimator.output_noise_std: {fit.noise_std:.1e}' + (
+                    ', or give a more exact G(z): the residual is coloured'
+                    if fit.correlation > COLOURED else '')),
+        finding(SHOWN_BACKLASH, not fit.doubts, f'{unseen}; {"; ".join(fit.doubts)}' if fit.doubts
+                else ', '.join(f'{name} = {value:.4g} ± {std:.1g}'
+                               for name, value, std in fit.estimates), past),
     ]
 
 
 def _fit(
-    model: TransferFunction, record: Record, p: Parameters, more_delay: int = MORE_DELAY,
+    model: TransferFunction, record: DriverRecord, p: Parameters, more_delay: int = MORE_DELAY,
 ) -> RecordFit:
     """Fit with any delay that the driver may have, or with the expected one alone."""
     expected = p.control.delay_samples
     return fit_record(
-        record.v, record.y, model, p.plant.uncertainty,
-        p.estimator.output_noise_std,
-        delays=range(expected + more_delay + 1) if more_delay else (expected,),
+        record.v, record.y, model, p.plant.uncertainty, p.estimator.output_noise_std,
+        delays=range(0 if more_delay else expected, expected + more_delay + 1),
     )
 
 
 def _only(subject: str, found: str, cure: str) -> list[Finding]:
     """One reason why nothing else can be told."""
-    return [Finding(subject, WRONG, found, cure)] + [
-        not_judged(other, f'once {subject} fits') for other in MOTION_SUBJECTS if other != subject
-    ]
+    return [Finding(subject, WRONG, found, cure), *not_judged(
+        [other for other in MOTION_SUBJECTS if other != subject], subject)]
 
 
-def not_judged(subject: str, when: str) -> Finding:
-    """A line for what something else hides."""
-    return Finding(subject, UNKNOWN, f'can be told {when}')
+def not_judged(subjects: Sequence[str], behind: str) -> list[Finding]:
+    """Lines for what something else hides."""
+    return [Finding(subject, UNKNOWN, f'can be told once {behind} fits') for subject in subjects]
 
 
-def _odd(fit: RecordFit, lag: int, p: Parameters) -> bool:
-    """Whether a delay that nobody announced came out together with what is not noise."""
-    noisy = fit.noise_std > NOISIER * p.estimator.output_noise_std
-    return noisy and fit.correlation > COLOURED and _delay(fit, lag, p).mark == WRONG
-
-
-def _mismatch(fit: RecordFit, other: float | None, p: Parameters) -> tuple[str, str]:
-    """Say how badly G predicts y, and whether the same poles at another period [s] would."""
-    period = p.sample_period
-    if other is not None:
-        return f'is off by far, and less so for a sample period of {other:.3g} s', (
-            f'G(z) looks made for a sample period of about {other:.3g} s: discretise it with '
-            f'sample_period, {period:g} s'
-        )
-    return f'predicts {max(fit.predicted, 0.0):.0%} of the motion of y', (
-        'enter the G(z) of this plant, discretised with sample_period; see that y is measured '
-        'behind the gap and that the driver holds v over the period'
-    )
-
-
-def _other_period(fit: RecordFit, record: Record, p: Parameters) -> float | None:
+def _other_period(fit: RecordFit, record: DriverRecord, p: Parameters) -> float | None:
     """Sample period [s] for which the poles of G fit to within plant.uncertainty, or far better."""
-    later = Record(record.v[MORE_DELAY:], record.y[MORE_DELAY:], record.lag)
+    later = DriverRecord(record.v[MORE_DELAY:], record.y[MORE_DELAY:], record.lag)
     others: list[tuple[float, float, float]] = []
     for ratio in OTHER_PERIODS:
         denominator = np.real(np.poly(fit.nominal.poles.astype(complex) ** ratio)).tolist()
-        other = TransferFunction(fit.nominal.numerator.tolist(), denominator)
         # The same samples of y as in the fit, whose evidence is compared.
-        refit = _fit(other, later, p, more_delay=0)
+        refit = _fit(
+            TransferFunction(fit.nominal.numerator.tolist(), denominator), later, p, more_delay=0)
         # The zeros are still those of the other period: G may be off by more, if it explains more.
         fits = refit.error_scale <= 1.0 or refit.evidence > fit.evidence + DECISIVE
-        if refit.predicted >= PREDICTED and fits:
+        if refit.predicted >= WELL_PREDICTED and fits:
             others.append((refit.evidence, refit.error_scale, ratio))
     best = max((evidence for evidence, _, _ in others), default=-inf)
     if best <= fit.evidence - DECISIVE:
         return None
     # Of those that fit alike the one that is least off.
-    _, ratio = min(other[1:] for other in others if other[0] > best - SURE)
+    _, ratio = min(other[1:] for other in others if other[0] > best - 10.0)
     return p.sample_period / ratio
 
 
@@ -236,13 +211,11 @@ def _delay(fit: RecordFit, lag: int, p: Parameters) -> Finding:
     expected = p.control.delay_samples
     if report_use(p) is ReportUse.ALWAYS:
         lag = 0  # the report already has it
-    found = fit.delay + lag
-    if fit.margins.get(expected - lag, inf) <= DECISIVE:
-        return Finding(DELAY, FITS, f'{expected} samples, as control.delay_samples says')
-    return Finding(
-        DELAY, WRONG, f'{found} samples; control.delay_samples says {expected}',
-        f'apply v as soon as it comes, or set control.delay_samples: {found}',
-    )
+    found, fits = fit.delay + lag, fit.margins.get(expected - lag, inf) <= DECISIVE
+    return finding(
+        DELAY, fits, f'{expected} samples, as control.delay_samples says' if fits
+        else f'{found} samples; control.delay_samples says {expected}',
+        f'apply v as soon as it comes, or set control.delay_samples: {found}')
 
 
 def _sign(fit: RecordFit, p: Parameters) -> Finding:
@@ -251,16 +224,13 @@ def _sign(fit: RecordFit, p: Parameters) -> Finding:
             SIGN, WRONG, f'y moves against v: m would be {fit.m:.4g}',
             'change the sign of y or v in the driver, or of plant.numerator',
         )
-    values = [('m', fit.m, fit.std_m)]
-    if not fit.doubts:
-        values += [('c_r', fit.c_r, fit.std_c_r), ('c_l', fit.c_l, fit.std_c_l)]
-    for name, value, std in values:
+    for name, value, std in fit.estimates[:1 if fit.doubts else 3]:
         low, high = getattr(p.estimator.bounds, name)
-        slack = 3.0 * std + BOUND_SLACK * abs(value)
+        slack = 3.0 * std + 0.01 * abs(value)
         if not low - slack <= value <= high + slack:
             return Finding(
                 SIGN, WRONG, f'{name} would be {value:.4g}, outside [{low:g}, {high:g}]',
-                f'see the units of v, y and G(z) and the zero of v, or widen '
+                'see the units of v, y and G(z) and the zero of v, or widen '
                 f'estimator.bounds.{name}',
             )
     return Finding(SIGN, FITS, f'm is about {fit.m:.4g}, within its bounds')
@@ -270,37 +240,9 @@ def _model(fit: RecordFit, p: Parameters) -> Finding:
     """Say how far G is off where it was learned to be another one: the loop learns it too."""
     found = f'predicts {fit.predicted:.1%} of the motion of y'
     if fit.model is not fit.nominal:
-        period = p.sample_period
-        errors = ', '.join(
-            f'{error:.1%} at {frequency / (2.0 * pi * period):.2g} Hz'
+        found += ' once it is corrected: it is off by ' + ', '.join(
+            f'{error:.1%} at {frequency / (2.0 * pi * p.sample_period):.2g} Hz'
             for frequency, error in zip(
-                fit.frequencies, fit.error_of_model(fit.frequencies), strict=True
-            )
+                fit.frequencies, fit.error_of_model(fit.frequencies), strict=True)
         )
-        found += f' once it is corrected: it is off by {errors}'
-    return Finding(MODEL, FITS, found)
-
-
-def _noise(fit: RecordFit, p: Parameters) -> Finding:
-    given = p.estimator.output_noise_std
-    found = f'deviation {fit.noise_std:.2g}; estimator.output_noise_std says {given:.2g}'
-    if fit.noise_std <= NOISIER * given:
-        return Finding(NOISE, FITS, found)
-    cure = f'set estimator.output_noise_std: {fit.noise_std:.1e}'
-    if fit.correlation > COLOURED:
-        cure += ', or give a more exact G(z): the residual is coloured'
-    return Finding(NOISE, WRONG, found, cure)
-
-
-def _backlash(fit: RecordFit, swing: float) -> Finding:
-    if fit.doubts:
-        return Finding(
-            BACKLASH, WRONG, f'not identifiable from this motion: v swung by {swing:.4g}; '
-            + '; '.join(fit.doubts),
-            'swing v past the gap in both directions, several times; raise --duration',
-        )
-    return Finding(BACKLASH, FITS, ', '.join(
-        f'{name} = {value:.4g} ± {std:.1g}' for name, value, std in (
-            ('m', fit.m, fit.std_m), ('c_r', fit.c_r, fit.std_c_r), ('c_l', fit.c_l, fit.std_c_l),
-        )
-    ))
+    return Finding(G_OF_Z, FITS, found)

@@ -6,8 +6,9 @@ The same fit as in the loop, over all samples at once. For the check of a driver
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf, isfinite, nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +32,6 @@ from backlash_ros.core.records.samples import check_record, frequencies_of, outl
 
 Array = NDArray[np.float64]
 
-FEWEST = 10  # samples per unknown of G and u below which nothing is said
-SURE = 5.0  # standard deviations of the gap by which the play output must move to count
-LIKELIER = 1.0  # log-likelihood by which another G than the nominal one must be better
-NO_GAP = 0.01  # standard deviation of a gap over the swing of v that counts as known: there is none
-
 
 @dataclass(frozen=True)
 class RecordFit:
@@ -55,30 +51,36 @@ class RecordFit:
     All numbers are nan where there is no fit.
     """
 
-    m: float
-    c_r: float
-    c_l: float
-    gap: float
-    std_m: float
-    std_c_r: float
-    std_c_l: float
-    std_gap: float
-    start: float
     nominal: TransferFunction
     model: TransferFunction
-    delay: int
-    margins: dict[int, float]
-    error_scale: float
-    noise_std: float
-    rms: float
-    correlation: float
-    unexplained: float
     evidence: float
-    predicted: float
-    reversals: int
-    outliers: int
-    frequencies: tuple[float, float]
-    doubts: tuple[str, ...]
+    doubts: tuple[str, ...] = ()
+    m: float = nan
+    c_r: float = nan
+    c_l: float = nan
+    gap: float = nan
+    std_m: float = nan
+    std_c_r: float = nan
+    std_c_l: float = nan
+    std_gap: float = nan
+    start: float = nan
+    delay: int = 0
+    margins: dict[int, float] = field(default_factory=dict)
+    error_scale: float = nan
+    noise_std: float = nan
+    rms: float = nan
+    correlation: float = nan
+    unexplained: float = nan
+    predicted: float = nan
+    reversals: int = 0
+    outliers: int = 0
+    frequencies: tuple[float, float] = (nan, nan)
+
+    @property
+    def estimates(self) -> tuple[tuple[str, float, float], ...]:
+        """Names, values and standard deviations of m, c_r, c_l."""
+        return (('m', self.m, self.std_m), ('c_r', self.c_r, self.std_c_r),
+                ('c_l', self.c_l, self.std_c_l))
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -101,6 +103,18 @@ class RecordFit:
         return np.asarray(np.abs(self.model.response(z) / self.nominal.response(z) - 1.0))
 
 
+class _Best(NamedTuple):
+    """The best fit of a record. sign: of G in it. still: rms that a constant u leaves of y.
+    evidence: log-likelihood by which the fit beats that."""
+
+    problem: Problem
+    fit: Fit
+    sign: float
+    still: float
+    evidence: float
+    outliers: int
+
+
 def fit_record(
     v: Array, y: Array, model: TransferFunction | StateModel, uncertainty: float,
     noise_std: float, bounds: Bounds | None = None, delays: Sequence[int] = (0,),
@@ -118,53 +132,52 @@ def fit_record(
     if not delays or min(delays) < 0:
         raise ValueError(f'delays={delays!r} must name at least one, none of them negative')
     nominal = model.transfer_function if isinstance(model, StateModel) else model
-    longest = max(delays)
+    longest, swing = max(delays), float(np.ptp(v)) if len(v) else 0.0
     # y(k+1) follows v(k - delay); all delays are compared over the same samples of y.
     after = y[longest + 1:]
-    swing = float(np.ptp(v)) if len(v) else 0.0
-    if np.count_nonzero(np.isfinite(after)) < FEWEST * (nominal.order + 2):
-        return _nothing(nominal, nan, f'too few samples: {len(after)} after the longest delay')
+    if np.count_nonzero(np.isfinite(after)) < 10 * (nominal.order + 2):
+        return RecordFit(
+            nominal, nominal, nan, (f'too few samples: {len(after)} after the longest delay',))
     if swing == 0.0:
-        return _nothing(nominal, 0.0, 'v stood still')
-    results: dict[int, _Best] = {}
-    for delay in delays:
-        best = _best(v[longest - delay:len(v) - 1 - delay], after, nominal, uncertainty, noise_std)
-        if best is not None:
-            results[delay] = best
-    if not results:
-        return _nothing(nominal, 0.0, f'y shows nothing of v, which swung by {swing:.4g}')
-    delay = max(results, key=lambda d: results[d].fit.evidence)
-    margins = {
-        d: results[delay].fit.evidence - results[d].fit.evidence if d in results else inf
+        return RecordFit(nominal, nominal, 0.0, ('v stood still',))
+    found = {delay: best for delay in delays for best in [_best(
+        v[longest - delay:len(v) - 1 - delay], after, nominal, uncertainty, noise_std,
+    )] if best is not None}
+    if not found:
+        return RecordFit(
+            nominal, nominal, 0.0, (f'y shows nothing of v, which swung by {swing:.4g}',))
+    delay = max(found, key=lambda d: found[d].fit.evidence)
+    best, margins = found[delay], {
+        d: found[delay].fit.evidence - found[d].fit.evidence if d in found else inf
         for d in delays
     }
-    return _described(results[delay], nominal, delay, margins, bounds, swing)
-
-
-@dataclass(frozen=True)
-class _Best:
-    """The best fit of a record. sign: of G in it. still: rms and evidence of a constant u."""
-
-    setup: Setup
-    problem: Problem
-    fit: Fit
-    sign: float
-    still_rms: float
-    still_evidence: float
-    outliers: int
+    fit, problem = best.fit, best.problem
+    m, c_r, c_l = fit.crossings.tolist()
+    std_m, std_c_r, std_c_l = fit.crossings_std.tolist()
+    told = RecordFit(
+        nominal, _learned(problem.family, fit, nominal, best.sign), best.evidence,
+        m=best.sign * m, c_r=c_r, c_l=c_l, gap=fit.gap,
+        std_m=std_m, std_c_r=std_c_r, std_c_l=std_c_l, std_gap=fit.gap_std,
+        start=fit.p0, delay=delay, margins=margins, error_scale=fit.scale, noise_std=fit.noise,
+        rms=fit.rms, correlation=fit.correlation, unexplained=fit.unexplained,
+        predicted=1.0 - fit.rms / best.still if best.still > 0.0 else 0.0,
+        reversals=_reversals(problem.input(fit)[0], fit), outliers=best.outliers,
+        frequencies=frequencies_of(np.where(problem.known, problem.y, nan)),
+    )
+    return replace(told, doubts=_doubts(told, fit, bounds, swing))
 
 
 def _best(
     v: Array, y: Array, nominal: TransferFunction, uncertainty: float, noise_std: float,
 ) -> _Best | None:
     """Fit v (N,) and y (N,) after it; None where a constant u explains y as well."""
-    sign, noise_std = 1.0, max(noise_std, SMALLEST_NOISE)
-    wide = Bounds((1e-300, 1e300), (-1e300, 1e300), (-1e300, 1e300))
+    noise_std, wide = max(noise_std, SMALLEST_NOISE), (-1e300, 1e300)
     record = Record(0, v, y, np.full(len(v), nan))
     setup = Setup(
-        PlantFamily(nominal, uncertainty), noise_std, wide, inf, float(np.ptp(v)), 0.0, np.zeros(3)
+        PlantFamily(nominal, uncertainty), noise_std, Bounds((1e-300, 1e300), wide, wide), inf,
+        float(np.ptp(v)), 0.0, np.zeros(3),
     )
-    fit = afresh(setup, record)
+    sign, fit = 1.0, afresh(setup, record)
     if fit is not None and fit.m < 0.0:
         # With the other sign of G it is a fit like any other.
         sign = -1.0
@@ -179,9 +192,9 @@ def _best(
         problem = problem_of(setup, record)
         fit = afresh(setup, record, also=fit) or fit
     still = _still(problem, fit)
-    count = max(int(problem.known.sum()), 1)
-    still_evidence = -0.5 * count * float(np.log((still**2 + noise_std**2) / noise_std**2))
-    return _Best(setup, problem, fit, sign, still, still_evidence, int(wild.sum()))
+    by_still = -0.5 * max(int(problem.known.sum()), 1) * float(
+        np.log((still**2 + noise_std**2) / noise_std**2))
+    return _Best(problem, fit, sign, still, fit.evidence - by_still, int(wild.sum()))
 
 
 def _still(problem: Problem, fit: Fit) -> float:
@@ -197,38 +210,13 @@ def _still(problem: Problem, fit: Fit) -> float:
     return float(np.sqrt(np.mean(rest**2)))
 
 
-def _described(
-    best: _Best, nominal: TransferFunction, delay: int, margins: dict[int, float],
-    bounds: Bounds | None, swing: float,
-) -> RecordFit:
-    """All there is to say about a fit."""
-    fit, family = best.fit, best.setup.family
-    m, c_r, c_l = fit.crossings.tolist()
-    std_m, std_c_r, std_c_l = fit.crossings_std.tolist()
-    p, _ = best.problem.input(fit)
-    found = RecordFit(
-        m=best.sign * m, c_r=c_r, c_l=c_l, gap=fit.gap,
-        std_m=std_m, std_c_r=std_c_r, std_c_l=std_c_l, std_gap=fit.gap_std,
-        start=fit.p0, nominal=nominal, model=_learned(family, fit, nominal, best.sign),
-        delay=delay, margins=margins, error_scale=fit.scale, noise_std=fit.noise, rms=fit.rms,
-        correlation=fit.correlation, unexplained=fit.unexplained,
-        evidence=fit.evidence - best.still_evidence,
-        predicted=1.0 - fit.rms / best.still_rms if best.still_rms > 0.0 else 0.0,
-        reversals=_reversals(p, fit), outliers=best.outliers,
-        frequencies=frequencies_of(np.where(best.problem.known, best.problem.y, nan)), doubts=(),
-    )
-    return _with_doubts(found, fit, bounds, swing, REVERSALS if family.count else 1)
-
-
 def _learned(
     family: PlantFamily, fit: Fit, nominal: TransferFunction, sign: float,
 ) -> TransferFunction:
     """The G of the fit where it is likelier than the nominal one."""
     xi = fit.theta[3:]
-    if not family.count:
-        return nominal
     cov = fit.cov_xi + 1e-16 * np.eye(family.count)
-    if 0.5 * float(xi @ np.linalg.solve(cov, xi)) <= LIKELIER:
+    if not family.count or 0.5 * float(xi @ np.linalg.solve(cov, xi)) <= 1.0:
         return nominal
     return _with_sign(family.model_at(fit.xi), sign)
 
@@ -242,45 +230,31 @@ def _reversals(p: Array, fit: Fit) -> int:
     moves = np.diff(p, prepend=fit.p0)
     moves = moves[moves != 0.0]
     turns = np.flatnonzero(np.diff(np.sign(moves))) + 1
-    strokes = np.add.reduceat(moves, np.append(0, turns)) if len(moves) else moves
-    strokes = strokes[np.abs(strokes) > SURE * fit.gap_std]
-    return int(np.count_nonzero(np.diff(np.sign(strokes))))
+    ways = np.add.reduceat(moves, np.append(0, turns)) if len(moves) else moves
+    ways = ways[np.abs(ways) > 5.0 * fit.gap_std]
+    return int(np.count_nonzero(np.diff(np.sign(ways))))
 
 
-def _with_doubts(
-    found: RecordFit, fit: Fit, bounds: Bounds | None, swing: float, wanted: int,
-) -> RecordFit:
-    """The same with what keeps it from being precise enough for the loop."""
-    doubts: list[str] = []
-    if found.reversals < wanted:
-        doubts.append(
-            f'v crossed the gap {found.reversals} times; {wanted} at least are needed to tell both '
-            'crossings'
-        )
-    if not found.std_m <= STD_SLOPE * abs(found.m):
-        doubts.append(f'm is known to {found.std_m:.2g} only')
-    if not found.std_gap <= max(STD_GAP * found.gap, NO_GAP * swing):
-        doubts.append(
-            f'the gap, about {found.gap:.4g}, is known to {found.std_gap:.2g} only'
-            + (f': {found.unexplained:.0%} of its motion follows from no backlash and no G'
-               if found.correlation > 0.0 and isfinite(found.unexplained) else '')
-        )
-    if bounds is not None:
-        values = (found.m, found.c_r, found.c_l)
-        doubts += [
-            f'{name} would be {value:.4g}, outside of its bounds'
-            for name, value, far in zip(
-                ('m', 'c_r', 'c_l'), values, outside_bounds(bounds, fit), strict=True) if far
-        ]
-    return replace(found, doubts=tuple(doubts))
-
-
-def _nothing(nominal: TransferFunction, evidence: float, reason: str) -> RecordFit:
-    """No fit, and why."""
-    return RecordFit(
-        *(nan,) * 9, nominal, nominal, 0, {}, nan, nan, nan, nan, nan, evidence, nan, 0, 0,
-        (nan, nan), (reason,),
-    )
+def _doubts(
+    found: RecordFit, fit: Fit, bounds: Bounds | None, swing: float,
+) -> tuple[str, ...]:
+    """What keeps it from being precise enough for the loop."""
+    wanted = REVERSALS if len(fit.xi) else 1
+    rest = f': {found.unexplained:.0%} of its motion follows from no backlash and no G' \
+        if found.correlation > 0.0 and isfinite(found.unexplained) else ''
+    return tuple(text for true, text in (
+        (found.reversals < wanted,
+         f'v crossed the gap {found.reversals} times; {wanted} at least are needed to tell both '
+         'crossings'),
+        (not found.std_m <= STD_SLOPE * abs(found.m), f'm is known to {found.std_m:.2g} only'),
+        # A gap of 0 is known to 1 % of the swing.
+        (not found.std_gap <= max(STD_GAP * found.gap, 0.01 * swing),
+         f'the gap, about {found.gap:.4g}, is known to {found.std_gap:.2g} only{rest}'),
+        *((far, f'{name} would be {value:.4g}, outside of its bounds')
+          for (name, value, _), far in zip(
+              found.estimates, outside_bounds(bounds, fit) if bounds else [False] * 3,
+              strict=True)),
+    ) if true)
 
 
 def _with_sign(model: TransferFunction, sign: float) -> TransferFunction:

@@ -1,4 +1,4 @@
-"""The verdict on a driver: all findings in order, and the table that shows them."""
+"""All that there is to say of a driver, so that each fault shows once."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from backlash_ros.core.driver_check.findings import (
 )
 from backlash_ros.core.driver_check.motion import (
     DELAY,
-    MODEL,
+    G_OF_Z,
     MOTION_SUBJECTS,
-    NOISE,
+    NOISE_ON_Y,
     applied_findings,
     motion_findings,
     not_judged,
@@ -29,46 +29,41 @@ from backlash_ros.core.driver_check.motion import (
 from backlash_ros.core.parameters import Parameters
 
 MESSAGE_SUBJECTS = ('rate', 'jitter', 'lost samples', 'repeated samples', 'clock', 'values')
-# Without these nothing that follows from time or motion means anything.
-BASIC = {'publisher', 'type'}
-BLURRED_BY_JITTER = {DELAY, MODEL, NOISE}
-NEEDED_FOR_MOTION = {'listener', 'rate', 'clock'}
-SIMILAR = 0.6  # of difflib: a topic that may be meant
 
 
 def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Finding]:
-    """All findings; what a fault hides is said to be unknown, so that each fault shows once."""
+    """All findings; what a fault hides is said to be unknown."""
     found = graph_findings(graph, bool(p.get('io.best_effort', False)))
-    wrong = [f.subject for f in found if f.mark == WRONG and f.subject in BASIC]
     if graph.publishers == 0:
         return found
-    if wrong:
-        return found + _hidden(MESSAGE_SUBJECTS + MOTION_SUBJECTS, wrong[0])
+    # Without these nothing that follows from time or motion means anything.
+    if wrong := _wrong(found, 'publisher', 'type'):
+        return found + not_judged(MESSAGE_SUBJECTS + MOTION_SUBJECTS, wrong)
     timing = timing_of(heard, p.sample_period)
     if timing is None:
         rate = Finding(
             'rate', WRONG, f'{len(heard.outputs)} samples heard, {FEWEST_SAMPLES} are needed',
             'see that plant_output is published without pause; raise --duration',
         )
-        return [*found, rate, *_hidden(MESSAGE_SUBJECTS[1:] + MOTION_SUBJECTS, 'rate')]
+        return [*found, rate, *not_judged(MESSAGE_SUBJECTS[1:] + MOTION_SUBJECTS, 'rate')]
     found += message_findings(heard, timing, p.sample_period)
-    wrong = [f.subject for f in found if f.mark == WRONG and f.subject in NEEDED_FOR_MOTION]
-    if wrong:
-        return found + _hidden(MOTION_SUBJECTS, wrong[0])
+    if wrong := _wrong(found, 'listener', 'rate', 'clock'):
+        return found + not_judged(MOTION_SUBJECTS, wrong)
     found += applied_findings(heard, timing, p)
     motion = motion_findings(record_of(heard, timing), p)
-    if any(f.subject == 'jitter' and f.mark == WRONG for f in found):
+    if _wrong(found, 'jitter'):
         # Amid jitter it is uncertain which v led to which y: what fits does, what does not may.
         motion = [
-            not_judged(f.subject, 'once jitter fits')
-            if f.mark == WRONG and f.subject in BLURRED_BY_JITTER else f
-            for f in motion
+            line for f in motion for line in (
+                not_judged([f.subject], 'jitter')
+                if f.mark == WRONG and f.subject in (DELAY, G_OF_Z, NOISE_ON_Y) else [f])
         ]
     return found + motion
 
 
-def _hidden(subjects: Sequence[str], behind: str) -> list[Finding]:
-    return [not_judged(subject, f'once {behind} fits') for subject in subjects]
+def _wrong(found: Iterable[Finding], *subjects: str) -> str:
+    """The first of these subjects that is wrong."""
+    return next((f.subject for f in found if f.mark == WRONG and f.subject in subjects), '')
 
 
 def all_fit(findings: Iterable[Finding]) -> bool:
@@ -94,12 +89,10 @@ def similar_topics(
 
     wanted: fully qualified. seen: topics with their types.
     """
-    last = wanted.rsplit('/', 1)[-1]
-
     def likeness(topic: str) -> float:
-        name = topic.rsplit('/', 1)[-1]
-        alike = difflib.SequenceMatcher(None, last, name).ratio()
+        last, other = (name.rsplit('/', 1)[-1] for name in (wanted, topic))
+        alike = difflib.SequenceMatcher(None, last, other).ratio()
         return alike + (0.1 if wanted_type in seen[topic] else 0.0)
 
-    near = [topic for topic in seen if topic != wanted and likeness(topic) >= SIMILAR]
+    near = [topic for topic in seen if topic != wanted and likeness(topic) >= 0.6]
     return sorted(near, key=lambda topic: (-likeness(topic), topic))

@@ -10,7 +10,7 @@ what the backlash that was identified behind v says. All but the poles of L is l
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from math import log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +23,10 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-STABLE = 0.9999  # largest reflection coefficient of the denominator
-SLOWEST = 0.99  # pole: a motor that takes longer follows no command
 PUSHED_FOR = 10  # samples after which the load is pushed on a side as hard as it ever is
-FEWEST = 10  # samples of them for each unknown
-NEGLIGIBLE = 0.01  # gaps (rms) by which v is off the command where nothing lies between them
-POOR = 0.1  # gaps (rms) that an L may leave unexplained
-
-
-class _Fitted(NamedTuple):
-    """A fit. taps: coefficients of the numerator, the first of them `delay` samples late."""
-
-    denominator: Array
-    taps: Array
-    delay: int
-    wind_up: float
-    offset: float
-    squares: float
+NEGLIGIBLE, POOR = 0.01, 0.1  # gaps (rms) by which v is off the command where nothing lies between
+# them, and that an L may leave unexplained
+SLOWEST_MOTOR = 0.99  # pole: a motor that takes longer follows no command
 
 
 def with_actuator(found: Identification, commands: Array) -> Identification:
@@ -53,93 +40,70 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
         return found
     p = details.fit.p
     side = np.where(p <= found.v, 1.0, np.where(p >= found.v + gap, -1.0, 0.0))
-    rows = _pushed(side)
-    best = _best(commands, found.v, side, rows)
-    left = off if best is None else float(np.sqrt(best.squares / len(rows)))
-    if best is None or left > POOR * gap:
-        return replace(found, remarks=(
-            *found.remarks,
-            f'applied_control is off control by {left / gap:.0%} of the gap (rms) that no lag '
-            'explains, and y will follow worse for it: stay within what the motor can follow',
-        ))
-    return replace(found, actuator=_actuator(best))
-
-
-def _pushed(side: Array) -> NDArray[np.int64]:
-    """Samples at which the load has been pushed on one side for a while."""
-    same = np.ones(len(side), dtype=bool)
-    same[:PUSHED_FOR] = False
+    pushed = side != 0.0
+    pushed[:PUSHED_FOR] = False
     for ago in range(1, PUSHED_FOR + 1):
-        same[ago:] &= side[ago:] == side[:-ago]
-    return np.flatnonzero(same & (side != 0.0))
-
-
-def _best(
-    commands: Array, v: Array, side: Array, rows: NDArray[np.int64],
-) -> _Fitted | None:
-    """The fit with the least rows log(squares) + unknowns log(rows); None without any."""
-    found: list[tuple[float, _Fitted]] = []
-    for order in (1, 2):
-        for delay in range(4):
-            # A coefficient more than poles is part of a delay.
-            unknowns = 2 * order + 3
-            if len(rows) < FEWEST * unknowns or len(np.unique(side[rows])) < 2:
-                continue
-            one = _fitted(commands, v, side, rows, order, delay)
-            if one is not None:
-                squares = max(one.squares, np.finfo(float).tiny)
-                found.append((
-                    len(rows) * float(np.log(squares)) + unknowns * float(np.log(len(rows))), one,
-                ))
-    return min(found, key=lambda pair: pair[0])[1] if found else None
+        pushed[ago:] &= side[ago:] == side[:-ago]
+    rows = np.flatnonzero(pushed)
+    fits = [] if len(np.unique(side[rows])) < 2 else [
+        _fitted(commands, found.v, side, rows, order, delay)
+        for order in (1, 2) if len(rows) >= 10 * (2 * order + 3) for delay in range(4)
+    ]
+    # The least rows log(squares) + unknowns log(rows).
+    _, left, actuator = min((one for one in fits if one[2] is not None),
+                            default=(0.0, off, None), key=lambda one: one[0])
+    if actuator is not None and left <= POOR * gap:
+        return replace(found, actuator=actuator)
+    return replace(found, remarks=(
+        *found.remarks,
+        f'applied_control is off control by {left / gap:.0%} of the gap (rms) that no lag '
+        'explains, and y will follow worse for it: stay within what the motor can follow',
+    ))
 
 
 def _fitted(
-    commands: Array, v: Array, side: Array, rows: NDArray[np.int64], order: int, delay: int,
-) -> _Fitted | None:
+    commands: Array, v: Array, side: Array, rows: NDArray[np.intp], order: int, delay: int,
+) -> tuple[float, float, Actuator | None]:
+    """Criterion, rms of what is left over, and the actuator, None where it would be none."""
     moved = np.concatenate([np.zeros(delay), (commands - commands[0])[:len(commands) - delay]])
     target = v[rows]
 
     def solved(reflections: Array) -> tuple[Array, Array, Array]:
         denominator = _denominator(reflections)
         answer = lfilter([1.0], denominator, moved)
-        columns = [np.concatenate([np.zeros(i), answer[:len(answer) - i]])[rows]
-                   for i in range(order + 1)]
-        matrix = np.column_stack([*columns, -side[rows], -np.ones(len(rows))])
+        # A coefficient more than poles is part of a delay.
+        matrix = np.column_stack([
+            *(np.concatenate([np.zeros(i), answer[:len(answer) - i]])[rows]
+              for i in range(order + 1)), -side[rows], -np.ones(len(rows)),
+        ])
         solution = np.linalg.lstsq(matrix, target, rcond=None)[0]
         return denominator, solution, target - matrix @ solution
 
     from scipy.optimize import least_squares  # takes a fifth of the time that a start takes
     size = float(np.std(target)) or 1.0
-    fits = [
-        least_squares(
-            lambda x: solved(x)[2] / size, _reflections(np.full(order, pole)),
-            bounds=(-STABLE, STABLE), x_scale=0.1,
-        ) for pole in (0.3, 0.7, 0.9)
-    ]
-    best = min(fits, key=lambda one: float(one.cost))
+    # Reflection coefficients of real poles: all within 1 where all poles are.
+    starts = [[-2.0 * pole / (1.0 + pole**2), pole**2] if order == 2 else [-pole]
+              for pole in (0.3, 0.7, 0.9)]
+    best = min((
+        least_squares(lambda x: solved(x)[2] / size, start, bounds=(-0.9999, 0.9999), x_scale=0.1)
+        for start in starts
+    ), key=lambda one: float(one.cost))
     denominator, solution, residual = solved(best.x)
-    if np.abs(np.roots(denominator)).max() > SLOWEST:
-        return None
     taps, (wind_up, offset) = solution[:order + 1], solution[order + 1:]
+    squares = max(float(residual @ residual), float(np.finfo(float).tiny))
+    criterion = len(rows) * log(squares) + (2 * order + 3) * log(len(rows))
     gain = float(taps.sum() / denominator.sum())
-    one = _Fitted(
-        denominator, taps, delay, float(wind_up), float(offset) + gain * float(commands[0]),
-        float(residual @ residual),
-    )
-    try:
-        _actuator(one)
-    except ParameterError:
-        return None
-    return one
-
-
-def _reflections(poles: Array) -> Array:
-    """Reflection coefficients of real poles (1,) or (2,): all within 1 where all poles are."""
-    if len(poles) == 1:
-        return -poles
-    product = float(poles[0] * poles[1])
-    return np.array([-float(poles.sum()) / (1.0 + product), product])
+    actuator = None
+    if gain > 0.0 and np.abs(np.roots(denominator)).max() <= SLOWEST_MOTOR:
+        offset += gain * float(commands[0])
+        try:
+            # v at the end of an interval belongs to the next sample: one more pole at 0.
+            lag = TransferFunction(
+                taps.tolist(), [*denominator.tolist(), *[0.0] * (delay + 1)], 'actuator')
+            actuator = Actuator(lag, ((wind_up + offset) / gain, (wind_up - offset) / gain))
+        except ParameterError:
+            pass
+    return criterion, float(np.sqrt(squares / len(rows))), actuator
 
 
 def _denominator(reflections: Array) -> Array:
@@ -148,17 +112,3 @@ def _denominator(reflections: Array) -> Array:
     for k in reflections.tolist():
         a = np.append(a, 0.0) + k * np.append(0.0, a[::-1])
     return a
-
-
-def _actuator(fitted: _Fitted) -> Actuator:
-    """As parameters have it: L strictly proper, the wind-up in units of the command."""
-    # v at the end of an interval belongs to the next sample: one more pole at 0.
-    at_zero = fitted.delay + len(fitted.taps) - (len(fitted.denominator) - 1)
-    denominator = np.append(fitted.denominator, np.zeros(at_zero))
-    gain = float(fitted.taps.sum() / fitted.denominator.sum())
-    if not gain > 0.0:
-        raise ParameterError('actuator.numerator', fitted.taps.tolist(), 'must have a gain > 0')
-    return Actuator(
-        TransferFunction(fitted.taps.tolist(), denominator.tolist(), 'actuator'),
-        ((fitted.wind_up + fitted.offset) / gain, (fitted.wind_up - fitted.offset) / gain),
-    )

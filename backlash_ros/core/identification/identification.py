@@ -8,24 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field, replace
-from math import inf, nan
-from typing import NamedTuple, TypeVar
+from math import exp, inf, log, nan, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.identification import uncertainty
-from backlash_ros.core.identification.gap_search import (
-    Profile,
-    profile,
-    search,
-    steiglitz_mcbride,
-)
+from backlash_ros.core.identification.gap_search import SEARCH_ROWS, Profile, search
 from backlash_ros.core.identification.least_response import least_response
-from backlash_ros.core.identification.not_play import Observed
+from backlash_ros.core.identification.not_play import Observed, what_it_is
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
-    TINY,
+    RACE_STEPS,
     Compared,
     cancelled_poles,
     compare,
@@ -37,44 +32,32 @@ from backlash_ros.core.identification.order_selection import (
     selected,
 )
 from backlash_ros.core.identification.output_error import (
+    TINY,
     Fit,
     Samples,
     Structure,
     best_start,
     fit,
     linear_rows,
-    squares_of,
+    squares_left,
+    steiglitz_mcbride,
     triangle,
 )
 from backlash_ros.core.identification.uncertainty import Covariance
-from backlash_ros.core.identification.verdict import (
-    APART,
-    SURE,
-    Findings,
-    Verdict,
-    is_no_play,
-    judge,
-)
+from backlash_ros.core.identification.verdict import ANOTHER, CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.roughness import noise_of
 from backlash_ros.core.records.samples import busiest, check_record, frequencies_of, outliers
 
 Array = NDArray[np.float64]
-T = TypeVar('T')
 
-GENERAL = Structure(3, 0, False)  # G with which the gap is searched first, and a tap per delay
-FEWEST = 8  # samples per unknown below which nothing is fitted
-EARLY, LATEST = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
-WINDOW = 4  # delays from one look at later ones to the next
-SHORTEST = 20  # samples of a record for each of the delay, at least
-LATER = 5.0  # log-likelihood by which a later delay must fit better
-ALIKE = 1.3  # ratio of the squares left over of delays that may be the right one
-ROWS = 1200  # in which gaps are compared: of more samples, neighbours are averaged
-SAME = 0.005  # relative distance of two gaps that are one
-NEAR = np.linspace(0.8, 1.2, 13)  # gaps around the best one, relative
-WHOLE = 24  # gaps over the swing of v
-LEAST_UNCERTAINTY = 0.01  # of G: what a record does not show of a plant that is never quite linear
+POLES = 3  # of the general G with which the gap is searched first; it has a tap for each delay
+EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
+FAR_OFF = 0.03  # relative distance of the last gap from the first, with which to begin anew
+WORSE_FOR = 3  # delays in a row that fit worse, behind which no later one is tried
+MOST_ALIKE = 8  # delays that fit alike, beyond which none of them is told
+ALIKE = 5.0  # log-likelihood by which a delay that fits alike may be worse
 
 
 @dataclass(frozen=True)
@@ -161,6 +144,22 @@ class Identification:
         return not self.reasons
 
 
+class _Search(NamedTuple):
+    """The best of the structures that were compared. rivals: other minima (gap, how far behind).
+
+    apart: deviation of the gap beside the fit's, by a model or a delay that fits alike.
+    """
+
+    samples: Samples
+    compared: list[Compared]
+    chosen: Compared
+    best: Fit
+    rivals: list[tuple[float, float]]
+    curve: Profile
+    delays: Sequence[int]
+    apart: float = 0.0
+
+
 def identify(v: Array, y: Array, sample_period: float, options: Options | None = None,
              ) -> Identification:
     """Identify v (N,), applied from k to k+1, and y (N,) at k, nan where lost.
@@ -176,64 +175,244 @@ def identify(v: Array, y: Array, sample_period: float, options: Options | None =
             return found
 
 
-class _Search(NamedTuple):
-    """The best of the structures that were compared. rivals: other minima (gap, how far behind).
-
-    apart: deviation of the gap beside the fit's, by a later delay that fits alike.
-    """
-
-    samples: Samples
-    compared: list[Compared]
-    chosen: Compared
-    best: Fit
-    rivals: list[tuple[float, float]]
-    curve: Profile
-    delays: Sequence[int]
-    apart: float = 0.0
-
-
 def identifying(
     v: Array, y: Array, sample_period: float, options: Options,
 ) -> Generator[str, None, Identification]:
-    """The same in pieces of some ten milliseconds; yields what is being done."""
+    """The same; yields what is being done."""
     v, y = np.asarray(v, dtype=float), np.asarray(y, dtype=float)
     check_record(v, y)
-    nothing = _nothing(v, y, sample_period, options)
-    if nothing is not None:
-        return nothing
-    part = busiest(v, y)
+    given, part = Identification(sample_period, v, y), busiest(v, y)
+    nothing = _why_nothing(v, y[part], options)
+    if nothing:
+        return replace(given, reasons=(nothing,))
     s = yield from _searched(v[part], y[part], options, options.delays or EARLY)
-    late = not options.delays and s.chosen.structure.delay == EARLY[-1]
-    # What no G with a backlash explains, any delay explains a little better.
-    if late and _delay_open(s.samples, s.best) and not is_no_play(_observed(s.samples, s.best)):
+    if not options.delays:
         s = yield from _later(s, options)
-    rows = effective_rows(s.samples, s.best)
-    # With as many poles, some of them may fit worse.
+    yield 'choosing the delay'
+    best, rows = s.best, effective_rows(s.best)
     others = [
-        one for one in _with_delays(s.samples, s.best, equal_delays(s.compared, s.chosen))
-        if rows * np.log(one.squares / max(s.best.squares, TINY)) <= PLATEAU
+        fit(s.samples, best.structure._replace(delay=delay), best.point)
+        for delay in equal_delays(s.compared, s.chosen) if delay != best.structure.delay
     ]
-    best, penalty = yield from _named('choosing the delay', least_response(
-        s.samples, s.best, others, s.best.squares / rows,
-    ))
-    yield 'fitting the whole record'
-    kept = y.copy()
-    kept[part] = s.samples.whole_y
-    samples = Samples(v, kept, max(s.delays) + 1)
+    # With as many poles, some of them may fit worse.
+    best = least_response(best, [
+        one for one in others if rows * log(max(one.squares, TINY) / max(best.squares, TINY))
+        <= PLATEAU
+    ], best.squares / rows)
     if len(v) > len(s.samples.v):
-        best = _on_all(samples, best, penalty)
-        wild = _outliers(samples, best)
-        samples = samples.without(wild) if wild.any() else samples
-    best = fit(samples, best.structure, best.point, penalty=penalty)
+        yield 'fitting the whole record'
+        kept = y.copy()
+        kept[part] = s.samples.whole_y
+        samples = Samples(v, kept, s.samples.first, len(v), penalty=best.samples.penalty)
+        begin = best_start(samples, best.structure, [best.point.a], best.point.gap, (0.0, 0.5, 1.0))
+        best = fit(samples, best.structure, begin)
+        wild = _without_outliers(samples, best)
+        best = best if wild is samples else fit(wild, best.structure, best.point)
     yield 'judging'
-    left_out = int((np.isfinite(y) & np.isnan(samples.whole_y)).sum())
-    given = replace(Identification(sample_period, v, y), outliers=left_out)
-    found = _described(samples, s, best, given, options, part.start, s.apart)
-    return _as_a_gain(found, samples, s, given, options, part.start)
+    given = replace(given, outliers=int((np.isfinite(y) & np.isnan(best.samples.whole_y)).sum()))
+    found = _described(s, best, given, options, part.start)
+    return _as_a_gain(found, s, best, given, options, part.start)
+
+
+def _why_nothing(v: Array, y: Array, options: Options) -> str:
+    """Why there is nothing to fit; empty where there is. y: of the part that is searched."""
+    known = np.isfinite(y[max(options.delays or EARLY) + 1:])
+    # The first samples of them are fitted alone, to predict the others.
+    fitted = known[:len(known) - round(options.held_out * len(known))]
+    needed = 8 * max(Structure(max(options.orders), 0, False).unknowns,
+                          Structure(POLES, 0, False).unknowns)
+    if fitted.sum() < needed or not known[len(fitted):].any():
+        return (
+            f'{int(known.sum())} samples of y are too few, or lie too unevenly, for an order of up '
+            f'to {max(options.orders)}, about {round(needed / (1.0 - options.held_out))} are '
+            'needed: record for longer, or limit --order'
+        )
+    if np.ptp(v) == 0.0:
+        return 'v stood still: move it to and fro, past the gap'
+    if np.nanmax(y) == np.nanmin(y):
+        return 'y stood still: let v swing wider than the gap, and see that y is measured'
+    return ''
+
+
+def _general(first: int, last: int) -> Structure:
+    """G with which the gap is searched: a few poles, and a tap for each delay."""
+    return Structure(POLES, first, False, POLES + last - first)
+
+
+def _searched(
+    v: Array, y: Array, options: Options, delays: Sequence[int],
+) -> Generator[str, None, _Search]:
+    """The best structure with one of these delays."""
+    samples, whole = Samples(v, y, max(delays) + 1, len(v)), _general(min(delays), max(delays))
+    yield 'searching the gap'
+    found, _ = search(samples, whole)
+    kept = _without_outliers(samples, fit(samples, whole, found[0].point))
+    if kept is not samples:
+        samples = kept
+        found, _ = search(samples, whole)
+    candidates = [one.point for one in found[:2]]
+    structures = [
+        Structure(order, delay, integrator) for integrator in options.integrators
+        for delay in delays for order in options.orders if order >= integrator
+    ]
+    for again in (True, False):
+        yield 'comparing orders and delays'
+        compared = compare(samples, candidates, structures, options.held_out)
+        yield 'refining'
+        while True:
+            chosen = selected(compared)
+            best, rivals, curve = _refined(samples, chosen)
+            if not gives_way(best, compared):
+                break
+            # Only the best fit of all shows that a pole is none.
+            compared = [one._replace(fit=best) if one is chosen else one for one in compared]
+        off = abs(best.point.gap - candidates[0].gap)
+        if not again or off <= FAR_OFF * best.point.gap:
+            break
+        candidates = [best.point, candidates[0]]  # the general G may have been a poor one
+    return _Search(samples, compared, chosen, best, rivals, curve, delays)
+
+
+def _without_outliers(samples: Samples, found: Fit) -> Samples:
+    """The same without readings that are none; rounding makes none."""
+    wild = outliers(found.residual, quantum(samples.y))
+    if not wild.any():
+        return samples
+    y = samples.whole_y.copy()
+    y[samples.first:samples.last][wild] = nan
+    return replace(samples, whole_y=y)
+
+
+def _refined(
+    samples: Samples, chosen: Compared,
+) -> tuple[Fit, list[tuple[float, float]], Profile]:
+    """The best fit of the chosen structure, other minima (gap, how far behind), the profile."""
+    found, curve = search(samples, chosen.structure, chosen.fit)
+    near = [one for one in found if one.squares < 1.5 * found[0].squares]
+    fits = [chosen.fit, *(fit(samples, chosen.structure, one.point) for one in near[:5])]
+    best = min(fits, key=lambda one: one.squares)
+    rows, gap = effective_rows(best), best.point.gap
+    rivals = sorted(
+        (0.5 * rows * log(max(one.squares, TINY) / max(best.squares, TINY)), one.point.gap)
+        for one in fits if abs(one.point.gap - gap) > ANOTHER * gap
+    )
+    return best, [(gap, behind) for behind, gap in rivals], curve
+
+
+def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
+    """The search among later delays, where one of them explains y as well or better.
+
+    The same structure is fitted with one sample of delay more and more, from the fit before.
+    """
+    yield 'searching later delays'
+    best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
+    samples = replace(early.samples, first=latest + 1, most=SEARCH_ROWS)
+    scan = [fit(samples, best.structure, best.point)]
+    alike, rows = list(scan), effective_rows(scan[0])
+    while scan[-1].structure.delay < min(latest, alike[-1].structure.delay + WORSE_FOR):
+        (a, gap, start), delay = scan[-1].point, scan[-1].structure.delay + 1
+        structure = best.structure._replace(delay=delay)
+        models = [a, *steiglitz_mcbride(samples, structure, scan[-1].p)[:1]]
+        scan.append(fit(
+            samples, structure, best_start(samples, structure, models, gap, (), start), RACE_STEPS))
+        most = min(one.squares for one in scan) * exp(2.0 * ALIKE / rows)
+        alike = [one for one in scan if one.squares <= most]
+    first, last = (alike[k].structure.delay for k in (0, -1))
+    if last <= EARLY[-1]:
+        return early
+    gaps = [one.point.gap for one in (best, *alike)]
+    early = early._replace(apart=0.5 * (max(gaps) - min(gaps)))
+    # What no G with a backlash explains, any delay explains a little better.
+    other = what_it_is(_observed(best))
+    if last - first > MOST_ALIKE or (other is not None and not other.known):
+        return early
+    late = yield from _searched(early.samples.v, early.samples.whole_y, options, range(
+        max(first - 1, 0), min(last + 2, latest) + 1))
+    better = effective_rows(late.best) * log(max(best.rms, TINY) / max(late.best.rms, TINY))
+    return late if late.best.structure.delay < max(late.delays) and better > -ALIKE else early
+
+
+def _delay_open(best: Fit) -> bool:
+    """Whether one more sample of delay fits as well."""
+    samples = replace(best.samples, first=best.samples.first + 1)
+    longer = best.structure._replace(delay=best.structure.delay + 1)
+    this, other = (fit(samples, structure, best.point) for structure in (best.structure, longer))
+    ratio = log(max(other.squares, TINY) / max(this.squares, TINY))
+    return bool(best.structure.delay) and effective_rows(this) * ratio < PLATEAU
+
+
+def _observed(best: Fit) -> Observed:
+    """The signals of a fit, each where it acts on y."""
+    samples = best.samples
+    noise = noise_of(samples.known.astype(float), samples.y[samples.known])
+    return Observed(
+        samples.v[samples.first:samples.last], samples.y,
+        samples.delayed(best.p, best.structure.delay), best.simulated,
+        max(noise, quantum(samples.y) / sqrt(12.0)), best.point.gap,
+    )
+
+
+def _described(
+    s: _Search, best: Fit, given: Identification, options: Options, searched_from: int,
+) -> Identification:
+    """Everything there is to say of the best fit."""
+    samples, structure = best.samples, best.structure
+    covariance = uncertainty.covariance_of(best)
+    crossings = uncertainty.crossings_covariance(best, covariance)
+    gap_var, c_r_var = np.diag(crossings).tolist()
+    c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
+    gap_var += s.apart**2
+    band = frequencies_of(best.simulated)
+    low = max(band[0], np.pi / samples.count)
+    frequencies = np.geomspace(low, max(band[1], 1.01 * low), 60, dtype=np.float64)
+    spread = uncertainty.response_std(best, covariance, frequencies)
+    gain_std = float(uncertainty.response_std(best, covariance, np.zeros(1))[0])
+    middle = np.sqrt(frequencies[:1] * frequencies[-1:])
+    residual = best.residual[samples.known]
+    squares, still = float(residual @ residual), _still(best)
+    chosen = s.chosen
+    cut = s.samples.last - round(options.held_out * s.samples.count)
+    held_out = HeldOut(cut, predicted(chosen.trained, replace(s.samples, first=cut)),
+                       chosen.held_out, chosen.trained.rms)
+    correlation = max(lag_one(residual) - 3.0 / sqrt(len(residual)), 0.0)
+    step, total = quantum(samples.y), float(best.numerator.sum())
+    verdict = judge(Findings(
+        _observed(best), best.point.gap, sqrt(gap_var), best.c_r, sqrt(max(c_r_var, 0.0)),
+        float(np.abs(uncertainty.response(best, middle))[0]),
+        total if structure.integrator else total / float(best.denominator.sum()),
+        gain_std, float(spread.max()),
+        # Whatever the correlation: what explains nine tenths of y shows v.
+        inf if squares < 0.01 * still
+        else 0.5 * effective_rows(best) * log(still / max(squares, TINY)),
+        correlation, held_out.rms, held_out.trained, s.rivals, best.reversals, step,
+        cancelled_poles(best), structure.delay,
+        structure.delay == max(s.delays) and _delay_open(best),
+    ))
+    # What no model explains moves both sides of the gap alike.
+    more = 0.25 * (verdict.gap_std**2 - gap_var)
+    # As parameters have it: z where G is a gain, for B acts a sample late.
+    at_zero = structure.numerator_taps - structure.order
+    return replace(
+        given, m=options.slope, gap=best.point.gap, c_r=best.c_r, c_l=best.c_r - best.point.gap,
+        std={'m': options.slope * gain_std, 'gap': verdict.gap_std,
+             'c_r': sqrt(max(c_r_var + more, 0.0)), 'c_l': sqrt(c_l_var + more)},
+        numerator=tuple((best.numerator / options.slope).tolist()),
+        denominator=(*best.denominator.tolist(), *[0.0] * at_zero),
+        delay=structure.delay,
+        delays=tuple(sorted({*equal_delays(s.compared, chosen), structure.delay})),
+        integrator=structure.integrator,
+        noise_std=sqrt(squares / max(len(residual) - structure.unknowns, 1)),
+        quantum=step, correlation=correlation, ljung_box=uncertainty.ljung_box(best.residual),
+        frequencies=frequencies, response_std=spread,
+        uncertainty=_as_parameter(2.0 * float(spread.max())),
+        reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
+        details=Details(samples, s.samples, searched_from, best, covariance, tuple(s.compared),
+                        chosen, s.curve, held_out),
+    )
 
 
 def _as_a_gain(
-    found: Identification, samples: Samples, s: _Search, given: Identification, options: Options,
+    found: Identification, s: _Search, best: Fit, given: Identification, options: Options,
     searched_from: int,
 ) -> Identification:
     """With a G that is a gain and a delay, where a better one is not known but the gap is.
@@ -245,281 +424,27 @@ def _as_a_gain(
     if not gains or not found.verdict.backlash.known or found.verdict.model.known:
         return found
     chosen = min(gains, key=lambda one: one.fit.squares)
-    best = fit(samples, chosen.structure, chosen.trained.point)
+    best = fit(replace(best.samples, penalty=None), chosen.structure, chosen.trained.point)
     apart = s.apart + 0.5 * abs(best.point.gap - found.gap)  # what depends on the model
     gain = _described(
-        samples, s._replace(chosen=chosen), best, given, options, searched_from, apart)
+        s._replace(chosen=chosen, apart=apart), best, given, options, searched_from)
     assert gain.verdict is not None
-    if not (gain.verdict.backlash.known and gain.verdict.model.known
-            and apart < SURE * found.std['gap']):
+    known = gain.verdict.backlash.known and gain.verdict.model.known
+    if not known or apart >= CERTAIN * found.std['gap']:
         return found
-    moved = float(np.sqrt(best.squares / np.nanvar(samples.y) / len(samples.known)))
-    return replace(gain, uncertainty=max(gain.uncertainty, _as_parameter(moved)))
+    moved = sqrt(best.squares / float(np.nanvar(best.samples.y)) / len(best.samples.known))
+    return replace(gain, uncertainty=max(gain.uncertainty, _as_parameter(2.0 * moved)))
 
 
-def _searched(
-    v: Array, y: Array, options: Options, delays: Sequence[int],
-) -> Generator[str, None, _Search]:
-    """The best structure with one of these delays."""
-    samples = Samples(v, y, max(delays) + 1)
-    whole = _general(min(delays), max(delays))
-    found = yield from _named('searching the gap', search(samples.coarse(ROWS), whole))
-    wild = _outliers(samples, fit(samples, whole, found[0].point))
-    if wild.any():
-        samples = samples.without(wild)
-        found = yield from _named('searching the gap again', search(
-            samples.coarse(ROWS), whole))
-    compared = yield from _named('comparing orders and delays', compare(
-        samples, [one.point for one in _distinct(found)[:2]], options.orders, delays,
-        options.integrators, options.held_out,
-    ))
-    finalists = [one for one in compared if np.isfinite(one.criterion)]
-    while True:
-        chosen = selected(finalists)
-        best, rivals, curve = yield from _named('refining', _refined(samples, chosen))
-        if chosen.exact or not gives_way(best, finalists):
-            return _Search(samples, compared, chosen, best, rivals, curve, delays)
-        # Only the best fit of all shows that a pole is none.
-        finalists = [one._replace(fit=best) if one is chosen else one for one in finalists]
-
-
-def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
-    """The search among later delays, where one of them explains y better."""
-    v, y = early.samples.v, early.samples.whole_y
-    latest = min(LATEST, len(v) // SHORTEST)
-    samples = Samples(v, y, latest + 1, most=ROWS)
-    gaps = np.append(early.best.point.gap * np.array([1.0, 0.75, 0.5]),
-                     samples.swing * np.geomspace(0.01, 0.5, 5))
-    left: dict[int, float] = {}
-    for delay in range(0, latest, WINDOW):
-        structure = _general(delay, delay + WINDOW)
-        for gap in gaps.tolist():
-            p = samples.played(gap, float(v[0]) + 0.5 * gap)
-            a = steiglitz_mcbride(samples, structure, p)[0]
-            left[delay] = min(squares_of(samples, structure, a, p), left.get(delay, inf))
-        yield 'searching later delays'
-    # Of a smooth motion many delays tell alike.
-    delay = min(delay for delay, squares in left.items() if squares <= ALIKE * min(left.values()))
-    delay = max(delay, WINDOW)  # taps of a shorter one reach as far
-    window = range(delay - 1, min(delay + WINDOW + 2, latest) + 1)
-    late = yield from _searched(v, y, options, window)
-    ratio = max(early.best.rms, TINY) / max(late.best.rms, TINY)
-    better = effective_rows(late.samples, late.best) * float(np.log(ratio))
-    inner = late.best.structure.delay < max(window)
-    if inner and better > LATER:
-        return late
-    apart = 0.5 * abs(late.best.point.gap - early.best.point.gap)
-    return early._replace(apart=apart) if better > -LATER else early
-
-
-def _general(first: int, last: int) -> Structure:
-    """G with which the gap is searched: a few poles, and a tap for each delay."""
-    return GENERAL._replace(delay=first, taps=GENERAL.order + last - first)
-
-
-def _nothing(v: Array, y: Array, sample_period: float, options: Options) -> Identification | None:
-    """Where there is nothing to fit: why."""
-    first = max(options.delays or EARLY) + 1
-    part = busiest(v, y)
-    known = np.isfinite(y[part][first:])
-    # The first samples of them are fitted alone, to predict the others.
-    fitted = known[:len(known) - round(options.held_out * len(known))]
-    needed = FEWEST * max(Structure(max(options.orders), 0, False).unknowns, GENERAL.unknowns)
-    reason = ''
-    if fitted.sum() < needed or not known[len(fitted):].any():
-        reason = (
-            f'{int(known.sum())} samples of y are too few, or lie too unevenly, for an order of up '
-            f'to {max(options.orders)}, about {round(needed / (1.0 - options.held_out))} are '
-            'needed: record for longer, or limit --order'
-        )
-    elif np.ptp(v) == 0.0:
-        reason = 'v stood still: move it to and fro, past the gap'
-    elif np.nanmax(y) == np.nanmin(y):
-        reason = 'y stood still: let v swing wider than the gap, and see that y is measured'
-    return Identification(sample_period, v, y, reasons=(reason,)) if reason else None
-
-
-def _named(stage: str, work: Generator[None, None, T]) -> Generator[str, None, T]:
-    """The pieces of a generator under the name of what is done."""
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            result: T = done.value
-            return result
-        yield stage
-
-
-def _outliers(samples: Samples, found: Fit) -> NDArray[np.bool_]:
-    """Readings that are none; rounding makes none."""
-    return outliers(samples.y - found.simulated, quantum(samples.y))
-
-
-def _distinct(found: Sequence[Fit]) -> list[Fit]:
-    """Those whose gaps differ from all better ones."""
-    kept: list[Fit] = []
-    for one in found:
-        gap = one.point.gap
-        if all(abs(gap - other.point.gap) > SAME * other.point.gap for other in kept):
-            kept.append(one)
-    return kept
-
-
-def _refined(
-    samples: Samples, chosen: Compared,
-) -> Generator[None, None, tuple[Fit, list[tuple[float, float]], Profile]]:
-    """The best fit of the chosen structure, other minima (gap, how far behind), the profile."""
-    structure, swing = chosen.structure, samples.swing
-    coarse = samples.coarse(ROWS)
-    centre = fit(coarse, structure, chosen.fit.point)
-    whole: Array = np.append(0.0, np.geomspace(1e-3, 0.99, WHOLE) * swing)
-    curve = yield from profile(coarse, structure, whole, centre)
-    around = np.array([gap for gap in centre.point.gap * NEAR if 0.0 < gap < swing])
-    near = yield from profile(coarse, structure, around, centre)
-    minima: list[Fit] = []
-    for minimum in [*near.minima()[:3], *curve.minima()[:3]]:
-        minima.append(fit(samples, structure, minimum.point))
-        yield
-    best = min([chosen.fit, *minima], key=lambda one: one.squares)
-    rows = effective_rows(samples, best)
-    rivals = sorted(
-        (behind, one.point.gap) for one in minima
-        if abs(one.point.gap - best.point.gap) > APART * best.point.gap
-        for behind in [0.5 * rows * float(np.log(one.squares / max(best.squares, TINY)))]
-    )
-    gaps = np.concatenate([curve.gaps, near.gaps, [centre.point.gap]])
-    order = np.argsort(gaps, kind='stable')
-    fits = [*curve.fits, *near.fits, centre]
-    merged = Profile(
-        gaps[order], np.array([fits[k].squares for k in order]), [fits[k] for k in order]
-    )
-    return best, [(gap, behind) for behind, gap in rivals], merged
-
-
-def _on_all(samples: Samples, best: Fit, penalty: Array | None) -> Fit:
-    """The same structure on a longer record, at whose begin p may be anywhere in the gap."""
-    v0, gap = float(samples.v[0]), best.point.gap
-    starts = [v0 + share * gap for share in (0.0, 0.5, 1.0)]
-    begin = best_start(samples, best.structure, [best.point.a], gap, starts)
-    return fit(samples, best.structure, begin, penalty=penalty)
-
-
-def _with_delays(samples: Samples, best: Fit, delays: Sequence[int]) -> list[Fit]:
-    """The same structure with the other delays that fit alike."""
-    return [
-        fit(samples, best.structure._replace(delay=delay), best.point)
-        for delay in delays if delay != best.structure.delay
-    ]
-
-
-def _described(
-    samples: Samples, s: _Search, best: Fit, given: Identification, options: Options,
-    searched_from: int, apart: float = 0.0,
-) -> Identification:
-    """Everything there is to say of the best fit. apart: deviation of the gap beside the fit's."""
-    covariance = uncertainty.covariance_of(samples, best)
-    crossings = uncertainty.crossings_covariance(best, covariance)
-    gap_var, c_r_var = float(crossings[0, 0]), float(crossings[1, 1])
-    c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
-    gap_var += apart**2
-    band = frequencies_of(best.simulated)
-    low = max(band[0], np.pi / samples.count)
-    frequencies = np.geomspace(low, max(band[1], 1.01 * low), 60, dtype=np.float64)
-    spread = uncertainty.response_std(best, covariance, frequencies)
-    gain_std = float(uncertainty.response_std(best, covariance, np.zeros(1))[0])
-    residual = samples.y - best.simulated
-    rows = effective_rows(samples, best)
-    still = _still(samples, best)
-    correlation = max(
-        lag_one(residual[samples.known]) - 3.0 / np.sqrt(len(samples.known)), 0.0)
-    held_out = _held_out(s.samples, s.chosen, options.held_out)
-    numerator = best.numerator / options.slope
-    step = quantum(samples.y)
-    total = float(best.numerator.sum())
-    verdict = judge(Findings(
-        _observed(samples, best), best.point.gap, float(np.sqrt(gap_var)), best.c_r,
-        float(np.sqrt(c_r_var)),
-        float(np.abs(uncertainty.response(best, np.sqrt(frequencies[:1] * frequencies[-1:])))[0]),
-        total if best.structure.integrator else total / float(best.denominator.sum()),
-        gain_std, float(spread.max()),
-        # Whatever the correlation: what explains nine tenths of y shows v.
-        inf if best.squares < 0.01 * still
-        else 0.5 * rows * float(np.log(still / max(best.squares, TINY))),
-        correlation, held_out.rms, held_out.trained, s.rivals, best.reversals, step,
-        [_text(pole) for pole in cancelled_poles(best)], best.structure.delay,
-        best.structure.delay == max(s.delays) and _delay_open(samples, best),
-    ))
-    # What no model explains moves both sides of the gap alike.
-    more = 0.25 * (verdict.gap_std**2 - gap_var)
-    freedom = max(len(samples.known) - best.structure.unknowns, 1)
-    return replace(
-        given, m=options.slope, gap=best.point.gap, c_r=best.c_r, c_l=best.c_r - best.point.gap,
-        std={
-            'm': options.slope * gain_std, 'gap': verdict.gap_std,
-            'c_r': float(np.sqrt(c_r_var + more)), 'c_l': float(np.sqrt(c_l_var + more)),
-        },
-        numerator=tuple(numerator.tolist()), denominator=_proper(best),
-        delay=best.structure.delay,
-        delays=tuple(sorted({*equal_delays(s.compared, s.chosen), best.structure.delay})),
-        integrator=best.structure.integrator, noise_std=float(np.sqrt(best.squares / freedom)),
-        quantum=step, correlation=correlation,
-        ljung_box=uncertainty.ljung_box(residual), frequencies=frequencies, response_std=spread,
-        uncertainty=_as_parameter(float(spread.max())),
-        reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
-        details=Details(
-            samples, s.samples, searched_from, best, covariance, tuple(s.compared), s.chosen,
-            s.curve, held_out,
-        ),
-    )
-
-
-def _delay_open(samples: Samples, best: Fit) -> bool:
-    """Whether one more sample of delay fits as well."""
-    later = Samples(samples.v, samples.whole_y, samples.first + 1)
-    longer = best.structure._replace(delay=best.structure.delay + 1)
-    this, other = (fit(later, structure, best.point) for structure in (best.structure, longer))
-    ratio = float(np.log(max(other.squares, TINY) / max(this.squares, TINY)))
-    return bool(best.structure.delay) and effective_rows(later, this) * ratio < PLATEAU
-
-
-def _still(samples: Samples, best: Fit) -> float:
+def _still(best: Fit) -> float:
     """Squares left over by a u that stands still, through the same G."""
-    rows = linear_rows(samples, best.structure, best.point.a, best.p)
-    without = samples.reduced(rows[best.structure.numerator_taps:])
-    r, scale = triangle(np.vstack([without, samples.target]))
-    return max(float(r[-1, -1] * scale[-1]) ** 2, TINY)
-
-
-def _observed(samples: Samples, best: Fit) -> Observed:
-    """The signals of a fit, each where it acts on y."""
-    noise = noise_of(samples.known.astype(float), samples.y[samples.known])
-    return Observed(
-        samples.v[samples.first:samples.last], samples.y,
-        samples.delayed(best.p, best.structure.delay), best.simulated,
-        max(noise, quantum(samples.y) / np.sqrt(12.0)), best.point.gap,
-    )
-
-
-def _proper(found: Fit) -> tuple[float, ...]:
-    """The denominator as parameters have it: z where G is a gain, for B acts a sample late."""
-    at_zero = found.structure.numerator_taps - found.structure.order
-    return (*found.denominator.tolist(), *[0.0] * at_zero)
-
-
-def _text(root: complex) -> str:
-    return f'{root.real:.4g}' if abs(root.imag) < 1e-9 else f'{root:.4g}'
-
-
-def _held_out(samples: Samples, chosen: Compared, share: float) -> HeldOut:
-    """What the structure, fitted to the first part alone, predicts of the last."""
-    cut = samples.last - round(share * samples.count)
-    later = samples.part(cut, samples.last)
-    trained = chosen.trained
-    return HeldOut(cut, predicted(trained, later), chosen.held_out, trained.rms)
+    samples, structure = replace(best.samples, penalty=None), best.structure
+    rows = linear_rows(samples, structure, best.point.a, best.p)[structure.numerator_taps:]
+    return max(squares_left(triangle(np.vstack([samples.reduced(rows), samples.target]))), TINY)
 
 
 def _as_parameter(spread: float) -> float:
-    """plant.uncertainty for a relative deviation of G: of two deviations, one digit, upwards."""
-    value = min(max(2.0 * spread, LEAST_UNCERTAINTY), 1.0)
+    """plant.uncertainty for a relative spread of G: one digit, upwards, and 1 % at least."""
+    value = min(max(spread, 0.01), 1.0)
     digit = 10.0 ** np.floor(np.log10(value))
     return float(min(round(np.ceil(value / digit - 1e-9) * digit, 6), 1.0))

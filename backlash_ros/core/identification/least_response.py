@@ -9,12 +9,13 @@ the fit leave no such frequency, it is those at which the delays that fit alike 
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.output_error import Fit, Samples, fit
+from backlash_ros.core.identification.output_error import Fit, fit
 from backlash_ros.core.identification.uncertainty import (
     Covariance,
     covariance_of,
@@ -24,48 +25,31 @@ from backlash_ros.core.identification.uncertainty import (
 
 Array = NDArray[np.float64]
 
-POINTS = 40  # frequencies up to half the sampling rate
-GRID: Array = np.pi * (np.arange(POINTS) + 0.5) / POINTS  # [rad/sample]
-UNKNOWN = 0.1  # relative deviation, or difference, of G beyond which the record is silent
+GRID: Array = np.pi * (np.arange(40) + 0.5) / 40  # frequencies [rad/sample]
+SILENT = 0.1  # relative deviation, or difference, of G beyond which the record is silent
 
 
-def least_response(
-    samples: Samples, best: Fit, rivals: Sequence[Fit], noise_variance: float,
-) -> Generator[None, None, tuple[Fit, Array | None]]:
-    """The fit to take, and the penalty that it was made with, as `fit` takes it.
+def least_response(best: Fit, rivals: Sequence[Fit], noise_variance: float) -> Fit:
+    """The fit to take, whose samples have the penalty that it was made with.
 
     rivals: with other delays, that fit alike. noise_variance: effective.
     """
-    silent = _silent(samples, best)
-    if not len(silent):
-        silent = _contradicted(best, rivals)
-    if not len(silent):
-        return best, None
-    found: list[tuple[float, Fit, Array | None]] = []
-    for one in (best, *rivals):
-        smooth, penalty = _smoothed(samples, one, silent, noise_variance)
-        found.append((_gain(smooth, silent), smooth, penalty))
-        yield
-    return min(found, key=lambda one: one[0])[1:]
-
-
-def _silent(samples: Samples, best: Fit) -> Array:
-    """Frequencies [rad/sample] from which on G is not known."""
-    return GRID[known_up_to(best, covariance_of(samples, best)) < GRID]
-
-
-def _contradicted(best: Fit, rivals: Sequence[Fit]) -> Array:
-    """Frequencies [rad/sample] at which another delay makes another G."""
-    differs = np.zeros(POINTS, dtype=bool)
-    for one in rivals:
-        later = np.exp(-1j * GRID * (one.structure.delay - best.structure.delay))
-        differs |= np.abs(response(one, GRID) * later / response(best, GRID) - 1.0) > UNKNOWN
-    return np.asarray(GRID[differs])
+    silent = known_up_to(best, covariance_of(best)) < GRID
+    if not silent.any():
+        for one in rivals:
+            later = np.exp(-1j * GRID * (one.structure.delay - best.structure.delay))
+            ratio = response(one, GRID) * later / response(best, GRID)
+            silent |= np.abs(ratio - 1.0) > SILENT
+    if not silent.any():
+        return best
+    smooth = [_smoothed(one, GRID[silent], noise_variance) for one in (best, *rivals)]
+    return min(smooth, key=lambda one: float(np.sum(
+        (_rows(one, GRID[silent]) @ one.numerator) ** 2)))
 
 
 def known_up_to(found: Fit, covariance: Covariance) -> float:
     """Frequency [rad/sample] from which on G is not known; pi where it is known throughout."""
-    known = np.flatnonzero(response_std(found, covariance, GRID) <= UNKNOWN)
+    known = np.flatnonzero(response_std(found, covariance, GRID) <= SILENT)
     return float(GRID[known[-1]]) if len(known) else float(GRID[0])
 
 
@@ -77,23 +61,15 @@ def _rows(found: Fit, silent: Array) -> Array:
     return np.vstack([rows.real, rows.imag])
 
 
-def _gain(found: Fit, silent: Array) -> float:
-    values = _rows(found, silent) @ found.numerator
-    return float(values @ values)
-
-
-def _smoothed(
-    samples: Samples, found: Fit, silent: Array, noise_variance: float,
-) -> tuple[Fit, Array | None]:
-    """The fit with the heaviest penalty whose squares stay within what is allowed."""
-    rows, gain = _rows(found, silent), _gain(found, silent)
+def _smoothed(found: Fit, silent: Array, noise_variance: float) -> Fit:
+    """The fit with the heaviest penalty whose squares stay within two standard deviations."""
+    rows = _rows(found, silent)
+    gain = float(np.sum((rows @ found.numerator) ** 2))
     if gain == 0.0:
-        return found, None
-    most = found.squares + 4.0 * noise_variance  # two standard deviations
-    factor = np.sqrt(1e4 * found.squares / gain)
-    for _ in range(12):
-        smooth = fit(samples, found.structure, found.point, penalty=factor * rows)
-        if smooth.squares <= most:
-            return smooth, factor * rows
-        factor *= 0.25
-    return found, None
+        return found
+    for factor in np.sqrt(1e4 * found.squares / gain) * 0.25 ** np.arange(12.0):
+        smooth = fit(
+            replace(found.samples, penalty=factor * rows), found.structure, found.point)
+        if float(np.nansum(smooth.residual**2)) <= found.squares + 4.0 * noise_variance:
+            return smooth
+    return found

@@ -10,11 +10,6 @@ from collections.abc import Iterator
 from itertools import count
 
 GOLDEN, SILVER, BRONZE = 0.6180339887, 0.4142135624, 0.3027756377  # spread evenly, never repeat
-STROKES = 24  # strokes across the range in the whole motion, at its ordinary largest speed
-SLOWEST = 0.15  # of that speed
-AT_LIMIT = 3  # every so many strokes are as fast as the actuator may move
-SMALLEST, LARGEST = 0.35, 0.9  # parts of the way to the end of the range of a stroke that is short
-RESTS = (0.0, 0.1, 0.35)  # after a stroke, in times of one across the range at the ordinary speed
 
 
 def strokes(
@@ -23,22 +18,21 @@ def strokes(
     """v(k), one per sample, without end, beginning at v.
 
     low, high, rate: limits of v and of its speed [v/s]. period: of a sample [s]. duration: in which
-    the record is to be complete [s].
+    the record, some 24 strokes across the range, is to be complete [s].
     """
-    ordinary = min(rate, STROKES * (high - low) / duration)
+    ordinary = min(rate, 24.0 * (high - low) / duration)
     up = v <= 0.5 * (low + high)
     for k in count():
         # Two strokes from end to end, for a gap may be nearly as wide, then two short ones.
-        part = 1.0 if k % 4 < 2 else SMALLEST + (LARGEST - SMALLEST) * (k * GOLDEN % 1.0)
+        part = 1.0 if k % 4 < 2 else 0.35 + 0.55 * (k * GOLDEN % 1.0)
         target = v + part * ((high - v) if up else (low - v))
         target = min(max(target, low), high)  # whatever rounding does
-        fast = k % AT_LIMIT == AT_LIMIT - 1
-        speed = rate if fast else ordinary * SLOWEST ** ((0.13 + k * SILVER) % 1.0)
-        move = speed * period
+        # Every third is as fast as the actuator may move.
+        move = period * (rate if k % 3 == 2 else ordinary * 0.15 ** ((0.13 + k * SILVER) % 1.0))
         while v != target:
             v = min(v + move, target) if v < target else max(v - move, target)
             yield v
-        rest = RESTS[int(len(RESTS) * ((k * BRONZE) % 1.0))] * (high - low) / ordinary
+        rest = (0.0, 0.1, 0.35)[int(3 * (k * BRONZE % 1.0))] * (high - low) / ordinary
         for _ in range(round(rest / period)):
             yield v
         up = not up

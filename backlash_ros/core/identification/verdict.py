@@ -9,45 +9,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from backlash_ros.core.identification.not_play import Observed, varies, what_it_is
+from backlash_ros.core.identification.linear_family import gap_of_parts
+from backlash_ros.core.identification.not_play import Answer, Observed, what_it_is
 
-Array = NDArray[np.float64]
-
-REVERSALS = 3  # changes of the engaged side: fewer leave gap, crossings and start entangled
+FEWEST_REVERSALS = 3  # changes of the engaged side: fewer leave gap, crossings and start entangled
 ROUGHLY, PRECISE = 0.25, 0.1  # relative deviations: of a gap that is known; of gain and G
-STARTS = 0.5  # relative deviation of G from which on a controller cannot begin with it
 SHOWS = 15.0  # log-likelihood by which the fit must beat a u that stands still
-SURE = 3.0  # standard deviations
-WHOLE_SWING = 0.95  # of the swing of v: a gap as wide as this was not seen from both sides
-SMALL = 0.02  # of the swing of v: bound of a gap that is said not to be there
-ROUNDING = 1.5 / 12.0  # mean square of rounding by a quantum of 1, with a margin
-UNEXPLAINED = 0.05  # of the motion that the gap makes: less is not worth a word
-MOSTLY = 0.5  # of that motion: more leaves no gap that is known
-PER_UNEXPLAINED = 0.3  # standard deviations of the gap for one of what moves y otherwise
-MISSED = 4.0  # deviations of what moves y otherwise, that a gap may be which was not found
-MORE_THAN_NOISE = 2.0  # residual over noise, from which no gap can be ruled out
-WORSE_LATER = 2.0  # ratio of the error on held-out samples to that of the fit
-ONE_SPEED = 0.05  # relative spread of the speeds of v that are one speed
-APART = 0.02  # relative distance of two gaps that are not the same
-BEYOND = 5.0  # standard deviations: nearer ones are covered by them
-UNDECIDED = 6.0  # log-likelihood by which another gap may fall behind
-CHANGES = 0.1  # of the gap, from part to part of a record
-PARTS = 3  # of the time, and of the place
-
-
-class Answer(NamedTuple):
-    """Whether something is known; what, or why not; and what to do about it."""
-
-    known: bool
-    reason: str
-    cure: str = ''
-
-    @property
-    def sentence(self) -> str:
-        """Reason and cure."""
-        return f'{self.reason}: {self.cure}' if self.cure else self.reason
+CERTAIN = 3.0  # standard deviations of what is there
+ANOTHER = 0.02  # relative distance of two gaps that are not the same
+WORTH_A_WORD = 0.05  # of the motion that the gap makes, that no model explains
+PARTS = 3  # of the time, and of the place, in which the gap is compared
 
 
 class Verdict(NamedTuple):
@@ -62,11 +34,9 @@ class Verdict(NamedTuple):
     @property
     def lines(self) -> tuple[str, str]:
         """What is known, and what can be done with it."""
-        first = f'{"" if self.backlash.known else "not known: "}{self.backlash.reason}'
         if not self.backlash.known:
-            return first, f'measure again: {self.backlash.cure}'
-        if not self.gain.known:
-            first += f'; {self.gain.reason}'
+            return f'not known: {self.backlash.reason}', f'measure again: {self.backlash.cure}'
+        first = self.backlash.reason + ('' if self.gain.known else f'; {self.gain.reason}')
         if not self.model.known:
             return first, f'for a controller measure again: {self.model.sentence}'
         return first, self.model.reason
@@ -74,9 +44,7 @@ class Verdict(NamedTuple):
     @property
     def reasons(self) -> tuple[str, ...]:
         """Why a controller cannot begin with the result; empty where it can."""
-        return tuple(
-            one.sentence for one in (self.backlash, self.model) if not one.known
-        )
+        return tuple(one.sentence for one in (self.backlash, self.model) if not one.known)
 
 
 class Findings(NamedTuple):
@@ -108,7 +76,7 @@ class Findings(NamedTuple):
     rivals: Sequence[tuple[float, float]]
     reversals: int
     quantum: float
-    cancelled: Sequence[str]
+    cancelled: Sequence[complex]
     delay: int
     delay_open: bool
 
@@ -125,129 +93,98 @@ class Findings(NamedTuple):
     @property
     def unexplained(self) -> float:
         """Correlated part of the residual, as a motion of v."""
-        # What an encoder rounds away repeats itself as well, but is explained.
-        excess = self.rms**2 - ROUNDING * self.quantum**2
+        # What an encoder rounds away, a twelfth with a margin, repeats itself, but is explained.
+        excess = self.rms**2 - 1.5 / 12.0 * self.quantum**2
         # Where no correlation can be told, all of it may be one.
         correlated = self.correlation if np.isfinite(self.correlation) else 1.0
-        if correlated <= 0.0 or self.gain <= 0.0 or excess <= 0.0:
-            return 0.0
-        return float(np.sqrt(excess * correlated) / self.gain)
+        return float(np.sqrt(max(excess * correlated, 0.0)) / max(self.gain, 1e-300))
 
 
 def judge(f: Findings) -> Verdict:
     """The answers to three questions."""
-    others = [_parted(text) for text in what_it_is(f.observed)]
-    spread = float(np.hypot(f.gap_std, PER_UNEXPLAINED * f.unexplained))
+    other = what_it_is(f.observed)
+    # Of what moves y otherwise, by 0.3 deviations for one.
+    spread = float(np.hypot(f.gap_std, 0.3 * f.unexplained))
     if f.delay_open:
         # A delay that is too short by a sample looks like a gap that is wider by its motion of v.
         spread = float(np.hypot(spread, np.abs(np.diff(f.observed.v)).mean()))
-    remarks = list(_remarks(f))
-    backlash = _backlash(f, others, spread)
-    if backlash.known and f.gap > SURE * spread:
+    remarks = _remarks(f)
+    backlash = _backlash(f, other, spread)
+    if backlash.known and f.gap > CERTAIN * spread:
         changes, half = _changes(f)
         remarks += changes
         if half > spread:
             spread = half
-            backlash = backlash._replace(reason=_gap_text(f.gap, spread))
-    if backlash.known:
-        remarks += [f'{one.reason}: {one.cure}' for one in others]
+            backlash = _known_gap(f.gap, spread)
+    if backlash.known and other is not None:
+        remarks.append(other.sentence)
     return Verdict(backlash, _gain(f), _model(f), spread, tuple(remarks))
 
 
-def _backlash(f: Findings, others: Sequence[Answer], spread: float) -> Answer:
+def _known_gap(gap: float, spread: float) -> Answer:
+    return Answer(True, f'the gap is {gap:.4g} ± {spread:.2g}')
+
+
+def _backlash(f: Findings, other: Answer | None, spread: float) -> Answer:
     """Whether the gap is known, or that there is none."""
-    named = [one for one in others if not one.known]
-    checks = (
-        named[0] if named else None, _too_little_motion(f), _rival(f), _imprecise(f, spread),
-    )
-    for answer in checks:
-        if answer is not None:
-            return answer
-    if f.gap > SURE * spread:
-        return Answer(True, _gap_text(f.gap, spread))
-    bound = _bound(f, spread)
-    return Answer(True, f'there is no backlash: the gap is below {bound:.2g}')
-
-
-def _gap_text(gap: float, spread: float) -> str:
-    return f'the gap is {gap:.4g} ± {spread:.2g}'
-
-
-def _bound(f: Findings, spread: float) -> float:
-    return f.gap + SURE * spread + MISSED * f.unexplained
-
-
-def _too_little_motion(f: Findings) -> Answer | None:
+    if other is not None and not other.known:
+        return other
     if f.evidence < SHOWS:
         return Answer(
             False, f'y shows nothing of v, which swung by {f.swing:.4g}',
             'let v swing wider than the gap, and see that v is what the actuator gets',
         )
-    if f.gap >= WHOLE_SWING * f.swing:
+    if f.gap >= 0.95 * f.swing:
         return Answer(
             False, f'the gap is at its bound, the swing of v ({f.swing:.4g})',
             'let v swing wider, past the gap in both directions',
         )
-    if f.reversals < REVERSALS:
+    if f.reversals < FEWEST_REVERSALS:
         return Answer(
-            False, f'v went past the gap and back {f.reversals} times, {REVERSALS} are needed',
-            'move it to and fro more often, or record for longer',
+            False, f'v went past the gap and back {f.reversals} times, {FEWEST_REVERSALS} are '
+            'needed', 'move it to and fro more often, or record for longer',
         )
-    return None
-
-
-def _rival(f: Findings) -> Answer | None:
     for rival, behind in f.rivals:
-        if behind < UNDECIDED and abs(rival - f.gap) > max(BEYOND * f.gap_std, APART * f.gap):
-            return Answer(
-                False, f'two gaps fit alike, {f.gap:.4g} and {rival:.4g}',
-                'move v at several speeds and amplitudes',
-            )
-    return None
-
-
-def _imprecise(f: Findings, spread: float) -> Answer | None:
+        if behind < 6.0 and abs(rival - f.gap) > max(5.0 * f.gap_std, ANOTHER * f.gap):
+            return Answer(False, f'two gaps fit alike, {f.gap:.4g} and {rival:.4g}',
+                          'move v at several speeds and amplitudes')
     text = f'the gap, about {f.gap:.3g}, is known to ± {spread:.2g} only'
-    found = f.gap > SURE * spread
-    if f.unexplained > MOSTLY * max(f.gap, SURE * f.gap_std):
+    if f.unexplained > 0.5 * max(f.gap, CERTAIN * f.gap_std):
         return Answer(
             False, f'{text}: something else than a backlash and a linear G moves y by '
             f'{f.unexplained * f.gain:.2g}', 'see the residual on the page: friction, a load that '
             'moves by itself, or a higher order with --order',
         )
-    if found and spread <= ROUGHLY * f.gap:
-        return None
-    if not found:
-        return _no_gap_shown(f, spread)
+    if f.gap <= CERTAIN * spread:
+        return _no_gap(f, spread)
+    if spread <= ROUGHLY * f.gap:
+        return _known_gap(f.gap, spread)
     moved = f.gain * f.gap
     if f.quantum > moved:
         return Answer(
             False, f'{text}: y is quantised in steps of {f.quantum:.3g}, and the gap moves it by '
             f'{moved:.2g}', 'use a finer sensor, or record for longer',
         )
-    return Answer(
-        False, f'{text}: y has a noise of {f.rms:.2g}, and the gap moves it by {moved:.2g}',
-        'record for longer, or turn v more often',
-    )
+    return Answer(False, f'{text}: y has a noise of {f.rms:.2g}, and the gap moves it by '
+                  f'{moved:.2g}', 'record for longer, or turn v more often')
 
 
-def _no_gap_shown(f: Findings, spread: float) -> Answer | None:
-    """Where 0 lies within the deviations of the gap: why that is not yet a gap of 0."""
-    bound = _bound(f, spread)
+def _no_gap(f: Findings, spread: float) -> Answer:
+    """Where 0 lies within the deviations of the gap: whether that is a gap of 0."""
+    # Of what moves y otherwise, a gap may be four deviations that was not found.
+    bound = f.gap + CERTAIN * spread + 4.0 * f.unexplained
     text = f'a gap of up to {bound:.2g} cannot be ruled out'
-    if bound > max(SMALL * f.swing, f.quantum / max(f.gain, 1e-300)):
+    if bound > max(0.02 * f.swing, f.quantum / max(f.gain, 1e-300)):
         return Answer(False, text, 'record for longer, or turn v more often and faster')
     if f.gain_std > PRECISE:
         return Answer(
             False, f'{text}: the gain of G at rest is not known, and a slow lag looks like a gap',
             'move v at several speeds, with rests',
         )
-    if f.rms > MORE_THAN_NOISE * f.observed.noise:
-        return Answer(
-            False, f'{text}: the fit leaves {f.rms:.2g}, and the noise of y is '
-            f'{f.observed.noise:.2g}', 'see the residual on the page',
-        )
-    return None
+    if f.rms > 2.0 * f.observed.noise:
+        return Answer(False, f'{text}: the fit leaves {f.rms:.2g}, and the noise of y is '
+                      f'{f.observed.noise:.2g}', 'see the residual on the page')
+    return Answer(True, f'there is no backlash: the gap is below {bound:.2g}')
 
 
 def _gain(f: Findings) -> Answer:
@@ -271,80 +208,57 @@ def _model(f: Findings) -> Answer:
         )
     if spread <= PRECISE:
         return Answer(True, f'G is known to {spread:.2g} of itself, good enough to start with')
-    if spread <= STARTS:
+    if spread <= 0.5:
         return Answer(
             True, f'G is known to {spread:.0%}: good enough to start the controller with '
             'plant.uncertainty as in identified.yaml, which learns the rest',
         )
     much = f'{spread:.0%} of itself' if spread < 1.0 else 'nothing'
-    return Answer(
-        False, f'G, where y moves, is known to {much}',
-        'move v at more speeds, record for longer, or limit --order',
-    )
+    return Answer(False, f'G, where y moves, is known to {much}',
+                  'move v at more speeds, record for longer, or limit --order')
 
 
 def _remarks(f: Findings) -> list[str]:
-    found = []
-    if f.static < 0.0 and f.gain_std <= PRECISE:
-        found.append('y moves against v: the gain of G is negative')
-    if f.delay_open:
-        found.append(
-            f'the delay of {f.delay} samples is the longest that was compared, and the gap may '
-            f'have some of a longer one: try --delay {f.delay}-{min(2 * f.delay + 4, 40)}'
-        )
     share = f.unexplained / f.gap if f.gap > 0.0 else 0.0
-    if UNEXPLAINED < share <= 1.0:
-        found.append(
-            f'{share:.0%} of the motion that the gap makes follows from no backlash and no linear '
-            'G: the deviations tell of it'
-        )
-    if _one_speed(f.observed.v):
-        found.append(
-            'v moved at one speed only: a lag before the gap would look like a wider gap; move v '
-            'at several speeds'
-        )
-    if f.cancelled:
-        found.append(
-            f'the pole {f.cancelled[0]} is cancelled by a zero: a lower order does as well; '
-            'limit --order'
-        )
-    if f.held_out > WORSE_LATER * f.trained and f.rms > f.observed.noise:
-        found.append(
-            f'the last part of the record is predicted {f.held_out / f.trained:.2g} times worse '
-            'than the rest is fitted: the plant changed on the way, or the record is short'
-        )
-    return found
+    speeds = np.abs(np.diff(f.observed.v))
+    speeds = speeds[speeds > 0.01 * speeds.max(initial=0.0)]
+    one_speed = len(speeds) > 0 and np.std(speeds) < 0.05 * np.mean(speeds)
+    later = f.held_out / max(f.trained, 1e-300)
+    pole = '' if not f.cancelled else (
+        f'{f.cancelled[0].real:.4g}' if abs(f.cancelled[0].imag) < 1e-9 else
+        f'{f.cancelled[0]:.4g}')
+    return [text for true, text in (
+        (f.static < 0.0 and f.gain_std <= PRECISE,
+         'y moves against v: the gain of G is negative'),
+        (f.delay_open,
+         f'the delay of {f.delay} samples is the longest that was compared, and the gap may have '
+         f'some of a longer one: try --delay {f.delay}-{min(2 * f.delay + 4, 40)}'),
+        (WORTH_A_WORD < share <= 1.0,
+         f'{share:.0%} of the motion that the gap makes follows from no backlash and no linear G: '
+         'the deviations tell of it'),
+        (one_speed,
+         'v moved at one speed only: a lag before the gap would look like a wider gap; move v at '
+         'several speeds'),
+        (pole, f'the pole {pole} is cancelled by a zero: a lower order does as well; limit '
+         '--order'),
+        (later > 2.0 and f.rms > f.observed.noise,
+         f'the last part of the record is predicted {later:.2g} times worse than the rest is '
+         'fitted: the plant changed on the way, or the record is short'),
+    ) if true]
 
 
 def _changes(f: Findings) -> tuple[list[str], float]:
     """Where the gap is another one from part to part, and half of what it changes by."""
     o = f.observed
-    if not o.unexplained and f.unexplained < UNEXPLAINED * f.gap:
+    if not o.unexplained and f.unexplained < WORTH_A_WORD * f.gap:
         return [], 0.0
     place = np.searchsorted(np.quantile(o.p, np.arange(1, PARTS) / PARTS), o.p)
     time = PARTS * np.arange(len(o.v)) // len(o.v)
     found, half = [], 0.0
     for part, what in ((time, 'within the record'), (place, 'with the place, from left to right')):
-        gaps, std = varies(o, [part == k for k in range(PARTS)])
-        apart = float(np.ptp(gaps))
-        if apart > max(CHANGES * f.gap, BEYOND * float(std.max())) and gaps.min() > -std.max():
+        gaps, std = gap_of_parts(o.v, o.y, o.gap, [part == k for k in range(PARTS)])
+        apart, deviation = float(np.ptp(gaps)), float(std.max())
+        if apart > max(0.1 * f.gap, 5.0 * deviation) and gaps.min() > -deviation:
             found.append(f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps))
             half = max(half, 0.5 * apart)
     return found, half
-
-
-def _one_speed(v: Array) -> bool:
-    speeds = np.abs(np.diff(v))
-    speeds = speeds[speeds > 0.01 * speeds.max(initial=0.0)]
-    return bool(len(speeds) and np.std(speeds) < ONE_SPEED * np.mean(speeds))
-
-
-def is_no_play(o: Observed) -> bool:
-    """Whether it is something else than a play."""
-    return any(not _parted(text).known for text in what_it_is(o))
-
-
-def _parted(text: str) -> Answer:
-    """A sentence like `reason; cure` about what is no play; a load that coasts leaves one."""
-    reason, _, cure = text.partition('; ')
-    return Answer('while v crosses the gap' in reason, reason, cure)

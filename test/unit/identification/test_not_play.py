@@ -8,17 +8,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation import play as operator
-from backlash_ros.core.identification.not_play import (
-    Observed,
-    coasting,
-    creep,
-    other_nonlinearity,
-    pushed,
-    saturation,
-    stick_slip,
-    varies,
-    what_it_is,
-)
+from backlash_ros.core.identification.linear_family import gap_of_parts
+from backlash_ros.core.identification.not_play import SYMPTOMS, Observed, what_it_is
 
 Array = NDArray[np.float64]
 
@@ -86,42 +77,40 @@ OTHERS: dict[str, tuple[Callable[[Array], Array], str]] = {
 }
 
 
+def named(o: Observed) -> str:
+    answer = what_it_is(o)
+    assert answer is not None
+    assert answer.cure
+    return answer.reason
+
+
 @pytest.mark.parametrize('name', OTHERS)
 @pytest.mark.parametrize('plant', ['gain', 'two lags'])
 def test_another_nonlinearity_is_named(name: str, plant: str) -> None:
     nonlinearity, said = OTHERS[name]
-    (text,) = what_it_is(observed(V, behind(nonlinearity(V), plant)))
-    reason, _, cure = text.partition('; ')
-    assert said in reason
-    assert cure
+    assert said in named(observed(V, behind(nonlinearity(V), plant)))
 
 
 def test_stick_and_slip_is_named() -> None:
-    o = observed(V, behind(sticking(V), 'gain'), 0.9)
-    assert 'y sticks and slips' in stick_slip(o)
-    assert what_it_is(o) == [stick_slip(o)]
+    assert 'y sticks and slips' in named(observed(V, behind(sticking(V), 'gain'), 0.9))
 
 
 @pytest.mark.parametrize('plant', PLANTS)
 @pytest.mark.parametrize(('gap', 'noise'), [(0.0, NOISE), (0.05, NOISE), (GAP, NOISE), (GAP, 0.05)])
 def test_a_play_is_nothing_else(plant: str, gap: float, noise: float) -> None:
-    y = behind(play(V, gap), plant, noise)
-    o = observed(V, y, gap, noise)
-    assert what_it_is(o) == []
+    o = observed(V, behind(play(V, gap), plant, noise), gap, noise)
+    assert what_it_is(o) is None
     # Not even where the residual asks for it.
-    alone = [test(o) for test in (
-        other_nonlinearity, saturation, pushed, creep, stick_slip, coasting)]
-    assert alone == [''] * 6
+    assert all(symptom.test(o) is None for symptom in SYMPTOMS)
 
 
 @pytest.mark.parametrize('noise', [0.05, 0.3])
 def test_noise_that_is_not_white_is_no_nonlinearity(noise: float) -> None:
-    rng = np.random.default_rng(8)
-    wander = lfilter([noise], [1.0, -0.95], rng.standard_normal(COUNT))
+    wander = lfilter([noise], [1.0, -0.95], np.random.default_rng(8).standard_normal(COUNT))
     o = observed(V, behind(play(V, GAP), 'lag') + wander)
     assert o.unexplained
-    assert other_nonlinearity(o) == ''
-    assert saturation(o) == ''
+    found = what_it_is(o)
+    assert found is None or 'while v crosses' in found.reason
 
 
 @pytest.mark.parametrize('side', ['both', 'one'])
@@ -129,26 +118,23 @@ def test_a_y_that_is_at_its_end_is_named(side: str) -> None:
     y = np.minimum(behind(play(V, GAP), 'lag', 0.0), 0.9)
     y = np.maximum(y, -0.9 if side == 'both' else -9.0)
     o = observed(V, y + NOISE * np.random.default_rng(1).standard_normal(COUNT))
-    assert 'while v goes on by' in saturation(o)
+    assert 'while v goes on by' in named(o)
 
 
 def test_a_load_that_is_pushed_at_rest_is_named() -> None:
     v = 2.0 * np.round(np.sin(0.01 * K))
     push = 0.3 * ((K % 70) > 45)
-    assert 'while v is at rest' in pushed(observed(v, behind(play(v, GAP), 'lag') + push))
-    assert pushed(observed(v, behind(play(v, GAP), 'lag'))) == ''
+    assert 'while v is at rest' in named(observed(v, behind(play(v, GAP), 'lag') + push))
+    assert what_it_is(observed(v, behind(play(v, GAP), 'lag'))) is None
 
 
 def test_a_y_that_does_not_return_with_v_is_named() -> None:
     u = play(V, GAP)
     moved = np.append(0.0, np.cumsum(np.where(np.diff(u) > 0.0, 1.0, 0.8) * np.diff(u)))
-    o = observed(V, behind(moved, 'lag'))
-    said = creep(o)
-    assert 'y creeps by' in said
-    assert what_it_is(o) == [said]
+    assert 'y creeps by' in named(observed(V, behind(moved, 'lag')))
 
 
-def test_a_load_that_coasts_through_the_gap_is_named() -> None:
+def test_a_load_that_coasts_through_the_gap_is_named_and_leaves_a_play() -> None:
     p = play(V, GAP)
     resting = np.append(False, np.diff(p) == 0.0)
     speed = np.append(0.0, np.diff(p))
@@ -156,8 +142,10 @@ def test_a_load_that_coasts_through_the_gap_is_named() -> None:
     for k in range(COUNT):
         v, way = (0.97 * v, way + v) if resting[k] else (speed[k], 0.0)
         coast[k] = min(max(way, -0.2), 0.2)
-    o = observed(V, behind(p + coast, 'gain'))
-    assert 'it coasts there' in coasting(o)
+    answer = what_it_is(observed(V, behind(p + coast, 'gain')))
+    assert answer is not None
+    assert answer.known
+    assert 'it coasts there' in answer.reason
 
 
 def thirds() -> list[NDArray[np.bool_]]:
@@ -167,6 +155,6 @@ def thirds() -> list[NDArray[np.bool_]]:
 @pytest.mark.parametrize('plant', ['gain', 'lag', 'two lags'])
 def test_the_gap_of_each_part_is_told(plant: str) -> None:
     u = np.where(K < 2000, play(V, GAP), play(V, 0.75))
-    found, std = varies(observed(V, behind(u, plant)), thirds())
+    found, std = gap_of_parts(V, behind(u, plant), GAP, thirds())
     assert found - found[0] == pytest.approx([0.0, 0.0, 0.15], abs=0.02)
     assert std.max() < 0.02

@@ -15,7 +15,9 @@ from backlash_ros.core.identification.order_selection import (
     gives_way,
     selected,
 )
-from backlash_ros.core.identification.output_error import Fit, Point, Structure
+from backlash_ros.core.identification.output_error import Fit, Point, Samples, Structure
+
+SAMPLES = Samples(np.zeros(2), np.zeros(2), 1, 2)
 
 
 def fit_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Fit:
@@ -24,12 +26,12 @@ def fit_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Fit:
     a = np.real(np.poly(poles))[1:] if poles else np.empty(0)
     b = np.zeros(structure.order)
     b[structure.order - 1 - len(zeros):] = np.real(np.poly(zeros))
-    return Fit(structure, Point(a, 1.0, 0.0), np.append(b, 0.0), np.empty(0), np.empty(0),
-               0.0, 0.0, 1.0, 1)
+    return Fit(SAMPLES, structure, Point(a, 1.0, 0.0), np.append(b, 0.0), np.empty(0),
+               np.empty(0), 1.0)
 
 
-def compared(fit: Fit, held_out: float, criterion: float, exact: bool = False) -> Compared:
-    return Compared(fit.structure, held_out, fit, fit, criterion, exact)
+def compared(fit: Fit, held_out: float, criterion: float) -> Compared:
+    return Compared(fit.structure, held_out, fit, fit, criterion)
 
 
 PLAIN = compared(fit_of(False, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8]), 1.2, -20.0)
