@@ -85,13 +85,14 @@ def compare(
     for structure in _finalists(_with_criteria(first.values())):
         begins = [first[structure].trained.point, nearest._replace(
             a=first[structure].trained.point.a)]
-        begins += [_modelled(coarse, structure, point) for point in candidates[1:]]
+        # Averaged rows say little of what is as fast as they are.
+        begins += [_modelled(train, structure, point) for point in (nearest, *candidates[1:])]
         below = done.get(structure._replace(order=structure.order - 1))
         if below is not None:
             a = np.append(1.0, below.trained.point.a)
             begins += [below.trained.point._replace(a=np.convolve(a, (1.0, -pole))[1:])
                        for pole in (0.3, 0.85)]
-        some = [fit(coarse, structure, begin, RACE_STEPS) for begin in begins]
+        some = [fit(train, structure, begin, RACE_STEPS) for begin in begins]
         a, gap, start = min(some, key=lambda one: one.squares).point
         # A state of fewer numbers does not hide a start that is wrong.
         found = fit(train, structure, best_start(
@@ -158,7 +159,9 @@ def gives_way(found: Fit, compared: Sequence[Compared]) -> bool:
     smaller = [
         Structure(order - 1, delay, integrator and pole != 1.0) for pole in cancelled_poles(found)
     ]
-    return any(one.structure in smaller for one in compared if np.isfinite(one.criterion))
+    # One that explains far less has been fitted badly.
+    return any(one.structure in smaller and one.fit.squares < 2.0 * found.squares
+               for one in compared if np.isfinite(one.criterion))
 
 
 def cancelled_poles(found: Fit) -> list[complex]:
