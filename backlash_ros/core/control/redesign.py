@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -68,7 +69,7 @@ class Redesign:
                 self._made = True
             else:
                 self._channel = self._channel or self.executor.open()
-                self._channel.submit(job)
+                self._channel.submit(_designed, job)
                 self._poll()
         if not self._made:
             return None
@@ -79,12 +80,17 @@ class Redesign:
         return self._design
 
     def _poll(self) -> None:
-        """Take up gains that are finished; there are none where the present ones are safer."""
-        gains = self._channel.poll() if self._channel is not None and self._channel.busy else None
-        if not isinstance(gains, Failure):
-            if gains is not None and self._design is not None:
-                self._design, self._made = self._design._replace(gains=gains), True
-        elif gains.kind == LOST:
-            self.considered = None  # the same again, by another worker
-        else:
-            self.failed += 1
+        """Take up gains that are finished."""
+        found = self._channel.poll() if self._channel is not None and self._channel.busy else None
+        if isinstance(found, Failure):
+            if found.kind == LOST:
+                self.considered = None  # the same again, by another worker
+            else:
+                self.failed += 1
+        elif found is not None and found[0] is not None and self._design is not None:
+            self._design, self._made = self._design._replace(gains=found[0]), True
+
+
+def _designed(make: Callable[[], object | None]) -> tuple[object | None]:
+    """Gains, or None where the present ones are safer, as a result that is never None."""
+    return make(),

@@ -40,6 +40,9 @@ TOLERANCE = 21.0
 CLOSE, SETTLING = 7.0, 200
 UNCERTAIN = 5.0  # the same in standard deviations of x, where that is more
 SHARE = 1e-5  # the same as a share of the largest |x*| so far, where that is more
+# How often y may be brought back by full feedback, and gently until the tolerance is doubled each
+# time, before it has rested for SETTLING samples.
+MOST_RETURNS = 2
 ASTRAY = 4.0  # tolerances beyond which y is not led back gently, but with full feedback
 ARRIVED = 0.5  # share of the tolerance within which v comes to rest after that
 STEADY = 0.004  # share of the tolerance by which x* may still move per sample
@@ -71,8 +74,10 @@ class RestState:
 
     u_d: where v rests. shrinkage: standard deviations by which the crossings are shrunk for it.
     largest: |x*| so far. limit: tolerance in use. rested: samples for which the trajectory has.
-    turns, side: of v since then under full feedback, and the newest line. near: samples since y was
-    last away. pull: u - u* with which leading back began.
+    returns, leads:
+    how often y was brought back since, by full feedback and gently. turns, side: of v in this
+    return, and the newest line. near: samples since y was last away. pull: u - u* with which
+    leading back began.
     """
 
     mode: Mode = Mode.HOLD
@@ -82,6 +87,8 @@ class RestState:
     largest: float = 0.0
     limit: float = 0.0
     rested: int = 0
+    returns: int = 0
+    leads: int = 0
     turns: int = 0
     near: int = 0
     pull: float = 0.0
@@ -114,13 +121,15 @@ class Rest:
         least = SHARE * state.largest
         steady = STEADY * max(TOLERANCE * noise_std, least)
         if dist(plan.x, plan.onward) > steady or float(np.ptp(window)) > noise_std:
-            state.mode, state.rested, state.turns = Mode.FOLLOW, 0, 0
+            state.mode, state.rested, state.returns, state.leads = Mode.FOLLOW, 0, 0, 0
         elif x_std is None:
             off = abs(y - window.item(0)) > OFF * noise_std
             state.mode = Mode.RETURN if off else Mode.HOLD
         else:
             state.rested += 1
             width = CLOSE if state.rested < SETTLING else TOLERANCE
+            # Where y left again each time, the constants do not tell how to come closer.
+            width *= 2.0 ** min(max(state.leads - MOST_RETURNS, 0), 10)
             state.limit = max(width * noise_std, least, UNCERTAIN * x_std)
             if state.mode is Mode.RETURN and side is not state.side:
                 state.turns += 1
@@ -135,10 +144,13 @@ class Rest:
         # it is due again when y has stayed where it belongs for a while, and is pushed away.
         state.near = state.near + 1 if size <= state.limit else 0
         if state.near >= SETTLING:
-            state.turns = 0
-        if state.turns <= self._design.model.order:
+            state.returns = state.leads = 0
+        returns = state.mode is Mode.RETURN
+        if state.turns <= self._design.model.order if returns else state.returns < MOST_RETURNS:
             goes_on = not state.mode.steps and acts and size > ARRIVED * state.limit
             if goes_on or size > ASTRAY * state.limit:
+                if not returns:
+                    state.turns, state.returns = 0, state.returns + 1
                 return Mode.RETURN
         if state.mode is Mode.LEAD_BACK:
             # As long as it pulls the same way, and hard, or y is not yet near.
@@ -146,7 +158,7 @@ class Rest:
             return Mode.LEAD_BACK if pull * state.pull > least * state.pull**2 else Mode.HOLD
         if size <= state.limit:
             return Mode.HOLD
-        state.pull = pull
+        state.pull, state.leads = pull, state.leads + 1
         return Mode.LEAD_BACK
 
     def pull_back(self, deviation: Sequence[float], most: float) -> float:

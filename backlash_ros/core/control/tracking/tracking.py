@@ -26,9 +26,8 @@ from backlash_ros.core.plant.noise_level import NoiseLevel
 from backlash_ros.core.plant.state_model import StateModel
 
 # A better design takes over when v does not move much: samples after the first estimate, by then v
-# has crossed the gap with it; samples since the end of a crossing between which its last moves are
-# over and the next one is not yet to be expected; samples without any after which none is.
-SETTLED_AFTER, ENGAGED_SINCE, NO_CROSSING = 150, (5, 20), 100
+# has crossed the gap with it; samples after a crossing, by then its last moves are over.
+SETTLED_AFTER, ENGAGED_AFTER = 150, 5
 FORESEEN = 6  # samples in which u* is neither to turn nor to hurry when another design takes over
 BEYOND = 0.3  # deviations of noise in feedback, that u_d may go further onward than u* soon is
 IN_FEEDBACK = 4.0  # times the noise of u* that feedback makes of the same noise
@@ -80,16 +79,14 @@ class Tracking(Structure):
         self.rest = Rest(beginning, noise_std)
         self.hand_over = HandOver()
         self._y_noise = NoiseLevel()
-        self._moves = deque([0.0], maxlen=NO_CROSSING)  # by which v moved of late, as sizes
+        self._moves = deque([0.0], maxlen=100)  # by which v moved of late, as sizes
         self._engaged_for = 0  # samples since v has crossed the gap
 
     @property
     def may_change(self) -> bool:
         """Whether v neither crosses the gap nor is about to."""
-        trust, plan, (first, last) = self.feedback.trust, self.trajectory.state, ENGAGED_SINCE
-        if trust.in_use_for < SETTLED_AFTER or not (
-            first <= self._engaged_for <= last or self._engaged_for >= NO_CROSSING
-        ):
+        trust, plan = self.feedback.trust, self.trajectory.state
+        if trust.in_use_for < SETTLED_AFTER or self._engaged_for < ENGAGED_AFTER:
             return False
         # Neither a turn soon nor larger moves of v than those of late, as far as references say.
         fastest, ahead = trust.slope * max(self._moves), plan.ahead[:FORESEEN + 1]
@@ -154,7 +151,7 @@ class Tracking(Structure):
         turned = self.trajectory.turn(
             max(self._noise_std, self._y_noise.std), inverse.direction_band, crossing)
         correction = feedback.u(deviation, inverse.limited or inverse.taking_up)
-        u_d = plan.onward_u() - correction
+        u_d = plan.u - correction
         # What the noise of the references makes of u* and is not followed shows as a deviation.
         noise = NOISE_BAND * feedback.noise + IN_FEEDBACK * plan.noise_band
         if trust.full and abs(correction) < noise:

@@ -54,27 +54,6 @@ class TrajectoryState:
         """By how much u* has come back without having turned."""
         return max((self.extreme - self.ahead[0]) * self.side, 0.0)
 
-    def onward_u(self) -> float:
-        """What to go on to: the least that u* is on average from now on, before it turns.
-
-        Noise of the references would push v further and further ahead otherwise.
-        """
-        side, ahead = self.side, self.ahead
-        if self.noise > self.noise_band:
-            return ahead[0]  # what noise there is does not matter
-        least = least_at_peak = peak = ahead[0]
-        total = 0.0
-        for j, u in enumerate(ahead):
-            total += u
-            mean = total / (j + 1)
-            if (mean - least) * side < 0.0:
-                least = mean
-            if (u - peak) * side > 0.0:
-                peak, least_at_peak = u, least
-            elif (u - peak) * side < -self.noise:
-                return least_at_peak
-        return least
-
     def bounded(self, u_d: float, beyond: float) -> float:
         """u_d not much further onward than u* soon is: there is no way back but across the gap."""
         if self.side is Region.RIGHT:

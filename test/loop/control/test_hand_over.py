@@ -1,0 +1,77 @@
+"""Whoever takes over v in `tracking`, and whatever with: v goes on without a jump."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from backlash_ros.core.assembly import build_controller, build_state_model, build_structure
+from backlash_ros.core.control.controller import AdaptiveController
+from backlash_ros.core.control.tracking.design import Weights, design
+from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.simulation.closed_loop import build_closed_loop
+
+PARAMETERS = Parameters({
+    'structure': 'tracking', 'amplitude': 1.0, 'estimator.law': 'fixed', 'fixed.doubt': 0.1,
+    'sample_period': 0.005, 'frequency': 4.0,
+    'plant.numerator': [0.15678154, 0.12688103],
+    'plant.denominator': [1.0, -1.24982552, 0.53348809],
+    'estimator.output_noise_std': 1e-4, 'output_noise_std': 1e-4,
+    'backlash.m': 1.0, 'backlash.c_r': 0.5, 'backlash.c_l': -0.4, 'estimator.initial.m': 1.0,
+    'estimator.initial.c_r': 0.5, 'estimator.initial.c_l': -0.4,
+})
+GAP = 0.9
+
+
+def restarted(core: AdaptiveController) -> AdaptiveController:
+    new = build_controller(PARAMETERS, core.estimator.estimate)
+    new.go_on_from(core)
+    return new
+
+
+def with_other_weights(core: AdaptiveController) -> AdaptiveController:
+    structure = build_structure(PARAMETERS.replaced({'tracking.input_weight': 0.1}))
+    structure.go_on_from(core.structure)
+    core.structure = structure
+    return core
+
+
+def with_other_gains(core: AdaptiveController) -> AdaptiveController:
+    p = PARAMETERS
+    heavier = Weights(0.1, p.tracking.integral_weight, p.tracking.preview)
+    core.structure.adopt(design(build_state_model(p), heavier), core.estimator)
+    return core
+
+
+def with_another_estimate(core: AdaptiveController) -> AdaptiveController:
+    core.estimator.estimate = replace(core.estimator.estimate, m=0.98, c_r=0.51)
+    return core
+
+
+def after_a_rival(core: AdaptiveController) -> AdaptiveController:
+    new = restarted(core)
+    new.start_from(core.motion.v + 0.1)
+    return new
+
+
+@pytest.mark.parametrize('take_over', [
+    restarted, with_other_weights, with_other_gains, with_another_estimate, after_a_rival,
+])
+@pytest.mark.parametrize('at', [430, 505, 590])
+def test_v_goes_on_as_it_moved(
+    take_over: Callable[[AdaptiveController], AdaptiveController], at: int,
+) -> None:
+    loop, v = build_closed_loop(PARAMETERS), [0.0]
+    for k in range(at + 20):
+        if k == at:
+            loop.controller = take_over(loop.controller)
+            v[-1] = loop.controller.motion.v
+        step = loop.controller.step(loop.plant.measure(), loop.reference(k * loop.sample_period))
+        loop.plant.step(step.v)
+        v.append(step.v)
+    moves = np.abs(np.diff(v))
+    usual = np.sort(moves[at - 200:at])[-5]  # the gap is crossed once or twice
+    assert usual < 0.1 * GAP
+    assert moves[at] <= 2.0 * usual, 'at once'
+    assert np.median(moves[at:at + 8]) <= 3.0 * usual, 'while the difference fades'
