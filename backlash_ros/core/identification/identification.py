@@ -374,6 +374,7 @@ def _described(
     cut = s.samples.last - round(options.held_out * s.samples.count)
     held_out = HeldOut(cut, predicted(chosen.trained, replace(s.samples, first=cut)),
                        chosen.held_out, chosen.trained.rms)
+    delays = tuple(sorted({*equal_delays(s.compared, chosen), structure.delay}))
     correlation = max(lag_one(residual) - 3.0 / sqrt(len(residual)), 0.0)
     step, total = quantum(samples.y), float(best.numerator.sum())
     verdict = judge(Findings(
@@ -386,7 +387,8 @@ def _described(
         else 0.5 * effective_rows(best) * log(still / max(squares, TINY)),
         correlation, held_out.rms, held_out.trained, s.rivals, best.reversals, step,
         cancelled_poles(best), structure.delay,
-        structure.delay == max(s.delays) and _delay_open(best),
+        # Where many fit alike, the gap does not depend on the delay.
+        structure.delay == max(s.delays) and len(delays) < 3 and _delay_open(best),
     ))
     # What no model explains moves both sides of the gap alike.
     more = 0.25 * (verdict.gap_std**2 - gap_var)
@@ -399,7 +401,7 @@ def _described(
         numerator=tuple((best.numerator / options.slope).tolist()),
         denominator=(*best.denominator.tolist(), *[0.0] * at_zero),
         delay=structure.delay,
-        delays=tuple(sorted({*equal_delays(s.compared, chosen), structure.delay})),
+        delays=delays,
         integrator=structure.integrator,
         noise_std=sqrt(squares / max(len(residual) - structure.unknowns, 1)),
         quantum=step, correlation=correlation, ljung_box=uncertainty.ljung_box(best.residual),
