@@ -23,7 +23,6 @@ FITS, WRONG, UNKNOWN = '✓', '✗', '–'
 FEWEST_SAMPLES = 20  # for a judgement of the timing
 MOST_LATE = 0.5  # of a period: beyond 0.85 the controller takes it for a loss
 LOSS = 0.01  # share of lost samples that a driver may have
-FINE_STEPS = 5.0  # steps of y larger than this many resolutions need not repeat
 
 
 class Message(NamedTuple):
@@ -228,10 +227,11 @@ def _repetition(timing: Timing) -> Finding:
 
 def _held_share(y: NDArray[np.float64]) -> float:
     """Share of samples equal to the one before, of those amid a motion of many resolutions."""
+    fine_steps = 5.0  # steps of y larger than this many resolutions need not repeat
     y = y[np.isfinite(y)]
     steps = np.abs(np.diff(y))
     moving = steps[steps > 0.0]
-    if len(moving) < FEWEST_SAMPLES or np.median(moving) < FINE_STEPS * moving.min():
+    if len(moving) < FEWEST_SAMPLES or np.median(moving) < fine_steps * moving.min():
         return 0.0
-    around = np.abs(y[2:] - y[:-2]) >= FINE_STEPS * moving.min()
+    around = np.abs(y[2:] - y[:-2]) >= fine_steps * moving.min()
     return float(np.mean(steps[1:][around] == 0.0)) if around.any() else 0.0

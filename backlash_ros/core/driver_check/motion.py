@@ -39,11 +39,8 @@ MOTION_SUBJECTS = (DELAY, SIGN, G_OF_Z, NOISE_ON_Y, SHOWN_BACKLASH)
 
 DECISIVE = 3.0  # log-likelihood by which one delay beats another
 WELL_PREDICTED = 0.9  # share of the motion of y that G has to predict
-NOISIER = 3.0  # times the given deviation of the noise
-COLOURED = 0.5  # correlation of successive residuals that noise of a sensor does not have
 OTHER_PERIODS = (0.05, 0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0)  # times T, tried for G
 MORE_DELAY = 8  # samples that are tried beyond the expected delay
-REPORT = 'report v just before each y, or set estimator.use_applied_control: false'
 
 
 class DriverRecord(NamedTuple):
@@ -59,13 +56,14 @@ class DriverRecord(NamedTuple):
 
 def applied_findings(heard: Heard, timing: Timing, p: Parameters) -> list[Finding]:
     """Whether applied_control, where it is published or asked for, is of use."""
+    report = 'report v just before each y, or set estimator.use_applied_control: false'
     subject, use = 'applied_control', report_use(p)
     if not heard.applied:
-        return [Finding(subject, WRONG, 'is not published', REPORT)] \
+        return [Finding(subject, WRONG, 'is not published', report)] \
             if use is ReportUse.ALWAYS else []
     share = len(heard.applied) / len(timing.outputs)
     if use is not ReportUse.NEVER and share < REPORTED:
-        return [Finding(subject, WRONG, f'comes with {share:.0%} of the samples', REPORT)]
+        return [Finding(subject, WRONG, f'comes with {share:.0%} of the samples', report)]
     applied, control = _on_grid(heard.applied, timing), _on_grid(heard.controls, timing)
     if use is not ReportUse.NEVER or control is None or applied is None:
         return [Finding(subject, FITS, 'is published')]
@@ -118,6 +116,8 @@ def _shifted_difference(applied: Array, control: Array, lag: int) -> Array:
 
 def motion_findings(record: DriverRecord | None, p: Parameters) -> list[Finding]:
     """What v and y say together."""
+    coloured = 0.5  # correlation of successive residuals that noise of a sensor does not have
+    noisier = 3.0  # times the given deviation of the noise
     swing = 0.0 if record is None else float(np.ptp(record.v))
     if record is None or swing == 0.0:
         return _only(SHOWN_BACKLASH, 'v stood still', 'run the controller, or check_driver --drive')
@@ -134,10 +134,10 @@ def motion_findings(record: DriverRecord | None, p: Parameters) -> list[Finding]
     ):
         if hidden:
             return _only(SHOWN_BACKLASH, found, cure)
-    noisy = fit.noise_std > NOISIER * p.estimator.output_noise_std
+    noisy = fit.noise_std > noisier * p.estimator.output_noise_std
     delay = _delay(fit, record.lag, p)
     # A delay that nobody announced together with what is not noise is an odd G as well.
-    odd = noisy and fit.correlation > COLOURED and delay.mark == WRONG
+    odd = noisy and fit.correlation > coloured and delay.mark == WRONG
     unlike = fit.predicted < WELL_PREDICTED or odd
     if unlike or fit.error_scale > 2.0:
         other = _other_period(fit, record, p)
@@ -157,7 +157,7 @@ def motion_findings(record: DriverRecord | None, p: Parameters) -> list[Finding]
                 f'says {p.estimator.output_noise_std:.2g}',
                 f'set estimator.output_noise_std: {fit.noise_std:.1e}' + (
                     ', or give a more exact G(z): the residual is coloured'
-                    if fit.correlation > COLOURED else '')),
+                    if fit.correlation > coloured else '')),
         finding(SHOWN_BACKLASH, not fit.doubts, f'{unseen}; {"; ".join(fit.doubts)}' if fit.doubts
                 else ', '.join(f'{name} = {value:.4g} ± {std:.1g}'
                                for name, value, std in fit.estimates), past),

@@ -28,24 +28,23 @@ from backlash_ros.core.driver_check.motion import (
 )
 from backlash_ros.core.parameters import Parameters
 
-MESSAGE_SUBJECTS = ('rate', 'jitter', 'lost samples', 'repeated samples', 'clock', 'values')
-
 
 def judge(graph: Graph, heard: Heard, p: Parameters) -> list[Finding]:
     """All findings; what a fault hides is said to be unknown."""
+    message_subjects = ('rate', 'jitter', 'lost samples', 'repeated samples', 'clock', 'values')
     found = graph_findings(graph, bool(p.get('io.best_effort', False)))
     if graph.publishers == 0:
         return found
     # Without these nothing that follows from time or motion means anything.
     if wrong := _wrong(found, 'publisher', 'type'):
-        return found + not_judged(MESSAGE_SUBJECTS + MOTION_SUBJECTS, wrong)
+        return found + not_judged(message_subjects + MOTION_SUBJECTS, wrong)
     timing = timing_of(heard, p.sample_period)
     if timing is None:
         rate = Finding(
             'rate', WRONG, f'{len(heard.outputs)} samples heard, {FEWEST_SAMPLES} are needed',
             'see that plant_output is published without pause; raise --duration',
         )
-        return [*found, rate, *not_judged(MESSAGE_SUBJECTS[1:] + MOTION_SUBJECTS, 'rate')]
+        return [*found, rate, *not_judged(message_subjects[1:] + MOTION_SUBJECTS, 'rate')]
     found += message_findings(heard, timing, p.sample_period)
     if wrong := _wrong(found, 'listener', 'rate', 'clock'):
         return found + not_judged(MOTION_SUBJECTS, wrong)

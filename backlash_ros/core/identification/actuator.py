@@ -23,26 +23,24 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 
 Array = NDArray[np.float64]
 
-PUSHED_FOR = 10  # samples after which the load is pushed on a side as hard as it ever is
-NEGLIGIBLE, POOR = 0.01, 0.1  # gaps (rms) by which v is off the command where nothing lies between
-# them, and that an L may leave unexplained
-SLOWEST_MOTOR = 0.99  # pole: a motor that takes longer follows no command
-
 
 def with_actuator(found: Identification, commands: Array) -> Identification:
     """The same with what lies between the commands (N,) and the v that were reported, if anything.
 
     Where no L explains v, a remark says so.
     """
+    # gaps (rms) by which v is off the command where nothing lies between
+    negligible, poor = 0.01, 0.1
+    pushed_for = 10  # samples after which the load is pushed on a side as hard as it ever is
     details, gap = found.details, found.gap
     off = float(np.sqrt(np.mean((found.v - commands)**2)))
-    if details is None or off <= NEGLIGIBLE * gap:
+    if details is None or off <= negligible * gap:
         return found
     p = details.fit.p
     side = np.where(p <= found.v, 1.0, np.where(p >= found.v + gap, -1.0, 0.0))
     pushed = side != 0.0
-    pushed[:PUSHED_FOR] = False
-    for ago in range(1, PUSHED_FOR + 1):
+    pushed[:pushed_for] = False
+    for ago in range(1, pushed_for + 1):
         pushed[ago:] &= side[ago:] == side[:-ago]
     rows = np.flatnonzero(pushed)
     fits = [] if len(np.unique(side[rows])) < 2 else [
@@ -52,7 +50,7 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
     # The least rows log(squares) + unknowns log(rows).
     _, left, actuator = min((one for one in fits if one[2] is not None),
                             default=(0.0, off, None), key=lambda one: one[0])
-    if actuator is not None and left <= POOR * gap:
+    if actuator is not None and left <= poor * gap:
         return replace(found, actuator=actuator)
     return replace(found, remarks=(
         *found.remarks,
@@ -65,6 +63,8 @@ def _fitted(
     commands: Array, v: Array, side: Array, rows: NDArray[np.intp], order: int, delay: int,
 ) -> tuple[float, float, Actuator | None]:
     """Criterion, rms of what is left over, and the actuator, None where it would be none."""
+    # them, and that an L may leave unexplained
+    slowest_motor = 0.99  # pole: a motor that takes longer follows no command
     moved = np.concatenate([np.zeros(delay), (commands - commands[0])[:len(commands) - delay]])
     target = v[rows]
 
@@ -94,7 +94,7 @@ def _fitted(
     criterion = len(rows) * log(squares) + (2 * order + 3) * log(len(rows))
     gain = float(taps.sum() / denominator.sum())
     actuator = None
-    if gain > 0.0 and np.abs(np.roots(denominator)).max() <= SLOWEST_MOTOR:
+    if gain > 0.0 and np.abs(np.roots(denominator)).max() <= slowest_motor:
         offset += gain * float(commands[0])
         try:
             # v at the end of an interval belongs to the next sample: one more pole at 0.

@@ -54,9 +54,6 @@ Array = NDArray[np.float64]
 
 POLES = 3  # of the general G with which the gap is searched first; it has a tap for each delay
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
-FAR_OFF = 0.03  # relative distance of the last gap from the first, with which to begin anew
-WORSE_FOR = 3  # delays in a row that fit worse, behind which no later one is tried
-MOST_ALIKE = 8  # delays that fit alike, beyond which none of them is told
 ALIKE = 5.0  # log-likelihood by which a delay that fits alike may be worse
 
 
@@ -243,6 +240,7 @@ def _searched(
     v: Array, y: Array, options: Options, delays: Sequence[int],
 ) -> Generator[str, None, _Search]:
     """The best structure with one of these delays."""
+    far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
     samples, whole = Samples(v, y, max(delays) + 1, len(v)), _general(min(delays), max(delays))
     yield 'searching the gap'
     found, _ = search(samples, whole)
@@ -267,7 +265,7 @@ def _searched(
             # Only the best fit of all shows that a pole is none.
             compared = [one._replace(fit=best) if one is chosen else one for one in compared]
         off = abs(best.point.gap - candidates[0].gap)
-        if not again or off <= FAR_OFF * best.point.gap:
+        if not again or off <= far_off * best.point.gap:
             break
         candidates = [best.point, candidates[0]]  # the general G may have been a poor one
     return _Search(samples, compared, chosen, best, rivals, curve, delays)
@@ -304,12 +302,14 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
 
     The same structure is fitted with one sample of delay more and more, from the fit before.
     """
+    most_alike = 8  # delays that fit alike, beyond which none of them is told
+    worse_for = 3  # delays in a row that fit worse, behind which no later one is tried
     yield 'searching later delays'
     best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
     samples = replace(early.samples, first=latest + 1, most=SEARCH_ROWS)
     scan = [fit(samples, best.structure, best.point)]
     alike, rows = list(scan), effective_rows(scan[0])
-    while scan[-1].structure.delay < min(latest, alike[-1].structure.delay + WORSE_FOR):
+    while scan[-1].structure.delay < min(latest, alike[-1].structure.delay + worse_for):
         (a, gap, start), delay = scan[-1].point, scan[-1].structure.delay + 1
         structure = best.structure._replace(delay=delay)
         models = [a, *steiglitz_mcbride(samples, structure, scan[-1].p)[:1]]
@@ -324,7 +324,7 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
     early = early._replace(apart=0.5 * (max(gaps) - min(gaps)))
     # What no G with a backlash explains, any delay explains a little better.
     other = what_it_is(_observed(best))
-    if last - first > MOST_ALIKE or (other is not None and not other.known):
+    if last - first > most_alike or (other is not None and not other.known):
         return early
     late = yield from _searched(early.samples.v, early.samples.whole_y, options, range(
         max(first - 1, 0), min(last + 2, latest) + 1))

@@ -21,7 +21,6 @@ Figures = dict[str, float] | None
 
 PLAY_WIDTHS = (0.0006, 0.003, 0.01, 0.03, 0.1, 0.2, 0.4, 0.6, 0.8)  # of a play, in swings of v
 REST = 8  # samples of v at rest, behind as many in which y settles
-FEWEST_MOVES = 20  # moves that are looked at
 
 
 @dataclass(frozen=True)
@@ -180,8 +179,9 @@ def several_plays(o: Observed) -> Figures:
 
 def stick_slip(o: Observed) -> Figures:
     """A y that stays where it should move, and then jumps."""
+    fewest_moves = 20  # moves that are looked at
     known = np.flatnonzero(np.isfinite(o.y) & np.append(False, np.diff(o.p) != 0.0))
-    if len(known) < 3 * FEWEST_MOVES:
+    if len(known) < 3 * fewest_moves:
         return None
     simulated, y = o.simulated[known], o.y[known]
     # From each reading to the one by which y should have moved clearly.
@@ -191,7 +191,7 @@ def stick_slip(o: Observed) -> Figures:
     begin = np.flatnonzero(ahead < len(y))
     should = simulated[ahead[begin]] - simulated[begin]
     clear = np.abs(should) > 0.5 * moved
-    if np.count_nonzero(clear) < FEWEST_MOVES:
+    if np.count_nonzero(clear) < fewest_moves:
         return None
     share = ((y[ahead[begin]] - y[begin]) / np.where(clear, should, 1.0))[clear]
     stuck = float(np.mean(np.abs(share) < 0.3))

@@ -43,7 +43,6 @@ from backlash_ros.core.plant.filtering import lfilter
 Array = NDArray[np.float64]
 
 RACE_STEPS = 4  # of a fit that tells whether a structure may be the best
-FINALISTS = 4  # by the criterion, and as many by prediction
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
 
 
@@ -134,9 +133,10 @@ def _with_criteria(compared: Iterable[Compared]) -> list[Compared]:
 
 def _finalists(first: Sequence[Compared]) -> list[Structure]:
     """Structures that may be the best by either measure, with those that they may give way to."""
+    finalists = 4  # by the criterion, and as many by prediction
     by_criterion = sorted(first, key=lambda one: one.criterion)
     by_prediction = sorted(first, key=lambda one: one.held_out)
-    good = {one.structure for one in (*by_criterion[:FINALISTS], *by_prediction[:FINALISTS])}
+    good = {one.structure for one in (*by_criterion[:finalists], *by_prediction[:finalists])}
     good |= {by_criterion[0].structure._replace(delay=one.structure.delay) for one in first}
     for _ in range(2):  # what they give way to may have a pole that is cancelled as well
         good |= {Structure(s.order - 1, s.delay, also)

@@ -29,10 +29,7 @@ Array = NDArray[np.float64]
 T = TypeVar('T', bound=np.generic)
 
 TINY = float(np.finfo(float).tiny)
-HEAD = 30  # readings at the begin that are not averaged: they tell the state at the start
-SINGULAR = 1e-13  # of columns of length 1
 FILTERS = (0.6, 0.95)  # poles of the first filters of Steiglitz and McBride
-INSIDE = 0.999  # where poles outside of the unit circle are put
 
 
 class Structure(NamedTuple):
@@ -116,8 +113,9 @@ class Samples:
     @cached_property
     def _bins(self) -> tuple[NDArray[np.intp], Array]:
         """Where bins of neighbours begin, and the readings in each."""
-        each = ceil(max(self.count - HEAD, 1) / self.most) if self.most else 1
-        begins = np.append(np.arange(min(HEAD, self.count)), np.arange(HEAD, self.count, each))
+        head = 30  # readings at the begin that are not averaged: they tell the state at the start
+        each = ceil(max(self.count - head, 1) / self.most) if self.most else 1
+        begins = np.append(np.arange(min(head, self.count)), np.arange(head, self.count, each))
         return begins, np.add.reduceat(np.isfinite(self.y).astype(float), begins)
 
     def reduced(self, signals: Array) -> Array:
@@ -225,15 +223,16 @@ def triangle(rows: Array) -> Array:
 
 def solved(r: Array) -> Array:
     """Least squares of the last column of a triangle by the others, the least if singular."""
+    singular = 1e-13  # of columns of length 1
     upper, target = r[:-1, :-1], r[:-1, -1]
     if not np.isfinite(r).all():
         return np.full(len(target), nan)
     size = np.sqrt(np.einsum('ij,ij->j', upper, upper))
     size[size == 0.0] = 1.0
     upper = upper / size
-    if len(upper) and np.abs(np.diag(upper)).min() > SINGULAR:
+    if len(upper) and np.abs(np.diag(upper)).min() > singular:
         return np.asarray(lapack.dtrtrs(upper, target)[0] / size)
-    return np.asarray(np.linalg.lstsq(upper, target, rcond=SINGULAR)[0] / size)
+    return np.asarray(np.linalg.lstsq(upper, target, rcond=singular)[0] / size)
 
 
 def squares_left(r: Array) -> float:
@@ -391,8 +390,9 @@ def steiglitz_mcbride(
 
 def _stable(a: Array) -> Array:
     """The same with poles outside of the unit circle put inside."""
-    if largest_pole(a) <= INSIDE:
+    inside = 0.999  # where poles outside of the unit circle are put
+    if largest_pole(a) <= inside:
         return a
     poles = np.roots(np.append(1.0, a))
     size = np.abs(poles)
-    return np.real(np.poly(poles * np.minimum(INSIDE / np.maximum(size, INSIDE), 1.0)))[1:]
+    return np.real(np.poly(poles * np.minimum(inside / np.maximum(size, inside), 1.0)))[1:]

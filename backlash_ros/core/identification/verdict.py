@@ -13,13 +13,11 @@ import numpy as np
 from backlash_ros.core.identification.linear_family import gap_of_parts
 from backlash_ros.core.identification.not_play import Answer, Observed, what_it_is
 
-FEWEST_REVERSALS = 3  # changes of the engaged side: fewer leave gap, crossings and start entangled
 ROUGHLY, PRECISE = 0.25, 0.1  # relative deviations: of a gap that is known; of gain and G
 SHOWS = 15.0  # log-likelihood by which the fit must beat a u that stands still
 CERTAIN = 3.0  # standard deviations of what is there
 ANOTHER = 0.02  # relative distance of two gaps that are not the same
 WORTH_A_WORD = 0.05  # of the motion that the gap makes, that no model explains
-PARTS = 3  # of the time, and of the place, in which the gap is compared
 
 
 class Verdict(NamedTuple):
@@ -127,6 +125,8 @@ def _known_gap(gap: float, spread: float) -> Answer:
 
 def _backlash(f: Findings, other: Answer | None, spread: float) -> Answer:
     """Whether the gap is known, or that there is none."""
+    # changes of the engaged side: fewer leave gap, crossings and start entangled
+    fewest_reversals = 3
     if other is not None and not other.known:
         return other
     if f.evidence < SHOWS:
@@ -139,9 +139,9 @@ def _backlash(f: Findings, other: Answer | None, spread: float) -> Answer:
             False, f'the gap is at its bound, the swing of v ({f.swing:.4g})',
             'let v swing wider, past the gap in both directions',
         )
-    if f.reversals < FEWEST_REVERSALS:
+    if f.reversals < fewest_reversals:
         return Answer(
-            False, f'v went past the gap and back {f.reversals} times, {FEWEST_REVERSALS} are '
+            False, f'v went past the gap and back {f.reversals} times, {fewest_reversals} are '
             'needed', 'move it to and fro more often, or record for longer',
         )
     for rival, behind in f.rivals:
@@ -249,14 +249,15 @@ def _remarks(f: Findings) -> list[str]:
 
 def _changes(f: Findings) -> tuple[list[str], float]:
     """Where the gap is another one from part to part, and half of what it changes by."""
+    parts = 3  # of the time, and of the place, in which the gap is compared
     o = f.observed
     if not o.unexplained and f.unexplained < WORTH_A_WORD * f.gap:
         return [], 0.0
-    place = np.searchsorted(np.quantile(o.p, np.arange(1, PARTS) / PARTS), o.p)
-    time = PARTS * np.arange(len(o.v)) // len(o.v)
+    place = np.searchsorted(np.quantile(o.p, np.arange(1, parts) / parts), o.p)
+    time = parts * np.arange(len(o.v)) // len(o.v)
     found, half = [], 0.0
     for part, what in ((time, 'within the record'), (place, 'with the place, from left to right')):
-        gaps, std = gap_of_parts(o.v, o.y, o.gap, [part == k for k in range(PARTS)])
+        gaps, std = gap_of_parts(o.v, o.y, o.gap, [part == k for k in range(parts)])
         apart, deviation = float(np.ptp(gaps)), float(std.max())
         if apart > max(0.1 * f.gap, 5.0 * deviation) and gaps.min() > -deviation:
             found.append(f'the gap changes {what}: ' + ', '.join(f'{gap:.3g}' for gap in gaps))
