@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from enum import Enum
-from math import inf, nan
+from math import inf, isfinite, nan
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,15 +45,25 @@ def report_use(p: Parameters) -> ReportUse:
 
 
 class ReportTrust:
-    """Whether reports are used at present: always, never, or as long as none is missing."""
+    """Whether reports are used at present: always, never, or as long as none is missing.
+
+    They are from the first one on: a motor encoder that was not zeroed has another origin than the
+    commands, and a record that begins with these and goes on with those fits no backlash. A driver
+    that leaves one out before CONSISTENT in a row were there has to show as many first.
+    """
 
     def __init__(self, use: ReportUse) -> None:
         self.trusted = use is ReportUse.ALWAYS
         self._use = use
         self._contrary = 0  # outputs in a row that speak against `trusted`
+        self._first = 0  # outputs in a row that had theirs from the beginning; CONSISTENT: settled
 
     def note(self, complete: bool) -> bool:
         """Note whether each interval before an output had its report; returns `trusted`."""
+        if self._use is ReportUse.AUTO and self._first < CONSISTENT:
+            self._first = self._first + 1 if complete else CONSISTENT if self.trusted else 0
+            self.trusted = complete
+            return complete
         self._contrary = 0 if complete is self.trusted else self._contrary + 1
         if self._use is ReportUse.AUTO and self._contrary == CONSISTENT:
             self.trusted, self._contrary = complete, 0
@@ -81,6 +92,7 @@ class CommandHistory:
         self._period_ns = sample_period_s * 1e9
         self.output_ns = 0
         self._transit_ns = 0.0  # median time from one node to the other
+        self._reported_beyond = 0.0  # the newest report less the command that it stands for
         self._published: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
         self._reported: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
 
@@ -149,9 +161,20 @@ class CommandHistory:
         # The report of the newest interval may still be under way while older ones are here.
         complete = len(reports) == intervals and stamp_ns > end_ns - 0.5 * self._period_ns
         if not self.trust.note(complete):
+            self._reported_beyond = 0.0
             return []
         self.counts.unreported += not complete
         return reports if complete else []
+
+    def in_place_of_reports(
+        self, reports: Sequence[float], acted: Sequence[float], others: Sequence[float],
+    ) -> tuple[list[float], list[float]]:
+        """acted, others (see `over`) as they would have been reported, had the driver done so."""
+        if reports:
+            self._reported_beyond = min(
+                (reports[-1] - v for v in (acted[-1], others[-1]) if isfinite(v)), key=abs)
+        return ([v + self._reported_beyond for v in acted],
+                [v + self._reported_beyond for v in others])
 
     def _at(self, time_ns: float) -> tuple[float, float]:
         """The newest v that had left by then, and the one beside it that may have been in use."""

@@ -251,9 +251,9 @@ class ControlLoop:
             return core.step(y, y_m, lost)
         # Late commands are counted even where the driver says which ones it applied.
         acted, others = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
-        return core.step(
-            y, y_m, lost, commands.reported_over(lost + 1, stamp_ns, unsent), others, acted
-        )
+        reports = commands.reported_over(lost + 1, stamp_ns, unsent)
+        acted, others = commands.in_place_of_reports(reports, acted, others)
+        return core.step(y, y_m, lost, reports, others, acted)
 
     # --- the phases ------------------------------------------------------------------------------
 

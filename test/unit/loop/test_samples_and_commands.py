@@ -1,6 +1,6 @@
 """Which sample a message holds, and which v the plant had: the bookkeeping of the controller."""
 
-from math import inf, isnan
+from math import inf, isnan, nan
 
 import numpy as np
 import pytest
@@ -164,15 +164,32 @@ def uses(pattern: list[bool], use: ReportUse = ReportUse.AUTO) -> tuple[list[boo
     return used, commands.counts.unreported
 
 
-def test_reports_are_used_once_every_interval_has_had_one_and_until_they_stop() -> None:
+def test_reports_are_used_from_the_first_on_until_they_stop() -> None:
     n = CONSISTENT
-    used, unreported = uses([True] * (n + 10) + [False] + [True] * 5 + [False] * 2 * n + [True] * n)
+    used, unreported = uses(
+        [False] * 3 + [True] * (n + 10) + [False] + [True] * 5 + [False] * 2 * n + [True] * n)
     assert used == [
-        *[False] * (n - 1), *[True] * 11, False, *[True] * 5, *[False] * 2 * n,
+        *[False] * 3, *[True] * (n + 10), False, *[True] * 5, *[False] * 2 * n,
         *[False] * (n - 1), True,
     ]
     # What is missing counts while reports are used, and not from a driver that has none.
     assert unreported == 1 + n - 1
+
+
+def test_a_driver_that_leaves_reports_out_from_the_beginning_has_to_show_many_in_a_row() -> None:
+    n = CONSISTENT
+    used, _ = uses([True, False] * 5 + [True] * n)
+    assert used == [True, *[False] * (9 + n - 1), True]
+
+
+def test_a_report_that_is_missing_is_replaced_by_what_it_would_have_said() -> None:
+    commands = CommandHistory(PERIOD_S)
+    commands.in_place_of_reports([1.06], [1.0], [nan])
+    (acted,), (other,) = commands.in_place_of_reports([], [2.0], [3.0])
+    assert (acted, other) == pytest.approx((2.06, 3.06))
+    # A command that was late is no offset.
+    commands.in_place_of_reports([3.06], [2.0], [3.0])
+    assert commands.in_place_of_reports([], [5.0], [nan])[0] == pytest.approx([5.06])
 
 
 @given(st.lists(st.booleans(), max_size=100))
