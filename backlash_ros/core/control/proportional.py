@@ -33,8 +33,7 @@ class Proportional(Structure):
         """Return u_d and v that satisfy (3.2) and (2.3) together."""
         y_m, e, band = inputs.y_m, inputs.estimate, inverse.direction_band
         m, c_r, c_l, f = e.m, e.c_r, e.c_l, min(e.f, LARGEST_F_OVER_M * e.m)
-        rests = inverse.direction(y_m, band) is Region.GAP
-        if f == 0.0 and rests and not inverse.taking_up:
+        if f == 0.0 and not inverse.taking_up and inverse.direction(y_m, band) is Region.GAP:
             return Command(y_m, inverse.v, f)  # first case of (2.3)
         before, self._estimate = self._estimate, e
         if before is not None and before is not e and inverse.take_up < inf:
@@ -49,29 +48,29 @@ class Proportional(Structure):
             by_m = f * (y_m + f * c_r) / (m - f) ** 2
             by_c = m * f / (m - f)
             band = max(band, 3.0 * hypot(by_m * e.std_m, by_c * max(e.std_c_r, e.std_c_l)))
-        u_d = {Region.RIGHT: m * (y_m + f * c_r) / (m - f),
-               Region.LEFT: m * (y_m + f * c_l) / (m - f)}
+        right, left = m * (y_m + f * c_r) / (m - f), m * (y_m + f * c_l) / (m - f)
         # Where both directions solve the loop, the smaller move is the one a shaft would make.
         v, held = inverse.v, y_m + f * inverse.v
-        to_right = abs(u_d[Region.RIGHT] / m + c_r - v)
-        to_left = abs(u_d[Region.LEFT] / m + c_l - v)
-        sides = (Region.RIGHT, Region.LEFT) if to_right <= to_left else (Region.LEFT, Region.RIGHT)
+        solutions = (Region.RIGHT, right), (Region.LEFT, left)
+        if abs(right / m + c_r - v) > abs(left / m + c_l - v):
+            solutions = solutions[1], solutions[0]
         if inverse.taking_up:
-            side = inverse.side
-            if side is not Region.GAP and inverse.direction(u_d[side], band) is Region.GAP:
-                v = inverse.step(u_d[side], m, c_r, c_l, band)  # u_d rests, v goes on to its line
-                return Command(y_m + f * v, v, f)
+            for side, u_d in solutions:
+                if side is inverse.side and inverse.direction(u_d, band) is Region.GAP:
+                    v = inverse.step(u_d, m, c_r, c_l, band)  # u_d rests, v goes on to its line
+                    return Command(y_m + f * v, v, f)
         elif (
             abs(held - inverse.extreme) <= 1e-12 * (abs(held) + abs(v))  # but for rounding
             or inverse.direction(held, band) is Region.GAP
         ):
             return Command(held, v, f)  # first case of (3.3): u_d rests, and so does v
-        for side in sides:
-            if inverse.direction(u_d[side], band) is side:
-                return Command(u_d[side], inverse.step(u_d[side], m, c_r, c_l, band), f)
+        for side, u_d in solutions:
+            if inverse.direction(u_d, band) is side:
+                return Command(u_d, inverse.step(u_d, m, c_r, c_l, band), f)
         if abs(held) > (abs(y_m) + abs(f) * max(c_r, -c_l)) / (1.0 - LARGEST_F_OVER_M):
             # New estimates have moved both lines so far from v that no u_d could have led there.
-            inverse.aim(u_d[sides[0]], sides[0])
+            side, u_d = solutions[0]
+            inverse.aim(u_d, side)
             v = inverse.proceed(m, c_r, c_l)
             return Command(y_m + f * v, v, f)
         if band == 0.0:
