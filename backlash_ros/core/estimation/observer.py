@@ -28,7 +28,6 @@ from backlash_ros.core.estimation.settings import GATE, OUTLIERS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.plant.backlash import clamp
-from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.riccati import lyapunov, riccati
 from backlash_ros.core.plant.state_model import StateModel, powers
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -196,7 +195,8 @@ def state_after(model: TransferFunction, u: Array, y: Array) -> Array:
     """The state of this G (observer form) that explains y (M,), nan where lost, after u (M,)."""
     a, b, c = model.state_space()
     responses = powers(a, b, len(u))
-    forced = lfilter(b, model.denominator, u)
+    # The loop computes this as well, where a first import of SciPy would make commands late.
+    forced = np.convolve(responses @ c, u)[:len(u)]
     columns = powers(a.T, a.T @ c, len(u))  # of the state before them
     known = np.isfinite(y)
     before = np.linalg.lstsq(columns[known], (y - forced)[known], rcond=1e-12)[0]
