@@ -49,7 +49,7 @@ OF_THE_LOOP: dict[str, type[Any]] = {
 
 
 @dataclass
-class Channel:
+class RecordedTopic:
     """A recorded topic, with namespace and remappings in its name, and its counts of messages."""
 
     name: str
@@ -120,7 +120,7 @@ class RecorderNode(ProcessNode):
         p, self.failure = self.settings, ''
         self._now_ns: int | None = 0 if p.lockstep else None  # simulated time
         self._bag: Bag | None = None
-        self._channels: dict[str, Channel] = {}
+        self._channels: dict[str, RecordedTopic] = {}
         self._progress = Progress()
         if p.bag:
             self._bag = self._open_bag(p.bag, p.storage)
@@ -228,7 +228,7 @@ class RecorderNode(ProcessNode):
         subscription = self.listen(
             message_type, topic, partial(self._on_message, topic), qos, raw=True
         )
-        channel = self._channels[topic] = Channel(str(subscription.topic_name), None)
+        channel = self._channels[topic] = RecordedTopic(str(subscription.topic_name), None)
         # As bags know a type: std_msgs/msg/Float64.
         kind = f'{message_type.__module__.split(".")[0]}/msg/{message_type.__name__}'
 

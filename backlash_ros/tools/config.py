@@ -239,7 +239,7 @@ def _read_sections(path: Path) -> list[Section]:
                 raise InputError('each section must hold ros__parameters and nothing else')
             if not isinstance(content['ros__parameters'], dict):
                 raise InputError('ros__parameters must hold "name: value" lines')
-            sections[str(name)] = dict(_flat(content['ros__parameters']))
+            sections[str(name)] = dict(flattened(content['ros__parameters']))
         # What is wrong with the values of a joint, all values together tell.
         joints = [joint for values in sections.values()
                   for joint in Parameters({'joints': values.get('joints', ())}).joints]
@@ -249,10 +249,11 @@ def _read_sections(path: Path) -> list[Section]:
         raise
 
 
-def _flat(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+def flattened(tree: Mapping[object, object], prefix: str = '') -> Iterator[tuple[str, object]]:
+    """Names, with points in them, and values of nested sections."""
     for key, value in tree.items():
         if isinstance(value, dict):
-            yield from _flat(value, f'{prefix}{key}.')
+            yield from flattened(value, f'{prefix}{key}.')
         else:
             yield f'{prefix}{key}', value
 

@@ -214,9 +214,7 @@ def _learned(
     family: PlantFamily, fit: Fit, nominal: TransferFunction, sign: float,
 ) -> TransferFunction:
     """The G of the fit where it is likelier than the nominal one."""
-    xi = fit.theta[3:]
-    cov = fit.cov_xi + 1e-16 * np.eye(family.count)
-    if not family.count or 0.5 * float(xi @ np.linalg.solve(cov, xi)) <= 1.0:
+    if not family.count or fit.behind(np.zeros(family.count)) <= 1.0:
         return nominal
     return _with_sign(family.model_at(fit.xi), sign)
 

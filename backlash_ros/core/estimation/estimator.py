@@ -75,11 +75,7 @@ def fitted(
     part = record.swapped(belief.swapped - before.swapped).between(belief.first, belief.end)
     place = place_of(fit, part, model, setup.family.memory)
     gains = _gains_of(tuple(model.numerator), tuple(model.denominator)) if with_gains else None
-    apart = fit.theta[3:] - proposed
-    if not len(apart) or not belief.trusted:
-        return Fitted(belief, place, None, gains)
-    behind = 0.5 * float(apart @ np.linalg.solve(fit.cov_xi + 1e-16 * np.eye(len(apart)), apart))
-    if behind <= 1.0:  # log-likelihood by which the G that was proposed before is the worse one
+    if not len(proposed) or not belief.trusted or fit.behind(proposed) <= 1.0:
         return Fitted(belief, place, None, gains)
     better = StateModel(setup.family.model_at(fit.xi))
     return Fitted(belief, place, Proposal(better, fit.theta[3:], gains_of(better)), gains)

@@ -82,6 +82,12 @@ class Fit:
         """Covariance of xi (K, K)."""
         return self.cov[3:, 3:] * self.inflation
 
+    def behind(self, xi: Array) -> float:
+        """Log-likelihood by which another error of G, xi (K,), is the worse one."""
+        apart = self.theta[3:] - xi
+        cov = self.cov_xi + 1e-16 * np.eye(len(apart))
+        return 0.5 * float(apart @ np.linalg.solve(cov, apart))
+
     @property
     def crossings(self) -> Array:
         """m, c_r, c_l, shape (3,)."""

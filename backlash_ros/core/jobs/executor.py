@@ -46,7 +46,7 @@ class Failure:
     text: str
 
 
-class Record:
+class SampleBuffer:
     """Samples of some quantities, of which the oldest may be dropped; first: number of the first.
 
     values: sample by sample.
@@ -86,7 +86,7 @@ class Channel:
     """
 
     def __init__(self, executor: Executor, number: int, quantities: int, capacity: int) -> None:
-        self.busy, self.number, self.record = False, number, Record(quantities)
+        self.busy, self.number, self.record = False, number, SampleBuffer(quantities)
         self.job: Job | None = None
         self.args: tuple[Any, ...] = ()
         self.since = self.end = self.sent = 0
@@ -154,14 +154,14 @@ class Executor:
 
     def forget(self, channel: Channel) -> None:
         """Drop record and job of a channel."""
-        channel.record = Record(channel.record.quantities)
+        channel.record = SampleBuffer(channel.record.quantities)
 
     def close(self) -> None:
         """End it; jobs that are under way are dropped."""
 
 
 def computed(
-    job: Job, record: Record, since: int, end: int, args: tuple[Any, ...],
+    job: Job, record: SampleBuffer, since: int, end: int, args: tuple[Any, ...],
 ) -> Any:
     """The result of a job for the samples from `since` to before `end`; a Failure if it raises."""
     try:

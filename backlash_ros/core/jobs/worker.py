@@ -23,7 +23,7 @@ from struct import Struct
 from threading import Event, Thread
 from typing import Any, BinaryIO
 
-from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure, Record, computed
+from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure, SampleBuffer, computed
 
 NICENESS = 5  # beyond that of the loop
 LENGTH = Struct('<Q')  # of an answer, in bytes, before it
@@ -223,7 +223,7 @@ def serve(preload: Sequence[str] = ()) -> None:
     Thread(target=_receive, args=(requests,), daemon=True).start()
     for name in preload:
         import_module(name)
-    records: dict[int, Record] = {}
+    records: dict[int, SampleBuffer] = {}
     while True:
         number, still_open, samples, job = requests.get()
         _send(results, (number, _result_of(job, _extended(records, number, *samples))))
@@ -240,16 +240,16 @@ def _receive(requests: SimpleQueue[Any]) -> None:
 
 
 def _extended(
-    records: dict[int, Record], number: int, quantities: int, first: int, block: bytes,
-) -> Record:
+    records: dict[int, SampleBuffer], number: int, quantities: int, first: int, block: bytes,
+) -> SampleBuffer:
     """The record of a channel with samples from number `first` on."""
     if number not in records or records[number].end != first:
-        records[number] = Record(quantities, first)
+        records[number] = SampleBuffer(quantities, first)
     records[number].values.frombytes(block)
     return records[number]
 
 
-def _result_of(body: bytes, record: Record) -> bytes:
+def _result_of(body: bytes, record: SampleBuffer) -> bytes:
     """The pickled result of a job, or Failure where job or result cannot be pickled."""
     try:
         job, since, end, args = pickle.loads(body)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
 from enum import Enum
 from math import inf, isfinite, nan
 
@@ -167,14 +166,18 @@ class CommandHistory:
         return reports if complete else []
 
     def in_place_of_reports(
-        self, reports: Sequence[float], acted: Sequence[float], others: Sequence[float],
+        self, reports: list[float], acted: list[float], others: list[float],
     ) -> tuple[list[float], list[float]]:
-        """acted, others (see `over`) as they would have been reported, had the driver done so."""
+        """acted, others (see `over`) as they would have been reported, where nothing was.
+
+        Where there are reports, these count and the two stay what they are.
+        """
         if reports:
             self._reported_beyond = min(
                 (reports[-1] - v for v in (acted[-1], others[-1]) if isfinite(v)), key=abs)
-        return ([v + self._reported_beyond for v in acted],
-                [v + self._reported_beyond for v in others])
+        elif beyond := self._reported_beyond:
+            return [v + beyond for v in acted], [v + beyond for v in others]
+        return acted, others
 
     def _at(self, time_ns: float) -> tuple[float, float]:
         """The newest v that had left by then, and the one beside it that may have been in use."""

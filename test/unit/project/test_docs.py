@@ -26,7 +26,7 @@ from backlash_ros.tools import replay as replay
 from backlash_ros.tools import report as report
 from backlash_ros.tools import simulate as simulate
 from backlash_ros.tools.bringup import __main__ as bringup
-from backlash_ros.tools.config import effective_parameters
+from backlash_ros.tools.config import effective_parameters, flattened
 from backlash_ros.tools.identify import command as identify
 
 DOCS = ROOT / 'docs'
@@ -210,14 +210,6 @@ def python_snippets() -> list[str]:
 def test_python_of_the_pages_runs(text: str) -> None:
     done = subprocess.run([sys.executable, '-c', text], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, text + done.stderr
-
-
-def flattened(tree: dict[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from flattened(value, f'{prefix}{key}.')
-        else:
-            yield f'{prefix}{key}', value
 
 
 def test_files_that_pages_show_are_valid() -> None:
