@@ -63,13 +63,17 @@ SENSOR_FAULTS = ('sign', 'constant', 'stuck', 'another axis', 'spikes', 'nan')
 
 @dataclass
 class Driver:
-    """Publishes y, applies the newest v, and reports it where it is asked to."""
+    """Publishes y, applies the newest v, and reports it where it is asked to.
+
+    origin: the v that a motor encoder shows where v is 0.
+    """
 
     p: Parameters
     rng: np.random.Generator
     actuator: Actuator
     sensor: Sensor
     reports: bool
+    origin: float = 0.0
     loses: bool = False
     loses_reports: bool = False
     repeats: bool = False
@@ -108,7 +112,7 @@ class Driver:
         self.number += 1
         now = self.time_ns
         if self.reports and not (self.loses_reports and self.rng.random() < LOSSES):
-            self.applied.append((v, now - REPORT_NS))
+            self.applied.append((v + self.origin, now - REPORT_NS))
         if self.loses and self.rng.random() < LOSSES:
             return
         output = Output(y, now, now, now + round(TRANSIT * self.period_ns), self.number)

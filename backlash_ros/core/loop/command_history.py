@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from enum import Enum
-from math import inf, isfinite, nan
+from math import inf, nan
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.loop.loop_statistics import Counts
+from backlash_ros.core.loop.report_origin import ReportOrigin
 from backlash_ros.core.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -46,9 +47,8 @@ def report_use(p: Parameters) -> ReportUse:
 class ReportTrust:
     """Whether reports are used at present: always, never, or as long as none is missing.
 
-    They are from the first one on: a motor encoder that was not zeroed has another origin than the
-    commands, and a record that begins with these and goes on with those fits no backlash. A driver
-    that leaves one out before CONSISTENT in a row were there has to show as many first.
+    They are from the first one on. A driver that leaves one out before CONSISTENT in a row were
+    there has to show as many first.
     """
 
     def __init__(self, use: ReportUse) -> None:
@@ -77,7 +77,8 @@ class CommandHistory:
     before it was in use: v is as long under way as y is. Times are those of one clock [ns].
 
     counts: where late commands and missing reports are counted. trust: whether reports go before
-    own commands. newest_ns: when the newest command left, own or of another controller. output_ns:
+    own commands. origin: of them, which is
+    subtracted. newest_ns: when the newest command left, own or of another controller. output_ns:
     stamp of the newest output that was used; reports up to the first one belong to nothing.
     """
 
@@ -87,11 +88,10 @@ class CommandHistory:
     ) -> None:
         self.counts = counts or Counts()
         self.newest_ns = 0
-        self.trust = ReportTrust(use)
+        self.trust, self.origin = ReportTrust(use), ReportOrigin()
         self._period_ns = sample_period_s * 1e9
         self.output_ns = 0
         self._transit_ns = 0.0  # median time from one node to the other
-        self._reported_beyond = 0.0  # the newest report less the command that it stands for
         self._published: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
         self._reported: deque[tuple[int, float]] = deque(maxlen=KEPT_COMMANDS)
 
@@ -139,7 +139,7 @@ class CommandHistory:
         if self._reported and end_ns > self.newest_ns + self._period_ns:
             stamp_ns, v = self._reported[-1]
             if stamp_ns > end_ns - 1.5 * self._period_ns:
-                return v
+                return v - self.origin.value
         return nan
 
     def reported_over(self, intervals: int, end_ns: int, unsent: int = 0) -> list[float]:
@@ -160,24 +160,9 @@ class CommandHistory:
         # The report of the newest interval may still be under way while older ones are here.
         complete = len(reports) == intervals and stamp_ns > end_ns - 0.5 * self._period_ns
         if not self.trust.note(complete):
-            self._reported_beyond = 0.0
             return []
         self.counts.unreported += not complete
-        return reports if complete else []
-
-    def in_place_of_reports(
-        self, reports: list[float], acted: list[float], others: list[float],
-    ) -> tuple[list[float], list[float]]:
-        """acted, others (see `over`) as they would have been reported, where nothing was.
-
-        Where there are reports, these count and the two stay what they are.
-        """
-        if reports:
-            self._reported_beyond = min(
-                (reports[-1] - v for v in (acted[-1], others[-1]) if isfinite(v)), key=abs)
-        elif beyond := self._reported_beyond:
-            return [v + beyond for v in acted], [v + beyond for v in others]
-        return acted, others
+        return [v - self.origin.value for v in reports] if complete else []
 
     def _at(self, time_ns: float) -> tuple[float, float]:
         """The newest v that had left by then, and the one beside it that may have been in use."""

@@ -74,6 +74,7 @@ class ControlLoop:
         self._gap = NEXT_SAMPLE  # what is missing since the newest output that was used
         self._unanswered = 0  # outputs, because nobody knew v yet
         self._ending: Iterator[float] = iter(())  # commands that lead v to its end
+        self._before_reports = self.estimate  # before it was learned from any
 
     # --- what it knows ---------------------------------------------------------------------------
 
@@ -209,6 +210,7 @@ class ControlLoop:
             if self.silent or gap.restarted or (too_long and self.phase is Phase.RUNS):
                 self.statistics.interruptions += 1
                 self._happens(Event.INTERRUPTION)
+                self.commands.origin.restart()
                 self._renew_core(self.estimate)
         return self.phase is Phase.RUNS or p.lockstep or self._may_begin(output)
 
@@ -252,8 +254,24 @@ class ControlLoop:
         # Late commands are counted even where the driver says which ones it applied.
         acted, others = commands.over(lost + 1, stamp_ns, self.counter.due_ns)
         reports = commands.reported_over(lost + 1, stamp_ns, unsent)
-        acted, others = commands.in_place_of_reports(reports, acted, others)
+        if reports and self._has_other_origin(reports[-1], acted[-1]):
+            return self._step_core(y, y_m, stamp_ns)
         return core.step(y, y_m, lost, reports, others, acted)
+
+    def _has_other_origin(self, report: float, command: float) -> bool:
+        """Begin anew where reports turn out to have another origin than what was learned from."""
+        origin = self.commands.origin
+        if origin.begins:
+            self._before_reports = self.estimate
+        report += origin.value
+        if not origin.changed_by(report, command / self.core.command_of(1.0)):
+            return False
+        self._driver.warn(
+            f'{self._driver.applied} is {origin.value:.4g} beyond v: taken for another zero of the '
+            'motor encoder, and subtracted'
+        )
+        self.renew(self._before_reports)
+        return True
 
     # --- the phases ------------------------------------------------------------------------------
 

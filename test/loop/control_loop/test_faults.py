@@ -62,6 +62,22 @@ def test_lost_controls_that_the_driver_reports_leave_the_estimates_within_5_perc
     world.check_sanity()
 
 
+@pytest.mark.parametrize(('origin', 'structure'), [(0.5, 'proportional'), (-4.0, 'tracking')])
+def test_reports_of_an_encoder_with_another_zero_still_teach_the_crossings_of_v(origin, structure):
+    world = SimulatedLoop(reports=True, structure=structure)
+    world.driver.origin = origin
+    world.run(600)
+    assert world.loop.commands.origin.value == pytest.approx(origin)
+    assert world.error() < 0.02
+    assert world.rows[-1].status is Status.TRACKING
+    # An encoder that is zeroed while the driver is gone.
+    world.driver.down_until = world.driver.tick + 200
+    world.driver.origin = 0.1
+    world.run(800)
+    assert world.loop.commands.origin.value == pytest.approx(0.1)
+    assert world.error() < 0.02
+
+
 def test_lost_controls_that_nobody_reports_are_said_to_be_inconsistent() -> None:
     world = SimulatedLoop()
     world.learn()

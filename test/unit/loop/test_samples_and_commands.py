@@ -1,6 +1,6 @@
 """Which sample a message holds, and which v the plant had: the bookkeeping of the controller."""
 
-from math import inf, isnan, nan
+from math import inf, isnan, sin
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from backlash_ros.core.loop.command_history import (
     report_use,
     v_of_intervals,
 )
+from backlash_ros.core.loop.report_origin import ReportOrigin
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, Arrival, SampleCounter
 from backlash_ros.core.parameters import Parameters
 
@@ -182,14 +183,18 @@ def test_a_driver_that_leaves_reports_out_from_the_beginning_has_to_show_many_in
     assert used == [True, *[False] * (9 + n - 1), True]
 
 
-def test_a_report_that_is_missing_is_replaced_by_what_it_would_have_said() -> None:
-    commands = CommandHistory(PERIOD_S)
-    commands.in_place_of_reports([1.06], [1.0], [nan])
-    (acted,), (other,) = commands.in_place_of_reports([], [2.0], [3.0])
-    assert (acted, other) == pytest.approx((2.06, 3.06))
-    # A command that was late is no offset.
-    commands.in_place_of_reports([3.06], [2.0], [3.0])
-    assert commands.in_place_of_reports([], [5.0], [nan])[0] == pytest.approx([5.06])
+@pytest.mark.parametrize(('lag', 'beyond', 'most'), [
+    (0.0, 0.06, inf), (0.7, -3.0, inf), (0.0, 0.0, inf), (0.7, 0.0, inf), (0.3, 0.0, 0.5),
+    (0.0, 0.0, -2.0),
+])
+def test_the_origin_of_reports_is_found_whether_the_motor_lags_or_is_limited(lag, beyond, most):
+    origin, position = ReportOrigin(), 0.0
+    for k in range(1000):
+        command = sin(0.1 * k)
+        position = lag * position + (1.0 - lag) * min(command, most)
+        origin.changed_by(round((position + beyond) / 1e-3) * 1e-3, command)
+    # A motor that is limited has no other origin.
+    assert origin.value == pytest.approx(beyond, abs=1e-3)
 
 
 @given(st.lists(st.booleans(), max_size=100))
