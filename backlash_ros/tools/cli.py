@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -111,6 +112,8 @@ def run_tool(name: str, tool: Callable[[], None]) -> int:
     Call it from the main thread: a SIGTERM stops the tool as a Ctrl-C does.
     """
     handler = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    # The interpreter takes a while to end, in which another Ctrl-C would change the exit code.
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
     try:
         tool()
         return DONE

@@ -182,13 +182,13 @@ def _compare(args: Sequence[str] | None) -> None:
     scenario = effective_parameters(options.config, options.settings, options.seed, options.axis)
     results = compare(scenario, cli.number_of_samples(scenario, options.duration))
     # Drawing libraries take a second to load, which bad input should not cost.
-    from backlash_ros.tools.figures import draw_comparison, png
+    from backlash_ros.tools.figures import draw_error_curves, png
     print(cli.format_table(COMPARISON_HEADER, [result.row for result in results]))
     out = result_directory(options.out)
     figure, document = 'images/comparison.png', out / 'comparison.md'
     (out / figure).parent.mkdir(parents=True, exist_ok=True)
     curves = [result.curves for result in results if result.curves is not None]
-    write_atomically(out / figure, png(draw_comparison(curves, COMPARISON_WINDOW_S)))
+    write_atomically(out / figure, png(draw_error_curves(curves, COMPARISON_WINDOW_S)))
     write_atomically(document, comparison_document(scenario, results, figure))
     print(f'document: {document}')
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from textwrap import fill
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -244,37 +243,6 @@ def draw_closer(run: RunRecord, values: Array, name: str, parts: Sequence[Part])
     return figure
 
 
-def draw_laws(traces: Sequence[figure_data.LawTrace], start: Part) -> Figure:
-    """Control errors of the laws, as Figure 5 of the paper: each alone, then their size."""
-    colours = {'moving_horizon': '#44AA99', 'lms': '#AA4499', 'printed': '#999933'}
-    rows, sizes = {}, []
-    for trace, style in zip(traces, DASHES * len(traces), strict=False):
-        colour = colours.get(trace.law, '#555555')
-        origin = 'this run' if trace.recorded else 'simulated'
-        rows[f'{trace.law}\n({origin})\n$u - u_d$ [unit of u]'] = [Line(trace.t, trace.e, colour)]
-        size = np.where(trace.rms > 0.0, trace.rms, np.nan)
-        sizes.append(Line(trace.t, size, colour, trace.law, style, 1.8))
-    rows['RMS of $u - u_d$\nover one period\n[unit of u]'] = sizes
-    figure, grid = draw_panels(
-        1.7 * len(traces) + 3.4, rows, (start, WHOLE_RUN),
-        height_ratios=[1.0] * len(traces) + [1.7],
-    )
-    for axes, trace in zip(grid[:-1].T.ravel(), [*traces, *traces], strict=True):
-        zero_line(axes)
-        axes.text(0.5, 0.5, fill(trace.note, 50), transform=axes.transAxes, ha='center',
-                  va='center', fontsize=9)
-    known = [line.values[np.isfinite(line.values)] for line in sizes]
-    # A law that diverges leaves the axes, which are made for those that do not.
-    if highest := [float(size.max()) for size in known if size.size]:
-        # Not the least of all: an error begins at zero.
-        low = float(np.percentile(np.concatenate(known), 2))
-        for axes in grid[-1]:
-            limit_decades(axes, low, min(max(highest), 1e3 * min(highest)))
-    figure.align_ylabels(grid[:, 0])
-    legend_above(grid[-1, 1])
-    return figure
-
-
 def draw_hysteresis(run: RunRecord, end: Part) -> Figure:
     """v-u loop at the end of the run with the true and the estimated lines."""
     figure = new_figure(6.0)
@@ -369,8 +337,8 @@ def draw_sweep(
     return figure
 
 
-def draw_comparison(loops: Sequence[figure_data.ErrorCurves], window_s: float) -> Figure:
-    """Size of the control error (Figure 5 of the paper, extended) and of the tracking error.
+def draw_error_curves(loops: Sequence[figure_data.ErrorCurves], window_s: float) -> Figure:
+    """Size of the control error (Figure 5 of the paper), and of the tracking error if any is known.
 
     window_s: over which the RMS was taken [s].
     """
@@ -382,17 +350,18 @@ def draw_comparison(loops: Sequence[figure_data.ErrorCurves], window_s: float) -
         control.append(Line(t, of_control, *look))
         if of_tracking is not None:
             tracking.append(Line(t, of_tracking, *look))
-    rows = {
-        f'RMS of $u - u_d$ over {window_s:g} s\n[unit of u]': control,
-        f'RMS of $y - y_m$ over {window_s:g} s\n[unit of y]': tracking,
-    }
-    figure, grid = draw_panels(8.4, rows, [WHOLE_RUN])
+    rows = {f'RMS of $u - u_d$ over {window_s:.3g} s\n[unit of u]': control}
+    if tracking:
+        rows[f'RMS of $y - y_m$ over {window_s:.3g} s\n[unit of y]'] = tracking
+    figure, grid = draw_panels(4.2 * len(rows), rows, [WHOLE_RUN])
     for axes, lines in zip(grid[:, 0], rows.values(), strict=True):
-        known = np.concatenate([line.values[line.values > 0.0] for line in lines] or [np.empty(0)])
-        if known.size:
-            limit_decades(axes, *np.percentile(known, [2, 100]).tolist())
+        known = [line.values[np.isfinite(line.values) & (line.values > 0.0)] for line in lines]
+        if highest := [float(size.max()) for size in known if size.size]:
+            # Not the least of all, as an error begins at zero; a law that diverges leaves the axes.
+            low = float(np.percentile(np.concatenate(known), 2))
+            limit_decades(axes, low, min(max(highest), 1e3 * min(highest)))
     label(grid[0, 0], 'Control error')
-    label(grid[1, 0], 'Tracking error, where y is meant to follow')
+    label(grid[-1, 0], 'Tracking error, where y is meant to follow' if tracking else '')
     legend_below(figure, grid[0, 0], columns=3)
     return figure
 

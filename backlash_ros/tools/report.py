@@ -98,11 +98,12 @@ def _figures(
         )
     if run.has_truth and parameters is not None:
         duration = figure_data.compared_samples(run) * run.sample_period
+        curves, window_s, notes = figure_data.compare_laws(run, parameters)
         yield (
             'laws.png', 'Control error of the laws (Figure 5 of the paper)',
             'This run beside the other laws, simulated with the same parameters, over the first '
-            f'{duration:.6g} s. Each has its own scale; the last panel has all on one.',
-            figures.draw_laws(figure_data.compare_laws(run, parameters), start),
+            f'{duration:.6g} s.' + ''.join(f' Without a curve: {escape(note)}.' for note in notes),
+            figures.draw_error_curves(curves, window_s),
         )
     yield (
         'hysteresis.png', 'Backlash: the v–u loop',

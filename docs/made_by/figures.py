@@ -29,8 +29,8 @@ from backlash_ros.tools.figures import (
     TIME_LABEL,
     band,
     curve,
+    draw_error_curves,
     draw_hysteresis,
-    draw_laws,
     label,
     legend_above,
     legend_below,
@@ -115,10 +115,8 @@ def draw_figure_4() -> Figure:
 def draw_figure_5() -> Figure:
     """Control errors of the laws on the paper's example, as Figure 5."""
     run = simulate(5.0)
-    start, _ = interesting_parts(run.record, run.parameters)
-    # A law that does not fit the structure of the paper leaves a note instead of a curve.
-    fitting = [trace for trace in compare_laws(run.record, run.parameters) if not trace.note]
-    return draw_laws(fitting, start)
+    curves, window_s, _ = compare_laws(run.record, run.parameters)
+    return draw_error_curves(curves, window_s)
 
 
 def draw_loop() -> Figure:

@@ -50,14 +50,13 @@ class AxisPlan:
 
     def waits(self, process: str) -> bool:
         """Whether one of its processes waits for somebody who may come at any time."""
-        p, waiting = self.parameters, []
-        if p.driver == ELSEWHERE or not p.autostart:
-            waiting.append('controller')
-        if not p.autostart:
-            waiting.append('plant')  # begins when the controller listens
-        if p.joints:
-            waiting.append('recorder')  # begins when the motion is planned
-        return process in map(self.process_name, waiting)
+        p = self.parameters
+        waiting = {
+            # The plant begins when the controller listens.
+            'controller': p.driver == ELSEWHERE or not p.autostart, 'plant': not p.autostart,
+            'recorder': bool(p.joints),  # begins when the motion is planned
+        }
+        return any(waits and process == self.process_name(node) for node, waits in waiting.items())
 
     def titled(self, text: str) -> str:
         """The text, with the name of the axis where there are axes."""
@@ -152,6 +151,8 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
     ):
         if wrong:
             raise ParameterError('driver', driver, rule, cure)
+    if p.bag:
+        raise ParameterError('bag', p.bag, 'is made by bringup', 'choose its folder with --out')
     for joint in p.joint_names:
         own = p.of_joint(joint)
         if driver and not options.unlimited and (missing := own.missing_limits):
@@ -160,10 +161,7 @@ def _checked(p: Parameters, axis: str, options: argparse.Namespace) -> Parameter
                 'is no limit, and a driver moves an actuator',
                 f'set {", ".join(missing)}, or give --unlimited',
             )
-        if not p.bag:
-            build_controller(own)
-    if p.bag:
-        raise ParameterError('bag', p.bag, 'is made by bringup', 'choose its folder with --out')
+        build_controller(own)
     build_reference(p)
     if not driver:
         build_plant(p)
@@ -211,21 +209,19 @@ def _node(axis: AxisPlan, node: str, domain: int | None) -> ProcessPlan:
     if node == 'recorder':
         # In YAML, whatever stands in the path.
         bag = str(axis.bag).replace("'", "''") if axis.record else ''
-        own = ['wait_for_publishers:=true', f"bag:='{bag}'"]
+        settings = ['-p', 'wait_for_publishers:=true', '-p', f"bag:='{bag}'"]
     else:
         # The loop and the recorder; in real time the reference follows plant_output as well, in
         # lockstep it follows /clock.
-        own = [f'wait_for_subscribers:={3 if node == "plant" and not lockstep else 2}']
-    command = [*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG_FILE)]
-    for setting in own:
-        command += ['-p', setting]
+        settings = ['-p', f'wait_for_subscribers:={3 if node == "plant" and not lockstep else 2}']
     if axis.name:
-        command += ['-r', f'__ns:=/{axis.name}']
+        settings += ['-r', f'__ns:=/{axis.name}']
         if lockstep:
-            command += ['-r', '/clock:=clock']  # each axis has a time of its own
+            settings += ['-r', '/clock:=clock']  # each axis has a time of its own
     return ProcessPlan(
-        axis.process_name(node), tuple(command), axis.logs / f'{node}.log',
-        child_environment(axis.logs, domain), axis.name,
+        axis.process_name(node),
+        (*_module(node), '--ros-args', '--params-file', str(axis.out / CONFIG_FILE), *settings),
+        axis.logs / f'{node}.log', child_environment(axis.logs, domain), axis.name,
         # The controller may end with a ramp, and then saves what it has learned.
         grace_s=axis.parameters.timeout.ramp if node == 'controller' else 0.0,
     )

@@ -20,7 +20,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from backlash_ros.tools.bringup.environment import with_source
 from backlash_ros.tools.cli import BrokenOffError
@@ -50,34 +50,46 @@ class ProcessPlan:
     grace_s: float = 0.0
 
 
-class Event(NamedTuple):
-    """A JSON object that a process printed as a line of its stdout; kind: what happened."""
-
-    plan: ProcessPlan
-    kind: str
-    content: Mapping[str, object]
-
-
-@dataclass
 class Child:
-    """A started process. What it prints besides events goes to its log."""
+    """A started process. Raises BrokenOffError for a program that cannot be started."""
 
-    plan: ProcessPlan
-    process: subprocess.Popen[bytes]
-    unfinished_line: bytes = b''
+    def __init__(self, plan: ProcessPlan) -> None:
+        self.plan, self._unfinished = plan, b''
+        # A node lets them through when it knows what to do with them: see nodes/__init__.py.
+        held_back = () if plan.foreign else (signal.SIGINT, signal.SIGTERM)
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
+        try:
+            with plan.log.open('ab') as log:
+                self.process = subprocess.Popen(
+                    plan.command, stdin=subprocess.DEVNULL,
+                    stdout=log if plan.foreign else subprocess.PIPE, stderr=log,
+                    env=plan.environment, start_new_session=True,
+                )
+        except OSError as error:
+            raise BrokenOffError(
+                f'{plan.name} does not start: {plan.command[0]}: {error.strerror}'
+            ) from error
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def take(self, chunk: bytes) -> list[Event]:
-        """Events of the lines that end in this chunk of stdout."""
-        *lines, self.unfinished_line = (self.unfinished_line + chunk).split(b'\n')
-        events = []
+    @property
+    def has_ended(self) -> bool:
+        """Whether the process has ended, by itself or by a signal."""
+        return self.process.poll() is not None
+
+    def events(self, chunk: bytes) -> list[dict[str, Any]]:
+        """JSON objects with `event` in the lines that end in this chunk; all else is logged."""
+        *lines, self._unfinished = (self._unfinished + chunk).split(b'\n')
+        found = []
         for line in lines:
-            try:
+            with contextlib.suppress(ValueError):
                 content = json.loads(line)
-                events.append(Event(self.plan, str(content['event']), content))
-            except (ValueError, TypeError, KeyError):
-                with self.plan.log.open('ab') as log:
-                    log.write(line + b'\n')
-        return events
+                if isinstance(content, dict) and 'event' in content:
+                    found.append(content)
+                    continue
+            with self.plan.log.open('ab') as log:
+                log.write(line + b'\n')
+        return found
 
     def describe_end(self, what: str, further: str = '') -> str:
         """What became of it, how it exited, and the end of its log."""
@@ -88,10 +100,9 @@ class Child:
 
     def end_of_log(self) -> str:
         """The last ten lines of the log, indented."""
-        log = self.plan.log
-        lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
+        lines = self.plan.log.read_text(encoding='utf-8', errors='replace').splitlines()
         quoted = ''.join(f'\n    {line}' for line in lines[-10:])
-        return f'{log}:{quoted}' if quoted else f'{log} is empty'
+        return f'{self.plan.log}:{quoted}' if quoted else f'{self.plan.log} is empty'
 
 
 class ProcessSupervisor:
@@ -99,7 +110,6 @@ class ProcessSupervisor:
 
     stages: in the order in which they are to be stopped, those of one stage together; all are
     started together. hurry: asked while stopping; once it says yes, nobody is given any more time.
-    Raises BrokenOffError for a program that cannot be started.
     """
 
     def __init__(
@@ -108,19 +118,20 @@ class ProcessSupervisor:
         self._plans, self._hurry = stages, hurry
         self._stages: list[list[Child]] = [[] for _ in stages]
         self._selector = selectors.DefaultSelector()
-        self._guardian: subprocess.Popen[bytes] | None = None
 
     def __enter__(self) -> ProcessSupervisor:
+        self._guardian = subprocess.Popen(
+            (sys.executable, '-m', 'backlash_ros.tools.bringup.supervisor'), bufsize=0,
+            stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),
+            start_new_session=True,
+        )
         try:
-            self._guardian = subprocess.Popen(
-                (sys.executable, '-m', 'backlash_ros.tools.bringup.supervisor'), bufsize=0,
-                stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, env=with_source(os.environ),
-                start_new_session=True,
-            )
             for children, plans in zip(self._stages, self._plans, strict=True):
                 for plan in plans:
-                    children.append(self._start(plan))
-                    self._tell_guardian(0)
+                    children.append(child := Child(plan))
+                    self._tell_guardian(list(map(_groups, self._stages)))
+                    if child.process.stdout is not None:
+                        self._selector.register(child.process.stdout, selectors.EVENT_READ, child)
         except BaseException:
             self.__exit__()
             raise
@@ -132,77 +143,50 @@ class ProcessSupervisor:
         for child in self.children:
             if child.process.stdout is not None:
                 child.process.stdout.close()
-        if self._guardian is not None and self._guardian.stdin is not None:
-            self._guardian.stdin.close()
-            self._guardian.wait()
+        self._tell_guardian([])
+        assert self._guardian.stdin is not None
+        self._guardian.stdin.close()
+        self._guardian.wait()
 
     @property
     def children(self) -> list[Child]:
         """All that were started."""
         return [child for stage in self._stages for child in stage]
 
-    def events(self, timeout: float) -> list[Event]:
+    def events(self, timeout: float) -> list[tuple[ProcessPlan, dict[str, Any]]]:
         """What the processes have said; waits up to timeout [s] for a first word."""
-        found: list[Event] = []
+        found = []
         for key, _ in self._selector.select(timeout):
             chunk = os.read(key.fd, 65536)
             if not chunk:
                 self._selector.unregister(key.fileobj)
-            found += key.data.take(chunk)
+            found += [(key.data.plan, content) for content in key.data.events(chunk)]
         return found
 
-    def ended(self) -> list[Child]:
-        """Children whose process has ended, whether by itself or by a signal."""
-        return [child for child in self.children if child.process.poll() is not None]
-
-    def stop(self) -> list[Event]:
+    def stop(self) -> list[tuple[ProcessPlan, dict[str, Any]]]:
         """Stop one stage after the other, each child with all its group; returns last words."""
-        last_words: list[Event] = []
+        last_words: list[tuple[ProcessPlan, dict[str, Any]]] = []
 
         def listen() -> None:
             last_words.extend(self.events(0.02))
 
-        for i, children in enumerate(self._stages):
-            living = [child for child in children if child.process.poll() is None]
-            settled = time.monotonic() + max((c.plan.settle_s for c in living), default=0.0)
+        for children in self._stages:
+            settle_s = max((c.plan.settle_s for c in children if not c.has_ended), default=0.0)
+            settled = time.monotonic() + settle_s
             while time.monotonic() < settled and not self._hurry():
                 listen()
             stop_groups(*_groups(children), listen, self._hurry)
             for child in children:
                 child.process.poll()
-            self._tell_guardian(i + 1)
         while self._selector.select(0.0):
             listen()
         return last_words
 
-    def _start(self, plan: ProcessPlan) -> Child:
-        # A node lets them through when it knows what to do with them: see nodes/__init__.py.
-        held_back = () if plan.foreign else (signal.SIGINT, signal.SIGTERM)
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, held_back)
-        try:
-            with plan.log.open('ab') as log:
-                process = subprocess.Popen(
-                    plan.command, stdin=subprocess.DEVNULL,
-                    stdout=log if plan.foreign else subprocess.PIPE, stderr=log,
-                    env=plan.environment, start_new_session=True,
-                )
-        except OSError as error:
-            raise BrokenOffError(
-                f'{plan.name} does not start: {plan.command[0]}: {error.strerror}'
-            ) from error
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        child = Child(plan, process)
-        if process.stdout is not None:
-            self._selector.register(process.stdout, selectors.EVENT_READ, child)
-        return child
-
-    def _tell_guardian(self, first: int) -> None:
-        """Say that the stages from the first on are still to be stopped."""
-        if self._guardian is not None and self._guardian.stdin is not None:
-            line = json.dumps([_groups(children) for children in self._stages[first:]]) + '\n'
-            with contextlib.suppress(BrokenPipeError):
-                self._guardian.stdin.write(line.encode())
+    def _tell_guardian(self, stages: Sequence[tuple[list[int], float]]) -> None:
+        """Say what is to be stopped, stage by stage, should this process die."""
+        assert self._guardian.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._guardian.stdin.write(f'{json.dumps(stages)}\n'.encode())
 
 
 def _groups(children: Sequence[Child]) -> tuple[list[int], float]:
@@ -240,24 +224,17 @@ def group_exists(group: int) -> bool:
         return False
     except PermissionError:
         return True
-    processes = Path('/proc')
-    # The leader first: only when it has gone all others must be looked through.
-    return not processes.is_dir() or _lives(processes / str(group), group) or any(
-        _lives(process, group) for process in processes.glob('[0-9]*')
-    )
-
-
-def _lives(process: Path, group: int) -> bool:
-    """Whether a process is of this group and has not ended (proc_pid_stat(5))."""
-    try:
-        text = (process / 'stat').read_text(encoding='utf-8', errors='replace')
-    except OSError:
-        return False
-    # The name of the program stands in parentheses and may hold anything.
-    state, _, its_group, *others = text.rpartition(')')[2].split()
-    # Where only the main thread has ended, the process is shown as a zombie with several threads.
-    ended = state == 'X' or (state == 'Z' and others[14] == '1')
-    return int(its_group) == group and not ended
+    for stat in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            text = stat.read_text(encoding='utf-8', errors='replace')
+        except OSError:
+            continue  # gone meanwhile
+        # The name of the program stands in parentheses and may hold anything: proc_pid_stat(5).
+        state, _, its_group, *others = text.rpartition(')')[2].split()
+        # Where only the main thread has ended, the process is shown as a zombie with threads.
+        if int(its_group) == group and (state not in 'XZ' or (state == 'Z' and others[14] != '1')):
+            return True
+    return False
 
 
 def guard(lines: Iterable[str]) -> None:

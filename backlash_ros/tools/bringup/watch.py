@@ -7,12 +7,13 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import inf, isfinite, nan
+from math import inf
+from typing import Any
 
 from backlash_ros import topics
 from backlash_ros.tools.bringup.plan import ELSEWHERE, AxisPlan, RunPlan
-from backlash_ros.tools.bringup.supervisor import Child, Event, ProcessSupervisor
-from backlash_ros.tools.cli import BrokenOffError, StopRequests
+from backlash_ros.tools.bringup.supervisor import Child, ProcessPlan, ProcessSupervisor
+from backlash_ros.tools.cli import BrokenOffError, StopRequests, number
 
 READY_DEADLINE_S = 30.0  # for the start of every process
 FIRST_SAMPLE_DEADLINE_S = 30.0  # of a driver that bringup has started
@@ -24,27 +25,15 @@ def complain(message: str, name: str = 'bringup: ') -> None:
     print(f'{name}{message}', file=sys.stderr, flush=True)
 
 
-def describe(progress: Mapping[str, object]) -> str:
+def describe(progress: Mapping[str, Any]) -> str:
     """The estimates with their errors in % of the truth, where that is known."""
     words = []
     for name in topics.BACKLASH:
-        estimate, truth = _number(progress, name), _number(progress, f'true_{name}')
-        words.append(f'{name} {estimate:.4g}')
-        if isfinite(truth) and truth != 0.0:
+        estimate, truth = progress.get(name), progress.get(f'true_{name}')
+        words.append(f'{name} {number(estimate)}')
+        if estimate is not None and truth:
             words[-1] += f' ({100.0 * (estimate - truth) / abs(truth):+.1f} %)'
-    return '  '.join([*words, f'lost {_number(progress, "lost"):.0f}'])
-
-
-def _number(values: Mapping[str, object], name: str) -> float:
-    """A number of an event, nan for null and for what is missing."""
-    value = values.get(name)
-    return float(value) if isinstance(value, (int, float)) else nan
-
-
-def _counts(values: Mapping[str, object], name: str) -> dict[str, int]:
-    """The counts in an event by what was counted, empty where they are missing."""
-    value = values.get(name)
-    return value if isinstance(value, dict) else {}
+    return '  '.join([*words, f'lost {progress.get("lost", 0)}'])
 
 
 @dataclass
@@ -88,17 +77,15 @@ class AxisProgress:
         """The time starts to run."""
         self.began = self.moved = time.monotonic()
 
-    def take(self, progress: Mapping[str, object]) -> None:
+    def take(self, progress: Mapping[str, Any]) -> None:
         """Take in what the recorder says."""
-        sample, p = _number(progress, 'sample'), self.plan.parameters
-        if not isfinite(sample):
-            return
+        sample, p = progress['sample'], self.plan.parameters
         if self.made == 0:
             self.begin()
             # A driver may have been running before; a simulated plant begins with sample 0.
-            self.first = int(sample) if p.driver else 0
-        made = int(sample) + 1 - self.first
-        self.heard = {'samples': made, **_counts(progress, 'received')}
+            self.first = sample if p.driver else 0
+        made = sample + 1 - self.first
+        self.heard = {'samples': made, **progress.get('received', {})}
         if made > self.made:
             self.made, self.moved, self.silent = made, time.monotonic(), False
             if self.moved >= self.next_line:
@@ -113,6 +100,8 @@ class AxisProgress:
         now, plan, p = time.monotonic(), self.plan, self.plan.parameters
         due = inf if p.samples == 0 or p.lockstep else \
             self.began + p.samples * p.sample_period + LATE_DEADLINE_S
+        if self.complete:
+            return
         if p.driver and self.made == 0:
             if p.driver != ELSEWHERE and now > self.began + FIRST_SAMPLE_DEADLINE_S:
                 raise BrokenOffError(plan.titled(
@@ -120,12 +109,12 @@ class AxisProgress:
                     f'output? See {plan.logs}; where it needs longer, start it yourself '
                     '(--driver none)'
                 ))
-        elif now > due and not self.complete:
+        elif now > due:
             raise BrokenOffError(plan.titled(
                 f'only {self.made} of {p.samples} samples, {LATE_DEADLINE_S:g} s after the end '
                 f'was due, see {plan.logs}'
             ))
-        elif now > self.moved + self.patience and not self.complete and not self.silent:
+        elif now > self.moved + self.patience and not self.silent:
             at = f' after sample {self.first + self.made - 1}' if self.made else ''
             silence = plan.titled(f'no new sample for {self.patience:g} s{at}')
             if not p.driver:
@@ -171,12 +160,15 @@ class RunWatch:
                 complain(f'{self._requests.last} ends the run')
         except BrokenOffError as error:
             # Said before the processes are stopped, which may take a while.
-            self.failure = str(error)
-            complain(self.failure)
-        for event in self._supervisor.stop():
-            self._note(event)
+            self._fail(str(error))
+        for plan, content in self._supervisor.stop():
+            self._note(plan, content)
         if not self.failure:
             self._judge_exits()
+
+    def _fail(self, reason: str) -> None:
+        self.failure = reason
+        complain(reason)
 
     @property
     def _over(self) -> bool:
@@ -222,38 +214,40 @@ class RunWatch:
                 ))
 
     def _listen(self) -> None:
-        for event in self._supervisor.events(0.1):
-            self._note(event)
+        for plan, content in self._supervisor.events(0.1):
+            self._note(plan, content)
         if self._requests.count and not self._over:
             raise BrokenOffError(f'interrupted by {self._requests.last}, stopping')
         dead = []
-        for child in self._supervisor.ended():
+        for child in self._supervisor.children:
             name = child.plan.name
-            if not (child.plan.spectator and name in self._ready):
-                dead.append(child.describe_end('died'))
-            elif name not in self._gone:
+            if not child.has_ended or name in self._gone:
+                continue
+            if child.plan.spectator and name in self._ready:
                 self._gone.add(name)
                 complain(child.describe_end('died', ', the run goes on without it'))
+            else:
+                dead.append(child.describe_end('died'))
         if dead:
             raise BrokenOffError('\n'.join(dead))
 
-    def _note(self, event: Event) -> None:
-        axis, content = self._axes[event.plan.axis], event.content
-        if event.kind == 'ready':
-            self._ready.add(event.plan.name)
+    def _note(self, plan: ProcessPlan, content: Mapping[str, Any]) -> None:
+        axis, kind = self._axes[plan.axis], content['event']
+        if kind == 'ready':
+            self._ready.add(plan.name)
             if 'address' in content:
-                print(f'{event.plan.name}: {content["address"]}', flush=True)
-        elif event.kind == 'done':
-            axis.published = _counts(content, 'published')
-        elif event.kind == 'progress':
+                print(f'{plan.name}: {content["address"]}', flush=True)
+        elif kind == 'done':
+            axis.published = content['published']
+        elif kind == 'progress':
             axis.take(content)
-        elif event.kind == 'recording_stopped':
+        elif kind == 'recording_stopped':
             # The log may lie on the very disk that is full.
-            complain(str(content.get('reason', '')))
-        elif event.kind == 'closed' and axis.plan.record and axis.made:
+            complain(content['reason'])
+        elif kind == 'closed' and axis.plan.record and axis.made and not content['failure']:
             outputs = topics.PLANT_OUTPUT, topics.JOINT_STATES, topics.ROBOT_STATES
-            for topic, count in _counts(content, 'messages').items():
-                if not content.get('failure') and topic.rpartition('/')[2] in outputs and not count:
+            for topic, count in content['messages'].items():
+                if topic.rpartition('/')[2] in outputs and not count:
                     complain(
                         f'the bag holds no message of {topic}, which the controller has heard: the '
                         'recorder did not discover its publisher before the end of the run; let '
@@ -263,17 +257,17 @@ class RunWatch:
     def _judge_exits(self) -> None:
         """Check the exit codes of the processes that were asked to end."""
         bad = []
+        # A driver may end so of the signal that stops it; a shell adds 128 to its number.
+        stopped = {sign * number + of_shell for sign, of_shell in ((-1, 0), (1, 128))
+                   for number in (signal.SIGINT, signal.SIGTERM)}
         for child in self._supervisor.children:
             code = child.process.returncode
             if code == 0 or child.plan.name in self._gone:
                 continue
             if not child.plan.foreign or code == -signal.SIGKILL:
                 bad.append(child.describe_end('did not stop cleanly'))
-            # A driver may end so of the signal that stops it; a shell adds 128 to its number.
-            elif code not in (-signal.SIGINT, -signal.SIGTERM,
-                              128 + signal.SIGINT, 128 + signal.SIGTERM):
+            elif code not in stopped:
                 # How a program of the user says good-bye is its own affair.
                 complain(child.describe_end('was stopped'))
         if bad:
-            self.failure = '\n'.join(bad)
-            complain(self.failure)
+            self._fail('\n'.join(bad))

@@ -30,21 +30,6 @@ class Part(NamedTuple):
     rows: slice
 
 
-class LawTrace(NamedTuple):
-    """Control error e = u - u_d (3.4) of one law, shape (N,).
-
-    rms: over the period of y_m before each time. recorded: whether it comes from the run itself;
-    the others are simulated. note: why there is no curve, if there is none.
-    """
-
-    law: str
-    t: Array
-    e: Array
-    rms: Array
-    recorded: bool = False
-    note: str = ''
-
-
 class ErrorCurves(NamedTuple):
     """Moving RMS of the control error and of the tracking error of a loop, shape (N,) each.
 
@@ -54,7 +39,7 @@ class ErrorCurves(NamedTuple):
     name: str
     t: Array
     control: Array
-    tracking: Array | None
+    tracking: Array | None = None
 
 
 def control_error(run: RunRecord) -> Array:
@@ -95,27 +80,33 @@ def compared_samples(run: RunRecord) -> int:
     return min(round(float(run.column('t')[-1]) / run.sample_period) + 1, 10_000)
 
 
-def compare_laws(run: RunRecord, parameters: Parameters) -> list[LawTrace]:
-    """The run's law beside every other one, simulated with the same parameters (Figure 5)."""
+def compare_laws(
+    run: RunRecord, parameters: Parameters,
+) -> tuple[list[ErrorCurves], float, list[str]]:
+    """The run's law beside every other one, simulated with the same parameters (Figure 5).
+
+    Also over how long the RMS is taken [s], a period of y_m, and what kept a law from its curve.
+    """
     samples = compared_samples(run)
-    window = max(round((_reference_period(parameters) or 1.0) / run.sample_period), 1)
-    own = parameters.estimator.law
+    window_s = _reference_period(parameters) or 1.0
+    window = max(round(window_s / run.sample_period), 1)
     compared = run.column('t') < (samples - 0.5) * run.sample_period
-    t, e = run.column('t')[compared], control_error(run)[compared]
-    traces = [LawTrace(own, t, e, moving_rms(e, window), recorded=True)]
+    own, notes = parameters.estimator.law, []
+    curves = [ErrorCurves(f'{own} (this run)', run.column('t')[compared],
+                          moving_rms(control_error(run)[compared], window))]
     for law in LAWS:
         if law == own or not law_fits(law, parameters.structure):
             continue
-        t, e, note = np.empty(0), np.empty(0), ''
         try:
-            simulated = run_loop(build_closed_loop(parameters.replaced({
+            other = run_loop(build_closed_loop(parameters.replaced({
                 'estimator.law': law, 'estimates.load': False,
             })), samples)
-            t, e = simulated.column('t'), control_error(simulated)
         except (ParameterError, InputError, BrokenOffError) as error:
-            note = str(error)
-        traces.append(LawTrace(law, t, e, moving_rms(e, window), note=note))
-    return traces
+            notes.append(f'{law}: {error}')
+        else:
+            curves.append(ErrorCurves(
+                law, other.column('t'), moving_rms(control_error(other), window)))
+    return curves, window_s, notes
 
 
 def followed_reference(run: RunRecord, parameters: Parameters | None) -> tuple[Array, float, bool]:

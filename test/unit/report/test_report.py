@@ -188,9 +188,8 @@ def test_moving_rms_is_that_of_the_newest_samples() -> None:
 
 def test_law_that_breaks_off_does_not_take_the_report_with_it(run: RunRecord) -> None:
     other = PARAMETERS.replaced({'waveform': 'file', 'file': 'gone.csv'})
-    own, *others = figure_data.compare_laws(run, other)
-    assert own.recorded
-    assert len(own.t) == run.samples
-    assert all('gone.csv' in trace.note for trace in others)
-    part = figure_data.Part('Begin', slice(10))
-    assert isinstance(figures.draw_laws([own, *others], part), Figure)
+    curves, _, notes = figure_data.compare_laws(run, other)
+    assert [len(curve.t) for curve in curves] == [run.samples]
+    assert notes
+    assert all('gone.csv' in note for note in notes)
+    assert isinstance(figures.draw_error_curves(curves, 0.5), Figure)
