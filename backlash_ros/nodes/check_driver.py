@@ -9,13 +9,13 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import yaml
 from rclpy.utilities import remove_ros_args
 
-from backlash_ros.core.driver_check.findings import WRONG, Finding, timing_of
-from backlash_ros.core.driver_check.gentle_drive import GentleDrive
-from backlash_ros.core.driver_check.motion import record_of
-from backlash_ros.core.driver_check.verdict import all_fit, judge, table
+from backlash_ros.core.driver_check.drive import waves
+from backlash_ros.core.driver_check.evidence import Evidence
+from backlash_ros.core.driver_check.faults import WRONG, Judgement, all_fit, judge, table
 from backlash_ros.nodes.drive.motion_node import MotionNode, add_motion_options
 from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED, OptionParser
@@ -28,39 +28,35 @@ class CheckDriverNode(MotionNode):
     """Judges what it hears."""
 
     def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__(CHECK_DRIVER, options, GentleDrive)
+        super().__init__(CHECK_DRIVER, options, waves)
 
     def tell(self) -> None:
-        findings = judge(self.graph.in_the_end(), self.heard, self.settings)
+        evidence = Evidence(self.graph.in_the_end(), self.heard, self.settings)
+        findings = judge(evidence)
         if self.ended:
-            findings.append(Finding(
+            findings.append(Judgement(
                 'drive', WRONG, f'{self.ended}: drive ended',
                 'let y come all the time; widen --output-range, or drive less: --amplitude, --rate',
             ))
         print(table(findings), flush=True)
         if self.options.save is not None:
-            self._save(self.options.save)
+            self._save(self.options.save, evidence)
         self.exit_code = DONE if all_fit(findings) else FAILED
 
-    def _save(self, path: Path) -> None:
-        period = self.settings.sample_period
-        timing = timing_of(self.heard, period)
-        record = None if timing is None else record_of(self.heard, timing)
-        if record is None:
+    def _save(self, path: Path, evidence: Evidence) -> None:
+        if evidence.v is None:
             self.say(f'nothing to save in {path}: v and y were not both heard')
             return
         try:
             with path.open('w', newline='', encoding='utf-8') as file:
                 writer = csv.writer(file)
                 writer.writerow(('t', 'v', 'y'))
-                writer.writerows(
-                    (repr(k * period), repr(float(v)), repr(float(y)))
-                    for k, (v, y) in enumerate(zip(record.v, record.y, strict=True))
-                )
+                t = self.settings.sample_period * np.arange(len(evidence.record[0]))
+                writer.writerows(zip(t, *evidence.record, strict=True))
         except OSError as error:
             self.say(f'{path}: cannot be written: {error.strerror}')
             return
-        print(f'saved {len(record.v)} samples of v and y in {path}')
+        print(f'saved {len(evidence.record[0])} samples of v and y in {path}')
 
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:

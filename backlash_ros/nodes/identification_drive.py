@@ -9,7 +9,7 @@ from pathlib import Path
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros import topics
-from backlash_ros.core.driver_check.gentle_drive import IdentificationDrive
+from backlash_ros.core.identification.motion import strokes
 from backlash_ros.nodes.drive.motion_node import MotionNode, add_motion_options
 from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED
@@ -24,7 +24,7 @@ class IdentificationDriveNode(MotionNode):
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
-        super().__init__(IDENTIFY, options, IdentificationDrive)
+        super().__init__(IDENTIFY, options, strokes)
         self._file = options.messages.open('w', encoding='ascii')
         self._written = {
             topics.CONTROL: 0, topics.APPLIED_CONTROL: 0, topics.PLANT_OUTPUT: 0,

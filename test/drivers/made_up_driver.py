@@ -6,9 +6,10 @@ import numpy as np
 from scipy.signal import cont2discrete
 
 from backlash_ros.core.assembly import build_plant
-from backlash_ros.core.driver_check.findings import FLOAT64, WRONG, Finding, Graph, Heard, Message
-from backlash_ros.core.driver_check.gentle_drive import GentleDrive, Range
-from backlash_ros.core.driver_check.verdict import judge
+from backlash_ros.core.driver_check.drive import Drive, Range, waves
+from backlash_ros.core.driver_check.evidence import Evidence
+from backlash_ros.core.driver_check.faults import FLOAT64, WRONG, Judgement, judge
+from backlash_ros.core.driver_check.heard import Graph, Heard, Message
 from backlash_ros.core.parameters import Parameters
 
 PERIOD_S = 0.04  # long enough that a busy machine does not disturb it
@@ -63,7 +64,7 @@ def heard_from_driver(
     0, so that the left side is never engaged.
     """
     limits = Range(reach * LIMITS.low, reach * LIMITS.high, LIMITS.rate)
-    drive = GentleDrive(limits, PERIOD_S, samples * PERIOD_S)
+    drive = Drive(waves, limits, PERIOD_S, samples * PERIOD_S)
     plant = build_plant(plant_parameters())
     v: list[float] = []
     y: list[float] = []
@@ -81,10 +82,10 @@ def heard_from_driver(
     return heard
 
 
-def faults(heard: Heard, graph: Graph = GOOD_GRAPH, **changes: object) -> list[Finding]:
-    findings = judge(graph, heard, Parameters(parameters(**changes)))
+def faults(heard: Heard, graph: Graph = GOOD_GRAPH, **changes: object) -> list[Judgement]:
+    findings = judge(Evidence(graph, heard, Parameters(parameters(**changes))))
     return [finding for finding in findings if finding.mark == WRONG]
 
 
-def subjects(findings: list[Finding]) -> list[str]:
+def subjects(findings: list[Judgement]) -> list[str]:
     return [finding.subject for finding in findings]

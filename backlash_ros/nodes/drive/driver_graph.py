@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 
 from rclpy.node import Node
@@ -14,8 +15,8 @@ from rclpy.qos import (
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from backlash_ros import topics
-from backlash_ros.core.driver_check.findings import FLOAT64, Graph
-from backlash_ros.core.driver_check.verdict import similar_topics
+from backlash_ros.core.driver_check.faults import FLOAT64
+from backlash_ros.core.driver_check.heard import Graph
 from backlash_ros.core.parameters.table import RECORDER
 from backlash_ros.nodes.control.rivals import names_of
 from backlash_ros.nodes.runtime.messages import DEPTH
@@ -109,3 +110,19 @@ def _misfit(asked: QoSProfile) -> str:
     bare = QoSProfile(depth=DEPTH, reliability=asked.reliability, durability=asked.durability)
     compatibility, reason = qos_check_compatible(QoSProfile(depth=DEPTH), bare)
     return f'control: {reason}' if compatibility == QoSCompatibility.ERROR else ''
+
+
+def similar_topics(
+    wanted: str, wanted_type: str, seen: Mapping[str, Sequence[str]],
+) -> list[str]:
+    """Topics that may be the wanted one under another name, most similar first.
+
+    wanted: fully qualified. seen: topics with their types.
+    """
+    def likeness(topic: str) -> float:
+        last, other = (name.rsplit('/', 1)[-1] for name in (wanted, topic))
+        alike = difflib.SequenceMatcher(None, last, other).ratio()
+        return alike + (0.1 if wanted_type in seen[topic] else 0.0)
+
+    near = [topic for topic in seen if topic != wanted and likeness(topic) >= 0.6]
+    return sorted(near, key=lambda topic: (-likeness(topic), topic))

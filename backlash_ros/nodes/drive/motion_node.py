@@ -17,8 +17,8 @@ from std_msgs.msg import Float64
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_controller, build_limits
 from backlash_ros.core.control.limits import plausible
-from backlash_ros.core.driver_check.findings import Heard, Message
-from backlash_ros.core.driver_check.gentle_drive import Drive, Range, drive_range
+from backlash_ros.core.driver_check.drive import Drive, Motion, drive_range
+from backlash_ros.core.driver_check.heard import Heard, Message
 from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.control.rivals import Presence, identity_made_by
 from backlash_ros.nodes.drive.driver_graph import DriverGraph
@@ -28,8 +28,6 @@ from backlash_ros.nodes.runtime.process import ProcessNode
 from backlash_ros.options import BAD_INPUT, FAILED, positive
 
 LOOK_S = 0.1  # between two looks at the graph
-# What a motion is: limits, sample period [s], duration [s], v at its begin.
-MakeMotion = Callable[[Range, float, float, float], Drive]
 
 
 def add_motion_options(parser: argparse.ArgumentParser) -> None:
@@ -60,14 +58,14 @@ class MotionNode(ProcessNode):
     ended before its time, empty if it did not. names: full names of the topics.
     """
 
-    def __init__(self, program: str, options: argparse.Namespace, motion: MakeMotion) -> None:
+    def __init__(self, program: str, options: argparse.Namespace, motion: Motion) -> None:
         super().__init__(program, parameters_of=CONTROLLER)
         p = self.settings
         build_controller(p)
         self.options = options
         if options.drive:
             limits = drive_range(p, options.amplitude, options.rate)
-            self._begin = partial(motion, limits, p.sample_period, options.duration)
+            self._begin = partial(Drive, motion, limits, p.sample_period, options.duration)
         self.heard = Heard()
         self.motion: Drive | None = None
         self.ended, self.exit_code = '', FAILED

@@ -20,29 +20,19 @@ from drivers.made_up_driver import (
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from backlash_ros.core.driver_check.findings import (
-    FITS,
-    FLOAT64,
-    UNKNOWN,
-    WRONG,
-    Heard,
-    Message,
-    graph_findings,
-)
-from backlash_ros.core.driver_check.gentle_drive import (
-    GentleDrive,
-    IdentificationDrive,
-    Range,
-    drive_range,
-)
-from backlash_ros.core.driver_check.verdict import all_fit, judge, similar_topics, table
+from backlash_ros.core.driver_check.drive import Drive, Range, drive_range, waves
+from backlash_ros.core.driver_check.evidence import Evidence
+from backlash_ros.core.driver_check.faults import FLOAT64, UNKNOWN, all_fit, judge, table
+from backlash_ros.core.driver_check.heard import Heard, Message
+from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.nodes.drive.driver_graph import similar_topics
 
 
 def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
-    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters()))
+    findings = judge(Evidence(GOOD_GRAPH, heard_from_driver(), Parameters(parameters())))
     assert all_fit(findings), table(findings)
     told = findings[-1].found
     values = [float(part.split(' = ')[1].split(' ±')[0]) for part in told.split(', ')]
@@ -66,14 +56,12 @@ def test_a_fault_in_the_graph_is_the_only_one_told(graph, subject, word) -> None
 
 def test_best_effort_is_fine_where_the_controller_accepts_it() -> None:
     graph = replace(GOOD_GRAPH, best_effort=True)
-    assert [f.mark for f in graph_findings(graph, True)] == [FITS] * 3
-    assert WRONG in [f.mark for f in graph_findings(graph, False)]
+    assert faults(heard_from_driver(), graph, io__best_effort=True) == []
 
 
 def test_nothing_is_judged_from_the_mixture_of_two_publishers() -> None:
-    findings = judge(
-        replace(GOOD_GRAPH, publishers=2), heard_from_driver(), Parameters(parameters())
-    )
+    findings = judge(Evidence(
+        replace(GOOD_GRAPH, publishers=2), heard_from_driver(), Parameters(parameters())))
     assert {f.mark for f in findings if f.subject in ('rate', 'G(z)', 'values')} == {UNKNOWN}
     assert not all_fit(findings)
 
@@ -214,9 +202,8 @@ def test_applied_control_that_leaves_samples_out_is_told(use: str) -> None:
 @pytest.mark.parametrize('ratio', [0.8, 1.2])
 def test_a_model_that_is_off_by_a_fifth_fits_and_the_finding_says_how_far(ratio: float) -> None:
     numerator, denominator = model(ratio * PERIOD_S)  # the same as another natural frequency
-    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters(
-        plant__numerator=numerator, plant__denominator=denominator,
-    )))
+    findings = judge(Evidence(GOOD_GRAPH, heard_from_driver(), Parameters(parameters(
+        plant__numerator=numerator, plant__denominator=denominator))))
     assert all_fit(findings), table(findings)
     found = next(f.found for f in findings if f.subject == 'G(z)')
     told, true = TransferFunction(numerator, denominator), TransferFunction(*model())
@@ -230,14 +217,14 @@ def test_a_model_that_is_off_by_a_fifth_fits_and_the_finding_says_how_far(ratio:
 
 @given(
     st.floats(-20.0, 5.0), st.floats(0.1, 30.0), st.floats(0.1, 200.0), st.floats(-3.0, 3.0),
-    st.sampled_from([GentleDrive, IdentificationDrive]),
+    st.sampled_from([waves, strokes]),
 )
 @example(-15.983699780621828, 29.100769855162365, 103.26211025102096, -2.3048063251753783,
-         IdentificationDrive)
+         strokes)
 def test_a_drive_keeps_its_limits_and_comes_to_rest(low, width, rate, start, kind) -> None:
     limits = Range(low, low + width, rate)
     start = min(max(start, limits.low), limits.high)
-    drive = kind(limits, 0.01, 2.0, start)
+    drive = Drive(kind, limits, 0.01, 2.0, start)
     path = [start] + [drive.step() for _ in range(200)]
     for _ in range(100_000):
         done = drive.step_to_rest()

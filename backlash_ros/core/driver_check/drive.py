@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import inf, pi, sin
 
-from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 
@@ -23,6 +22,10 @@ class Range:
     def rest(self) -> float:
         """Where v ends: 0, or the limit next to it."""
         return min(max(0.0, self.low), self.high)
+
+
+# Low, high, rate of a Range, sample period [s], duration [s] and first v of a motion to its v(k).
+Motion = Callable[[float, float, float, float, float, float], Iterator[float]]
 
 
 def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> Range:
@@ -47,57 +50,41 @@ def drive_range(p: Parameters, amplitude: float | None, rate: float | None) -> R
     return Range(low, high, speed)
 
 
-class Drive(ABC):
-    """v(k) from one sample to the next within limits."""
+class Drive:
+    """v(k) from one sample to the next along a motion, within limits."""
 
-    def __init__(self, limits: Range, sample_period: float, duration: float, v: float = 0.0,
-                 ) -> None:
+    def __init__(
+        self, motion: Motion, limits: Range, sample_period: float, duration: float, v: float = 0.0,
+    ) -> None:
         self.limits, self.v = limits, v
-        self._sample_period, self._duration = sample_period, duration
+        self._move = limits.rate * sample_period
+        self._motion = motion(limits.low, limits.high, limits.rate, sample_period, duration, v)
 
-    @abstractmethod
     def step(self) -> float:
         """The next v."""
+        return self._towards(next(self._motion))
 
     def step_to_rest(self) -> bool:
         """Move v towards rest; return whether it has got there."""
         return self._towards(self.limits.rest) == self.limits.rest
 
     def _towards(self, target: float) -> float:
-        move = self.limits.rate * self._sample_period
-        self.v = min(max(target, self.v - move), self.v + move)
+        self.v = min(max(target, self.v - self._move), self.v + self._move)
         return self.v
 
 
-class GentleDrive(Drive):
-    """To and fro along two sines."""
-
-    _t = 0.0
-
-    def step(self) -> float:
-        """The next v, towards the wave."""
-        low, high = self.limits.low, self.limits.high
-        half = 0.5 * (high - low)
-        # Together they tell a delay from a wider gap; three periods of the slower one.
-        share, faster = 0.3, 2.7
-        steepest = 1.0 - share + share * faster
-        x = min(6.0 * pi / self._duration, self.limits.rate / (half * steepest)) * self._t
-        target = 0.5 * (low + high) + half * (
-            (1.0 - share) * sin(x) + share * sin(faster * x))
-        # The wave waits where v has not got to its beginning yet.
-        if self._towards(target) == target:
-            self._t += self._sample_period
-        return self.v
-
-
-class IdentificationDrive(Drive):
-    """Strokes of several speeds and amplitudes, with rests, as core/identification has them."""
-
-    def __init__(self, limits: Range, sample_period: float, duration: float, v: float = 0.0,
-                 ) -> None:
-        super().__init__(limits, sample_period, duration, v)
-        self._strokes = strokes(limits.low, limits.high, limits.rate, sample_period, duration, v)
-
-    def step(self) -> float:
-        """The next v."""
-        return self._towards(next(self._strokes))
+def waves(
+    low: float, high: float, rate: float, period: float, duration: float, v: float,
+) -> Iterator[float]:
+    """To and fro along two sines from the middle of the range on, as soon as v has got there."""
+    middle, half, move = 0.5 * (low + high), 0.5 * (high - low), rate * period
+    while abs(v - middle) > move:
+        v += move if v < middle else -move
+        yield v
+    # Together they tell a delay from a wider gap; three periods of the slower one.
+    share, faster = 0.3, 2.7
+    x, step = 0.0, period * min(
+        6.0 * pi / duration, rate / (half * (1.0 - share + share * faster)))
+    while True:
+        yield middle + half * ((1.0 - share) * sin(x) + share * sin(faster * x))
+        x += step

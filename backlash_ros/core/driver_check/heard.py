@@ -1,0 +1,128 @@
+"""What was heard of a driver: messages, the ROS graph, and its samples, counted.
+
+Pure: no ROS in here, so that every judgement can be tried on made-up messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
+
+FEWEST_SAMPLES = 20  # for a judgement of the timing
+MOST_LATE = 0.5  # of a period: beyond 0.85 the controller takes it for a loss
+
+
+class Message(NamedTuple):
+    """A number on a topic, when it left and arrived [ns], and its number in the sequence."""
+
+    value: float
+    stamp_ns: int
+    received_ns: int
+    number: int
+
+
+@dataclass
+class Graph:
+    """What the ROS graph says about the topics of the driver.
+
+    publishers: of plant_output. types: of plant_output. listeners: of control, without the
+    tools of this package. misfits: reasons why messages cannot pass, from QoS.
+    best_effort: whether plant_output is published without guarantee. near_control: subscribed
+    topics of a name like control.
+    """
+
+    publishers: int = 0
+    types: tuple[str, ...] = ()
+    listeners: int = 0
+    misfits: tuple[str, ...] = ()
+    best_effort: bool = False
+    near_control: tuple[str, ...] = ()
+
+
+@dataclass
+class Heard:
+    """Messages of the three topics, and when listening ended [ns]."""
+
+    outputs: list[Message] = field(default_factory=list)
+    controls: list[Message] = field(default_factory=list)
+    applied: list[Message] = field(default_factory=list)
+    end_ns: int = 0
+
+
+class Timing(NamedTuple):
+    """Samples without repetitions: their messages, their count from 0, and the period found.
+
+    repeated: with the value of the one before. early: with another value, but long before they were
+    due. lateness: of a period, exceeded by 1 % of the samples. fits: the period is the one of the
+    parameters.
+    """
+
+    outputs: list[Message]
+    numbers: NDArray[np.int64]
+    period_s: float
+    missing: int
+    repeated: int
+    early: int
+    lateness: float
+    fits: bool
+
+
+def timing_of(heard: Heard, sample_period_s: float) -> Timing:
+    """Sort out what came twice or early, and count the samples; none where they are too few."""
+    outputs, repeated = _without_doubles(heard.outputs, sample_period_s)
+    if len(outputs) < FEWEST_SAMPLES:
+        return Timing([], np.zeros(0, dtype=np.int64), sample_period_s, 0, repeated, 0, 0.0, True)
+    rough = max(float(np.median(np.diff(stamps_of(outputs)))), 1.0)
+    counter = SampleCounter(rough * 1e-9)
+    index, missing, samples = [], 0, []
+    for message in outputs:
+        arrival = counter.count(message.stamp_ns, message.number)
+        if arrival.is_sample:
+            missing += arrival.missing
+            index.append(counter.index)
+            samples.append(message)
+    times = (stamps_of(samples) - samples[0].stamp_ns) * 1e-9
+    numbers = np.array(index, dtype=np.int64) - index[0]
+    slope, offset = np.polyfit(numbers, times, 1)
+    late = times - slope * numbers - offset
+    lateness = float(np.quantile(late, 0.99) - np.quantile(late, 0.01)) / float(slope)
+    # A driver that fell silent for good loses samples as well.
+    missing += max(int((heard.end_ns - samples[-1].stamp_ns) / rough) - 1, 0)
+    # Amid bursts the samples cannot be counted for certain; most intervals tell the period still.
+    steady = lateness <= MOST_LATE
+    period = float(slope) if steady else rough * 1e-9
+    return Timing(
+        samples, numbers, period, missing, repeated, len(outputs) - len(samples), lateness,
+        abs(period / sample_period_s - 1.0) <= (0.01 if steady else 0.1),
+    )
+
+
+def stamps_of(messages: Sequence[Message]) -> NDArray[np.int64]:
+    """When they left [ns]."""
+    return np.array([message.stamp_ns for message in messages], dtype=np.int64)
+
+
+def _without_doubles(
+    outputs: Sequence[Message], sample_period_s: float,
+) -> tuple[list[Message], int]:
+    """Without those that came again within a quarter of a period, and how many these were."""
+    kept = list(outputs[:1])
+    numbered_doubles = 0  # they must not look like gaps in the numbers
+    for message in outputs[1:]:
+        if message.number != UNNUMBERED:
+            message = message._replace(number=message.number - numbered_doubles)
+        before = kept[-1]
+        again = message.value == before.value or message.number == before.number != UNNUMBERED
+        if not again or message.stamp_ns - before.stamp_ns > 0.25 * sample_period_s * 1e9:
+            kept.append(message)
+        elif message.number != before.number:
+            numbered_doubles += 1
+    repeated = len(outputs) - len(kept)
+    # A larger share of equal values is a plant at rest.
+    return (list(outputs), 0) if repeated > 0.6 * len(outputs) else (kept, repeated)
