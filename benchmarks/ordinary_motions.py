@@ -16,7 +16,7 @@ import re
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from math import pi
 from pathlib import Path
@@ -35,7 +35,6 @@ from scipy.signal import cont2discrete
 from backlash_ros.core import Parameters, Status, build_closed_loop
 
 Array = NDArray[np.float64]
-Motion = Callable[[np.random.Generator, float, float], Array]
 
 CORNER, DAMPING = 2.0 * pi * 20.0, 0.5  # of the load in config/geared_motor.yaml [rad/s]
 AMPLITUDE = 0.5  # of y_m [rad]
@@ -53,44 +52,60 @@ PLANTS: dict[str, dict[str, object]] = {
 }
 
 
-def periodic(shape: str, omega: float) -> Motion:
-    """Sine, triangle or square of AMPLITUDE at omega [rad/s], for five periods and a bit."""
-    def motion(rng: np.random.Generator, period_s: float, lost_motion: float) -> Array:
-        phase = omega * np.arange(0.0, max(5.3 * 2.0 * pi / omega, LEAST_S), period_s)
+@dataclass(frozen=True)
+class Periodic:
+    """Sine, triangle or square at omega [rad/s], for five periods and a bit.
+
+    swing: from end to end, over the lost motion; None for that of AMPLITUDE.
+    """
+
+    shape: str
+    omega: float
+    swing: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes."""
+        return max(5.3 * 2.0 * pi / self.omega, LEAST_S)
+
+    def __call__(self, rng: np.random.Generator, period_s: float, lost_motion: float) -> Array:
+        phase = self.omega * np.arange(0.0, self.seconds, period_s)
         wave = np.sin(phase)
-        if shape == 'triangle':
+        if self.shape == 'triangle':
             wave = 2.0 / pi * np.arcsin(wave)
-        elif shape == 'square':
+        elif self.shape == 'square':
             wave = np.where(wave >= 0.0, 1.0, -1.0)
-        return np.asarray(AMPLITUDE * rng.choice([-1.0, 1.0]) * wave)
-    return motion
+        amplitude = AMPLITUDE if self.swing is None else 0.5 * self.swing * lost_motion
+        return np.asarray(amplitude * rng.choice([-1.0, 1.0]) * wave)
 
 
 @dataclass(frozen=True)
 class Moves:
     """Trapezoidal moves with rests between them.
 
-    speed [rad/s], acceleration [rad/s^2], rests: shortest and longest [s]. small: targets within
-    0.8 lost motions instead of 1 rad. one_way: three to five moves ahead, then a short one back.
+    speed [rad/s], acceleration [rad/s^2], rests: shortest and longest [s]. reach: of the targets to
+    both sides, over the lost motion; None for 1 rad. one_way: three to five moves ahead, then a
+    short one back.
     """
 
     seconds: float
     speed: float
     acceleration: float
     rests: tuple[float, float]
-    small: bool = False
+    reach: float | None = None
     one_way: bool = False
+    omega = 0.0
 
     def __call__(self, rng: np.random.Generator, period_s: float, lost_motion: float) -> Array:
         pieces, x, length, ahead = [np.zeros(1)], 0.0, 1, 0
+        reach = self.reach * lost_motion if self.reach else 0.5 if self.one_way else 1.0
         while length * period_s < self.seconds:
             if self.one_way:
                 back = ahead == 0
                 ahead = int(rng.integers(3, 6)) if back else ahead - 1
                 goal = x + (-lost_motion * rng.uniform(1.2, 3.0) if back and length > 1
-                            else rng.uniform(0.1, 0.4))
+                            else rng.uniform(0.2, 0.8) * reach)
             else:
-                reach = 0.8 * lost_motion if self.small else 1.0
                 goal = rng.uniform(-reach, reach)
             move = x + np.sign(goal - x) * self._way(abs(goal - x), period_s)
             x = goal
@@ -110,15 +125,16 @@ class Moves:
             left < ramp, distance - 0.5 * self.acceleration * left**2, way))
 
 
+Motion = Periodic | Moves
 MOTIONS: dict[str, Motion] = {
-    **{f'sine {w:g} rad/s': periodic('sine', w) for w in (0.2, 0.5, 1.0, 2.0)},
-    **{f'triangle {w:g} rad/s': periodic('triangle', w) for w in (0.5, 1.0)},
-    'square 1 rad/s': periodic('square', 1.0),
+    **{f'sine {w:g} rad/s': Periodic('sine', w) for w in (0.2, 0.5, 1.0, 2.0)},
+    **{f'triangle {w:g} rad/s': Periodic('triangle', w) for w in (0.5, 1.0)},
+    'square 1 rad/s': Periodic('square', 1.0),
     'moves, rests 0.5 to 1.5 s': Moves(45.0, 1.0, 5.0, (0.5, 1.5)),
     'slow moves, rests 1 to 3 s': Moves(90.0, 0.3, 1.0, (1.0, 3.0)),
     'fast moves, rests 3 to 8 s': Moves(100.0, 2.0, 20.0, (3.0, 8.0)),
     'moves, rests 10 to 20 s': Moves(250.0, 1.0, 5.0, (10.0, 20.0)),
-    'small moves, rests 0.2 to 0.6 s': Moves(30.0, 0.3, 3.0, (0.2, 0.6), small=True),
+    'small moves, rests 0.2 to 0.6 s': Moves(30.0, 0.3, 3.0, (0.2, 0.6), reach=0.8),
     'one-way moves, rests 0.5 to 1.5 s': Moves(90.0, 1.0, 5.0, (0.5, 1.5), one_way=True),
 }
 RATES = (200.0, 50.0, 1000.0)  # [Hz]; all combinations at the first, some at the others
@@ -129,12 +145,17 @@ AT_OTHER_RATES = (
 
 @dataclass(frozen=True)
 class Case:
-    """One run: a motion, what the true plant differs in, a rate [Hz] and a seed."""
+    """One run: a motion, what the true plant differs in, a rate [Hz] and a seed.
+
+    shape, differs: the motion and the parameters that these words stand for.
+    """
 
     motion: str
     plant: str
     rate: float
     seed: int
+    shape: Motion
+    differs: Mapping[str, object]
 
     @property
     def name(self) -> str:
@@ -174,12 +195,22 @@ class Result:
     @property
     def good(self) -> bool:
         """Whether it is as due: in time, close or honest about it, and never wrong."""
-        if self.first is None or self.rms is None or self.beyond is None:
-            return False
+        return not self.faults
+
+    @property
+    def faults(self) -> list[str]:
+        """What is not as due."""
         honest = self.std_five is not None and self.std_five < 0.03 \
             and self.at_five <= 3.0 * self.std_five
-        return bool(self.first <= IN_TIME and (self.at_five <= CLOSE or honest)
-                    and not self.wrong and self.beyond <= 0.02)
+        found = {
+            'never tracking': self.first is None,
+            'late': self.first is not None and self.first > IN_TIME,
+            'far': self.first is not None and self.at_five > CLOSE and not honest,
+            'beyond five deviations': (self.beyond or 0.0) > 0.02, 'wrong': bool(self.wrong),
+            'inconsistent': self.shares.get('inconsistent', 1.0) > 0.01,
+            'broke off': bool(self.problem),
+        }
+        return [name for name, there in found.items() if there]
 
 
 def all_cases(seeds: Sequence[int]) -> Iterator[Case]:
@@ -188,7 +219,51 @@ def all_cases(seeds: Sequence[int]) -> Iterator[Case]:
         motions, plants = (MOTIONS, PLANTS) if rate == RATES[0] else AT_OTHER_RATES
         for motion in motions:
             for plant in plants:
-                yield from (Case(motion, plant, rate, seed) for seed in seeds)
+                yield from (Case(motion, plant, rate, seed, MOTIONS[motion], PLANTS[plant])
+                           for seed in seeds)
+
+
+def random_cases(count: int, seed: int, samples: int) -> Iterator[Case]:
+    """Motions and plants drawn from all that is ordinary; samples: of the longest run."""
+    made = 0
+    while count:
+        made += 1
+        rng = np.random.default_rng([seed, made, 14])
+        rate = float(50.0 * 20.0 ** rng.uniform())
+        omega = float(0.02 * 1e3 ** rng.uniform())
+        swing = float(1.2 * (100.0 / 1.2) ** rng.uniform())
+        kind = str(rng.choice(['sine', 'triangle', 'square', 'moves', 'one-way'],
+                              p=[0.2, 0.15, 0.1, 0.4, 0.15]))
+        differs = {
+            'truth.scale_frequency': round(rng.uniform(0.85, 1.15), 3),
+            'truth.extra_lag': round(rng.uniform(0.0, 0.01), 4), 'truth.delay_samples': 1,
+            'input_disturbance': round(rng.uniform(-0.06, 0.06), 3),
+        }
+        differs = {name: value for name, value in differs.items() if rng.uniform() < 0.5}
+        rests = (0.0, 0.0)
+        if rng.uniform() < 0.8:
+            longest = float(0.2 * 100.0 ** rng.uniform())
+            rests = (longest * float(rng.uniform(0.1, 0.5)), longest)
+        backlash = random_backlash(made + 1000 * seed)
+        gap = backlash['backlash.c_r'] - backlash['backlash.c_l']
+        way = 0.5 * swing * backlash['backlash.m'] * gap  # of an average move [rad]
+        speed, turn_s = 1.3 * way * omega / pi, pi / omega  # 30 % of a move is acceleration
+        shape: Motion
+        if kind in ('moves', 'one-way'):
+            each = turn_s + 0.5 * sum(rests)
+            shape = Moves((35.0 if kind == 'one-way' else 22.0) * each, 2.0 * speed,
+                          6.0 * speed / turn_s, rests, swing / 2.0, kind == 'one-way')
+        else:
+            shape = Periodic(kind, omega, swing)
+        # As fast as the motor turns, and no longer than asked for.
+        if 0.5 * swing * gap * omega > 200.0 or shape.seconds * rate > samples:
+            continue
+        count -= 1
+        words = f'{kind} {omega:.2g} rad/s, swing {swing:.2g}'
+        if kind in ('moves', 'one-way'):
+            words += f', rests to {rests[1]:.2g} s'
+        plant = ', '.join(f'{name.split(".")[-1]} {value}' for name, value in differs.items())
+        yield Case(words, plant or 'exact', rate, made + 1000 * seed, shape, differs)
 
 
 def run_case(case: Case) -> Result:
@@ -198,7 +273,7 @@ def run_case(case: Case) -> Result:
     gap = backlash['backlash.c_r'] - backlash['backlash.c_l']
     lost_motion = backlash['backlash.m'] * gap
     rng = np.random.default_rng([case.seed, 13])
-    y_m = MOTIONS[case.motion](rng, period, lost_motion)
+    y_m = case.shape(rng, period, lost_motion)
     numerator, denominator, _ = cont2discrete(
         ([CORNER**2], [1.0, 2.0 * DAMPING * CORNER, CORNER**2]), period)
     with tempfile.TemporaryDirectory() as folder:
@@ -206,7 +281,7 @@ def run_case(case: Case) -> Result:
         rows = (f'{k * period:.6f},{value:.9g}' for k, value in enumerate(y_m))
         file.write_text('\n'.join(['t,y_m', *rows]))
         p = Parameters({
-            **motor(), **backlash, **PLANTS[case.plant], 'seed': case.seed,
+            **motor(), **backlash, **case.differs, 'seed': case.seed,
             'sample_period': period, 'plant.numerator': numerator[0, 1:].tolist(),
             'plant.denominator': denominator.tolist(), 'waveform': 'file', 'file': str(file),
             # A way that is longer than that of the example.
@@ -230,7 +305,7 @@ def _key(case: Case) -> tuple[str, str, float, int]:
 
 
 def _result(case: Case, y_m: Array, run: Judged, ms: float) -> Result:
-    reversals, tracking, omega = reversals_of(y_m), run.tracking, _omega(case.motion)
+    reversals, tracking, omega = reversals_of(y_m), run.tracking, case.shape.omega
     five = int(np.argmax(reversals >= FIVE_PERIODS)) or len(y_m) - 1
     if omega:
         five = min(round(5 * 2 * pi * case.rate / omega), len(y_m) - 1)
@@ -247,12 +322,6 @@ def _result(case: Case, y_m: Array, run: Judged, ms: float) -> Result:
         std if np.isfinite(std) else None, run.rms, run.beyond, run.wrong_if_tracking,
         {word.word: float(np.mean(run.status == word)) for word in Status}, ms,
     )
-
-
-def _omega(motion: str) -> float:
-    """Frequency of a periodic motion [rad/s], 0 for another one."""
-    found = re.search(r'([\d.]+) rad/s', motion)
-    return float(found[1]) if found else 0.0
 
 
 def reversals_of(y_m: Array) -> NDArray[np.int_]:
@@ -321,6 +390,9 @@ def main() -> int:
                         help='cases in whose name each of these is found')
     parser.add_argument('--seeds', type=int, default=1)
     parser.add_argument('--first-seed', type=int, default=FIRST_SEED)
+    parser.add_argument('--random', type=int, metavar='N',
+                        help='so many cases drawn from all that is ordinary by the first seed')
+    parser.add_argument('--samples', type=int, default=60_000, help='of the longest of these')
     parser.add_argument('--workers', type=int, default=1, help='processes, default 1')
     parser.add_argument('--by', choices=('case', 'motion', 'plant'), default='case',
                         help='what a row of the table is')
@@ -328,7 +400,9 @@ def main() -> int:
     parser.add_argument('--out', type=Path, default=ROOT / 'results' / 'ordinary_motions.json')
     arguments = parser.parse_args()
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-    cases = [case for case in all_cases(seeds)
+    drawn = random_cases(arguments.random, arguments.first_seed, arguments.samples) \
+        if arguments.random else all_cases(seeds)
+    cases = [case for case in drawn
              if all(re.search(word, case.name) for word in arguments.cases)]
     if not cases:
         parser.error(f'--cases {" ".join(arguments.cases)}: no case has such a name; see --list')
@@ -344,8 +418,9 @@ def main() -> int:
         groups.setdefault(label(case), []).append(result)
     print(text_table(HEADER, [row(*group) for group in [*groups.items(), ('all', results)]]))
     for result in results:
-        if result.problem:
-            print(f'    {result.motion}; {result.plant}, seed {result.seed}: {result.problem}')
+        if result.faults:
+            print(f'    {result.motion}; {result.plant}; {result.rate:g} Hz, seed {result.seed}: '
+                  f'{", ".join(result.faults)} {result.problem}')
     arguments.out.parent.mkdir(parents=True, exist_ok=True)
     arguments.out.write_text(json.dumps([asdict(r) for r in results], indent=1) + '\n')
     print(f'wrote {arguments.out}')

@@ -1,20 +1,21 @@
 """The linear plants that G(z) may be: G(z; xi), with exact gain at rest.
 
-    G(z; xi) = z^-d ((1 - f) + f z^-1) [B + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
+    G(z; xi) = z^-d [B (1 - f + f z^-1) + xi_w w (1 - z^-1)^2 B'] A(1)/A_nominal(1) / (A I)
 
 xi (K,) are the unknowns in units of their prior deviations: where G integrates, the leak of an
-integrator; the lag (d + f samples beside the nominal delay), the width of the response, and
-ln Omega, ln D of every section s^2 + 2 D Omega s + Omega^2 of two poles (a real pair is D >= 1, so
-that there is no edge), ln of a single real pole. The gain at rest stays in the slope m.
+integrator; the lag (d + f samples beside the nominal delay, d whole), the width of the response,
+and ln Omega, ln D of every section s^2 + 2 D Omega s + Omega^2 of two poles (a real pair is D >= 1,
+so that there is no edge), ln of a single real pole. The gain at rest stays in the slope m.
 
 What acts a part t of a sample late has the lag t and the width -t (1 - t) / 2: B' is B one sample
-shorter, and w = 1/8 the widest. Poles at 0, on the negative axis or outside of the unit circle
-stay where they are.
+shorter, and w = 1/8 the widest. With two poles, lag and width make every numerator that a dead time
+or another Omega can give. Poles at 0, on the negative axis or outside of the unit circle stay where
+they are.
 """
 
 from __future__ import annotations
 
-from math import cos, cosh, exp, floor, log, sqrt
+from math import cos, cosh, exp, floor, inf, log, sin, sinh, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,21 +52,28 @@ class PlantFamily:
         self._integrators = int(integrators.sum())
         self._fixed: list[float] = np.real(np.poly(poles[fixed])).tolist() if fixed.any() else [1.0]
         self._pairs, self._nominal = _sections(poles[moving])
-        a = self._stable(self._nominal)
+        a = _product(*(section for section, _ in self._sections_at(self._nominal)))
         self._gain = sum(a)
         late = max(self._delay + _mean(b.tolist()) - _mean(a), 1.0)
         self._scales: list[float] = []
+        self._limits: list[float] = []  # of what is moved by xi
         if uncertainty > 0.0:
+            # A leak of 0.1 a sample, a lag of 40 samples, a factor of 20 on Omega and D.
             leak = [LEAK * uncertainty] if self._integrators else []
             self._scales = [
                 *leak, uncertainty * late, widest, *([uncertainty] * len(self._nominal))
             ]
+            self._limits = [*([0.1] * len(leak)), 40.0, inf, *([3.0] * len(self._nominal))]
         self.leaks = int(bool(self._scales) and self._integrators > 0)
         self.count = len(self._scales)
         self.integrates = self._integrators > 0
         shorter = np.atleast_1d(np.poly([-1.0] * max(len(b) - 2, 0)))
         wide = np.convolve(shorter * b.sum() / shorter.sum(), [1.0, -2.0, 1.0])
-        self._b, self._wide = b.tolist(), wide.tolist()
+        self._b, later, self._wide = (
+            np.pad(taps, (0, max(len(b) + 1, 3) - len(taps))).tolist()
+            for taps in (b, np.append(0.0, b), wide)
+        )
+        self._move = [x - y for x, y in zip(later, self._b, strict=True)]
         slowest = max((abs(pole) for pole in poles[moving]), default=0.0)
         self.memory = memory_of(slowest)
 
@@ -75,32 +83,12 @@ class PlantFamily:
         y(k) is the output after the interval over which u(k) acted, so that b_0 is what acts with
         the smallest delay there is.
         """
-        most_leak = 0.1  # per sample
-        furthest = 3.0  # by which ln Omega and ln D may be off, at most
-        latest = 40.0  # samples of lag, at most
-        lag = width = leak = 0.0
-        logs = self._nominal
-        if self.count:
-            moved = [x * scale for x, scale in zip(xi, self._scales, strict=True)]
-            if self.leaks:
-                leak = min(max(moved.pop(0), -most_leak), most_leak)
-            lag, width, *apart = moved
-            logs = [
-                x + min(max(dx, -furthest), furthest) for x, dx in zip(logs, apart, strict=True)
-            ]
-        a = self._stable(logs)
-        lag = min(max(lag, -latest), latest)
-        whole = max(floor(lag), 1 - self._delay)
-        late, gain = [1.0 - lag + whole, lag - whole], sum(a) / self._gain
-        b, wide = _product(self._b, late), _product(self._wide, late)
-        b += [0.0] * (len(wide) - len(b))
-        wide += [0.0] * (len(b) - len(wide))
-        b = [0.0] * (self._delay + whole - 1) + [
-            gain * (x + width * y) for x, y in zip(b, wide, strict=True)
-        ]
-        a = _product(a, self._fixed)
-        for i in range(self._integrators):
-            a = _product(a, [1.0, -1.0 + (leak if i == 0 else 0.0)])
+        leak, lag, width, logs = self._moved(xi)
+        stable = _product(*(section for section, _ in self._sections_at(logs)))
+        gain, rest = sum(stable) / self._gain, self._rest([1.0, -1.0 + leak])
+        whole, taps = self._taps(lag, width)
+        b = [0.0] * (self._delay + whole - 1) + [gain * tap for tap in taps]
+        a = _product(stable, rest)
         while not self.count and not b[-1]:  # the same length at every xi, where there are any
             b.pop()
         length = max(len(a), len(b))
@@ -108,23 +96,57 @@ class PlantFamily:
 
     def slopes(self, xi: list[float]) -> tuple[Array, Array]:
         """Derivatives of b and a by each xi, both of shape (K, n + 1)."""
-        slope_step = 1e-5  # of xi, for the derivatives of the coefficients
-        rows = []
-        for j in range(self.count):
-            ends = []
-            for step in (slope_step, -slope_step):
-                moved = list(xi)
-                moved[j] += step
-                ends.append(self.at(moved))
-            rows.append(ends)
-        length = max((len(b) for ends in rows for b, _ in ends), default=1)
-        out = np.zeros((2, self.count, length))
-        for j, ((b1, a1), (b0, a0)) in enumerate(rows):
-            for part, above, below in ((0, b1, b0), (1, a1, a0)):
-                out[part, j, :len(above)] += above
-                out[part, j, :len(below)] -= below
-        out /= 2.0 * slope_step
+        leak, lag, width, logs = self._moved(xi)
+        sections = self._sections_at(logs)
+        stable = _product(*(section for section, _ in sections))
+        gain, rest = sum(stable) / self._gain, self._rest([1.0, -1.0 + leak])
+        whole, taps = self._taps(lag, width)
+        rows: list[tuple[list[float], list[float]]] = []  # b without its first zeros, and a
+        if self.leaks:
+            rows.append(([], _product(stable, self._rest([0.0, 1.0]))))
+        rows += [([gain * x for x in of_b], []) for of_b in (self._move, self._wide)]
+        for i, (_, slopes) in enumerate(sections):
+            others = [section for k, (section, _) in enumerate(sections) if k != i]
+            for slope in slopes:
+                moved = _product(slope, *others)
+                of_gain = sum(moved) / self._gain
+                rows.append(([of_gain * tap for tap in taps], _product(moved, rest)))
+        zeros = self._delay + whole - 1
+        out = np.zeros((2, self.count, max(zeros + len(taps), len(stable) + len(rest) - 1)))
+        for j, (of_b, of_a) in enumerate(rows[:self.count]):
+            free = abs(xi[j] * self._scales[j]) < self._limits[j]
+            out[0, j, zeros:zeros + len(of_b)] = of_b
+            out[1, j, :len(of_a)] = of_a
+            out[:, j] *= self._scales[j] * free
         return out[0], out[1]
+
+    def _moved(self, xi: list[float]) -> tuple[float, float, float, list[float]]:
+        """Leak, lag and width, and ln Omega, ln D of pairs, ln of the rest."""
+        if not self.count:
+            return 0.0, 0.0, 0.0, self._nominal
+        moved = [
+            min(max(x * scale, -limit), limit)
+            for x, scale, limit in zip(xi, self._scales, self._limits, strict=True)
+        ]
+        leak = moved.pop(0) if self.leaks else 0.0
+        return leak, moved[0], moved[1], [
+            x + apart for x, apart in zip(self._nominal, moved[2:], strict=True)
+        ]
+
+    def _taps(self, lag: float, width: float) -> tuple[int, list[float]]:
+        """Whole samples of the lag, and the numerator beside them, with the nominal gain."""
+        whole = max(floor(lag), 1 - self._delay)
+        part = lag - whole
+        return whole, [
+            x + part * dx + width * y
+            for x, dx, y in zip(self._b, self._move, self._wide, strict=True)
+        ]
+
+    def _rest(self, integrator: list[float]) -> list[float]:
+        """Denominator of the poles that do not move but for a leak, the first integrator given."""
+        if not self._integrators:
+            return self._fixed
+        return _product(self._fixed, integrator, *([[1.0, -1.0]] * (self._integrators - 1)))
 
     def model_at(self, xi: list[float]) -> TransferFunction:
         """G(z; xi) as a transfer function."""
@@ -146,20 +168,23 @@ class PlantFamily:
         slopes = powers[:, :db.shape[1]]
         return np.asarray(slopes @ db.T / of_b[:, None] - slopes @ da.T / of_a[:, None])
 
-    def _stable(self, logs: list[float]) -> list[float]:
-        """Denominator of the poles that may move, from ln Omega, ln D of pairs, ln of the rest."""
-        a = [1.0]
+    def _sections_at(self, logs: list[float]) -> list[tuple[list[float], list[list[float]]]]:
+        """Denominators of the poles that may move, each with its derivatives by its logs."""
+        out = []
         for i in range(self._pairs):
             omega, damping = exp(logs[2 * i]), exp(logs[2 * i + 1])
-            r = exp(-omega * damping)
-            if damping < 1.0:
-                middle = cos(omega * sqrt(1.0 - damping * damping))
-            else:
-                middle = cosh(omega * sqrt(damping * damping - 1.0))
-            a = _product(a, [1.0, -2.0 * r * middle, r * r])
+            r, square = exp(-omega * damping), omega * omega * (1.0 - damping * damping)
+            angle = sqrt(abs(square))
+            middle, sinc = (cos(angle), sin(angle)) if square > 0.0 else (cosh(angle), sinh(angle))
+            sinc = sinc / angle if angle > 1e-9 else 1.0
+            shrink, turns = -omega * damping, (-sinc * square, sinc * (omega * damping) ** 2)
+            out.append(([1.0, -2.0 * r * middle, r * r], [
+                [0.0, -2.0 * r * (shrink * middle + turn), 2.0 * shrink * r * r] for turn in turns
+            ]))
         for value in logs[2 * self._pairs:]:
-            a = _product(a, [1.0, -exp(-exp(value))])
-        return a
+            pole = exp(-exp(value))
+            out.append(([1.0, -pole], [[0.0, exp(value) * pole]]))
+        return out
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
@@ -174,13 +199,16 @@ def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:
     return len(pairs), [log(q) for pair in pairs for q in pair] + [log(q) for q in real]
 
 
-def _product(x: list[float], y: list[float]) -> list[float]:
-    """Coefficients of the product of two polynomials: for so few, faster than np.convolve."""
-    out = [0.0] * (len(x) + len(y) - 1)
-    for i, p in enumerate(x):
-        for j, q in enumerate(y):
-            out[i + j] += p * q
-    return out
+def _product(*factors: list[float]) -> list[float]:
+    """Coefficients of a product of polynomials: for so few, faster than np.convolve."""
+    product = [1.0]
+    for factor in factors:
+        out = [0.0] * (len(product) + len(factor) - 1)
+        for i, x in enumerate(product):
+            for j, y in enumerate(factor):
+                out[i + j] += x * y
+        product = out
+    return product
 
 
 def _mean(taps: list[float]) -> float:
