@@ -16,10 +16,8 @@ import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, NamedTuple
+from typing import Any
 
-from rclpy.client import Client
-from rclpy.task import Future
 from rclpy.utilities import remove_ros_args
 from rich import live as rich_live
 from rich.console import Console
@@ -34,7 +32,7 @@ from backlash_ros.topics import BACKLASH
 
 MONITOR = 'monitor'
 SCREEN_PERIOD_S = 0.2
-ANSWER_S = 5.0  # longest wait for a service
+ANSWER_S = 2.0  # longest wait for a service, and for its answer
 NOTICE_S = 3.0  # for which a notice is shown, and a second r resets
 
 
@@ -43,15 +41,6 @@ ACTIONS = {
     'f': ('freeze_adaptation', 'learning'), 'c': ('enable_compensation', 'compensating'),
     'r': ('reset_estimates', ''), 's': ('save_estimates', ''),
 }
-
-
-class Asked(NamedTuple):
-    """A call of a service. until_s: when the wait for it ends. then: the switches afterwards."""
-
-    answer: Future
-    until_s: float
-    state: ControllerState
-    then: dict[str, str]
 
 
 class MonitorNode(ProcessNode):
@@ -63,11 +52,9 @@ class MonitorNode(ProcessNode):
     def __init__(self, wanted: Sequence[str]) -> None:
         super().__init__(MONITOR)
         self._followed = FollowedControllers(self, wanted, BACKLASH, depth=1)
-        self._callers: dict[str, Client] = {}  # by the name of the service
         self._selected = 0
         self._notice, self._notice_ends_s = '', 0.0
         self._confirmed_until_s = 0.0  # a second r resets
-        self._pending: list[Asked] = []
 
     def work(self, executor: PromptExecutor) -> None:
         """Show controllers until a key or a signal ends it."""
@@ -108,8 +95,7 @@ class MonitorNode(ProcessNode):
                     executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
                     pressed = keys()
                 for key in pressed:
-                    self._on_key(key)
-                self._look_for_answers()
+                    self._on_key(key, executor)
 
     def _print_lines(self, executor: PromptExecutor) -> None:
         due_s = time.monotonic() + 1.0
@@ -124,14 +110,9 @@ class MonitorNode(ProcessNode):
     def _refresh(self) -> None:
         self._followed.take_diagnostics()
         for state in self._states:
-            for service, switch in ACTIONS.values():
-                # Here already: it takes a moment until a client has found its service.
-                name = f'{state.node}/{service}'
-                if name not in self._callers:
-                    self._callers[name] = self.create_client(SetBool if switch else Trigger, name)
             state.watch()
 
-    def _on_key(self, key: str) -> None:
+    def _on_key(self, key: str, executor: PromptExecutor) -> None:
         if key == 'q':
             signal.raise_signal(signal.SIGINT)
         elif key == '\t' and self._states:
@@ -143,39 +124,31 @@ class MonitorNode(ProcessNode):
             self._say(f'press r once more to reset the estimates of {name}')
         elif key in ACTIONS and self._states:
             self._confirmed_until_s = 0.0
-            self._call(self._states[self._selected], *ACTIONS[key])
+            self._call(executor, self._states[self._selected], *ACTIONS[key])
 
-    def _call(self, state: ControllerState, service: str, switch: str) -> None:
-        name = f'{state.node}/{service}'
-        client = self._callers[name]
-        if not client.service_is_ready():
-            self._say(f'{name} is not there')
-            return
-        on = not state.is_on(switch)
+    def _call(
+        self, executor: PromptExecutor, state: ControllerState, service: str, switch: str,
+    ) -> None:
+        """Call a service and show what it answers; the screen waits so long."""
+        name, on = f'{state.node}/{service}', not state.is_on(switch)
         request: Any = Trigger.Request()
         if switch:
             request = SetBool.Request(data=on if service == 'enable_compensation' else not on)
-        self._pending.append(Asked(
-            client.call_async(request), time.monotonic() + ANSWER_S, state,
-            {switch: str(on)} if switch else {},
-        ))
-        self._say(f'{name} ...')
-
-    def _look_for_answers(self) -> None:
-        for asked in list(self._pending):
-            if asked.answer.done():
-                response = asked.answer.result()
+        client = self.create_client(SetBool if switch else Trigger, name)
+        text = f'{name} is not there'
+        if client.wait_for_service(ANSWER_S):
+            text, until_s = f'no answer within {ANSWER_S:g} s', time.monotonic() + ANSWER_S
+            answer = client.call_async(request)
+            while not (answer.done() or self.stopping or time.monotonic() > until_s):
+                executor.spin_once(timeout_sec=SCREEN_PERIOD_S / 4)
+            if answer.done():
+                response = answer.result()
                 text = response.message
-                if response.success:
-                    # The next diagnostics may be a second away.
-                    asked.state.values |= asked.then
-            elif time.monotonic() > asked.until_s:
-                text = f'no answer within {ANSWER_S:g} s'
-            else:
-                continue
-            self._pending.remove(asked)
-            asked.state.note(text)
-            self._say(f'{asked.state.name}: {text}')
+                if switch and response.success:
+                    state.values[switch] = str(on)  # the next diagnostics may be a second away
+        self.destroy_client(client)
+        state.note(text)
+        self._say(f'{state.name}: {text}')
 
     def _say(self, text: str) -> None:
         self._notice, self._notice_ends_s = text, time.monotonic() + NOTICE_S

@@ -6,10 +6,10 @@ import argparse
 import signal
 import sys
 import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -60,50 +60,9 @@ class RecordedTopic:
     sequence: int = UNNUMBERED  # of the newest message
 
 
-class Progress:
-    """The newest rows, still serialised, and what they say of the run (of its first joint)."""
-
-    def __init__(self) -> None:
-        self._newest: dict[str, bytes] = {}
-        # The truth of a sample follows its signals by one sample.
-        self._signals: deque[bytes] = deque(maxlen=8)
-        self._first, self._rows = b'', 0
-
-    def take(self, topic: str, message: bytes) -> None:
-        """Remember a row of one of the array topics."""
-        self._newest[topic] = message
-        if topic == topics.SIGNALS:
-            self._first = self._first or message
-            self._signals.append(message)
-            self._rows += 1
-
-    def report(self) -> dict[str, object]:
-        """Content of a progress event, empty before the first sample."""
-        if not (topics.ESTIMATES in self._newest and self._signals):
-            return {}
-        first, *signals = (
-            _row(message, topics.SIGNAL_LABELS) for message in (self._first, *self._signals)
-        )
-        newest = signals[-1]
-        estimates = _row(self._newest[topics.ESTIMATES], topics.ESTIMATE_LABELS)
-        truth = _row(self._newest.get(topics.TRUTH), topics.TRUTH_LABELS)
-        same = [row for row in signals if row['sample'] == truth.get('sample')]
-        return {
-            'sample': int(min(newest['sample'], estimates['sample'])),
-            'status': int(newest['status']),
-            **{name: estimates[name] for name in (
-                'm', 'c_r', 'c_l', 'f', 'std_m', 'std_c_r', 'std_c_l',
-            )},
-            **{f'true_{name}': truth.get(name) for name in topics.BACKLASH},
-            'control_error': truth['u'] - same[0]['u_d'] if same else None,
-            'lost': int(newest['sample'] - first['sample']) + 1 - self._rows,
-        }
-
-
 def _row(message: bytes | None, labels: tuple[str, ...]) -> dict[str, float]:
-    if message is None:
-        return {}
-    return dict(zip(labels, deserialize_message(message, Float64MultiArray).data, strict=False))
+    data = deserialize_message(message, Float64MultiArray).data if message else ()
+    return dict(zip(labels, data, strict=False))
 
 
 class RecorderNode(ProcessNode):
@@ -121,7 +80,8 @@ class RecorderNode(ProcessNode):
         self._now_ns: int | None = 0 if p.lockstep else None  # simulated time
         self._bag: Bag | None = None
         self._channels: dict[str, RecordedTopic] = {}
-        self._progress = Progress()
+        self._newest: dict[str, bytes] = {}  # serialised, by topic
+        self._first_signals = b''
         if p.bag:
             self._bag = self._open_bag(p.bag, p.storage)
             self.log.info(f'started: records to {p.bag} ({p.storage})')
@@ -256,16 +216,30 @@ class RecorderNode(ProcessNode):
             stamp_ns = info['source_timestamp'] if self._now_ns is None else self._now_ns
             if self._with_bag(lambda bag: bag.write(connection, stamp_ns, message)):
                 channel.recorded += 1
-        self._progress.take(topic, message)
+        self._newest[topic] = message
+        if topic == topics.SIGNALS:
+            self._first_signals = self._first_signals or message
 
     def _on_clock(self, message: Clock) -> None:
         self._now_ns = stamp_ns_of(message)
 
     def _tell(self) -> None:
-        content = self._progress.report()
-        if content:
-            received = {topic: channel.received for topic, channel in self._channels.items()}
-            emit('progress', **content, received=received)
+        """Say how the run is going, of its first joint if it has several."""
+        newest = self._newest.get
+        signals = _row(newest(topics.SIGNALS), topics.SIGNAL_LABELS)
+        estimates = _row(newest(topics.ESTIMATES), topics.ESTIMATE_LABELS)
+        truth = _row(newest(topics.TRUTH), topics.TRUTH_LABELS)
+        received = {topic: channel.received for topic, channel in self._channels.items()}
+        first = _row(self._first_signals, topics.SIGNAL_LABELS).get('sample', nan)
+        # A joint that was not answered has nan for everything.
+        sample = min(signals.get('sample', nan), estimates.get('sample', nan))
+        if isfinite(sample) and isfinite(first):
+            emit(
+                'progress', sample=int(sample), received=received,
+                lost=int(signals['sample'] - first) + 1 - received[topics.SIGNALS],
+                **{name: estimates[name] for name in topics.BACKLASH},
+                **{f'true_{name}': truth.get(name) for name in topics.BACKLASH},
+            )
 
 
 def main(args: list[str] | None = None) -> int:

@@ -24,9 +24,8 @@ from backlash_ros.tools.runs.files import Run
 Array = NDArray[np.float64]
 # Messages of an array topic by label, shape (N,) each, and their `stamp` [ns] since the first.
 Table = dict[str, Array]
-Fields = dict[str, list[float]]  # of a LearnedModel
 
-# By which a topic is known whose node was renamed.
+# By which a topic is known, whatever its node is called.
 ARRAY_LABELS = {
     topics.SIGNALS: topics.SIGNAL_LABELS, topics.ESTIMATES: topics.ESTIMATE_LABELS,
     topics.TRUTH: topics.TRUTH_LABELS, topics.MODEL: ('numerator', 'denominator', 'delay_samples'),
@@ -132,26 +131,24 @@ def read_bag(
     content = read_topics(path, lambda topic: topic.name.rpartition('/')[2] in last_parts
                           and topic.message_type == 'std_msgs/msg/Float64MultiArray')
     try:
-        tables, models, notes = _find_tables(path, content, axis)
-    except InputError as error:
-        raise InputError(f'{error}; {content.damage}' if content.damage else str(error)) from None
-    restarted = _choose_section(tables, span)
-    signals, estimates, truth = tables
-    if not signals['stamp'].size:
-        raise InputError(f'{path}: holds no sample between --from and --to')
-    count, of_signals, of_estimates = np.intersect1d(
-        signals['sample'], estimates['sample'], assume_unique=True, return_indices=True
-    )
-    if count.size == 0:
-        raise InputError(f'{path}: no sample has both {topics.SIGNALS} and {topics.ESTIMATES}')
-    if sample_period is None:
-        sample_period = _median_period(path, count, signals['stamp'][of_signals])
-        notes.append(
-            f'the sample period of {sample_period:.6g} s was taken from the stamps of the bag, '
-            'as no parameters were given'
+        tables, models, notes = _find_tables(content, axis)
+        restarted = _choose_section(tables, span)
+        signals, estimates, truth = tables
+        if not signals['stamp'].size:
+            raise InputError('holds no sample between --from and --to')
+        count, of_signals, of_estimates = np.intersect1d(
+            signals['sample'], estimates['sample'], assume_unique=True, return_indices=True
         )
-    within = [fields for stamp, fields in models
-              if signals['stamp'][0] <= stamp < span.to_s * 1e9]
+        if count.size == 0:
+            raise InputError(f'no sample has both {topics.SIGNALS} and {topics.ESTIMATES}')
+        if sample_period is None:
+            sample_period = _median_period(count, signals['stamp'][of_signals])
+            notes.append(
+                f'the sample period of {sample_period:.6g} s was taken from the stamps of the bag, '
+                'as no parameters were given'
+            )
+    except InputError as error:
+        raise InputError('; '.join(filter(None, (f'{path}: {error}', content.damage)))) from None
     columns = {
         **_rows(signals, of_signals), **_rows(estimates, of_estimates),
         't': (count - count[0]) * sample_period,
@@ -166,79 +163,79 @@ def read_bag(
     unknown = np.full(count.size, np.nan)
     record = RunRecord(
         np.column_stack([columns.get(name, unknown) for name in COLUMNS]), sample_period,
-        int(heard[-1] - heard[0]) + 1 - heard.size, _learned_model(within[-1:]),
+        int(heard[-1] - heard[0]) + 1 - heard.size,
+        _learned_model([fields for stamp, fields in models
+                        if signals['stamp'][0] <= stamp < span.to_s * 1e9]),
     )
     notes = [content.damage, *notes, restarted]
     return Run(record, None, columns['latency_s'], tuple(filter(None, notes)))
 
 
 def _find_tables(
-    path: Path, content: Content, axis: str,
-) -> tuple[list[Table], list[tuple[int, Fields]], list[str]]:
+    content: Content, axis: str,
+) -> tuple[list[Table], list[tuple[float, dict[str, list[float]]]], list[str]]:
     """Signals, estimates and truth of one axis or joint, G with its stamps, what else is there."""
-    messages = content.messages.get(choose_namespace(_names_of(content, topics.SIGNALS), '')[0])
-    labels = [each.label for each in messages[0][1].layout.dim] if messages else []
+    first = content.messages.get(choose_namespace(_names_of(content, topics.SIGNALS), '')[0], [])
+    labels = _labels(first[0][1]) if first else []
     joints = list(dict.fromkeys(label.rpartition('.')[0] for label in labels if '.' in label))
-    joint, notes = '', []
+    prefix, notes = '', []
     if joints and axis in ('', *joints):
         joint = axis or joints[0]
         if not axis and joints[1:]:
             notes = [f'this is joint {joint}; --axis chooses one of {", ".join(joints[1:])}']
-        axis = ''
+        prefix, axis = f'{joint}.', ''
     tables: list[Table] = []
-    begin_ns = 0
+    begin_ns = first[0][0] if first else 0
     for topic in (topics.SIGNALS, topics.ESTIMATES, topics.TRUTH):
         name, note = choose_namespace(_names_of(content, topic), axis)
         if topic == topics.SIGNALS and note:
             notes.append(note)
             axis = name.strip('/').split('/')[0]
-        if found := content.messages.get(name):
-            begin_ns = begin_ns or found[0][0]
-            tables.append(_tabulate(path, name, ARRAY_LABELS[topic], found, joint, begin_ns))
+        if name:
+            begin_ns = content.messages[name][0][0] if topic == topics.SIGNALS else begin_ns
+            tables.append(_tabulate(topic, name, content.messages[name], prefix, begin_ns))
         elif topic == topics.TRUTH:  # which a real plant does not know
             tables.append({label: np.empty(0) for label in (*topics.TRUTH_LABELS, 'stamp')})
-        elif name:
-            raise InputError(f'{path}: holds no message of {name}')
         else:
-            heard = ', '.join(sorted(content.names)) or 'nothing'
             of_axis = f' of axis {axis}' if axis else ''
-            raise InputError(f'{path}: holds no {topic}{of_axis}, only {heard}')
+            raise InputError(f'holds no message of {topic}{of_axis}; its topics are '
+                             f'{", ".join(sorted(content.names)) or "none"}')
     models = content.messages.get(choose_namespace(_names_of(content, topics.MODEL), axis)[0], ())
-    fields = [(stamp - begin_ns, _fields_of(message, joint)) for stamp, message in models]
+    fields = [(float(stamp - begin_ns), _fields_of(message, prefix)) for stamp, message in models]
     # Of a joint that was not answered there is nothing but nan.
     known = [each for each in fields if not all(map(isnan, chain(*each[1].values())))]
     return tables, known, notes
 
 
+def _labels(message: Any) -> list[str]:
+    return [each.label for each in message.layout.dim]
+
+
 def _names_of(content: Content, topic: str) -> list[str]:
     """Under which names a topic was recorded; nodes that were renamed stand behind the others."""
-    kept = {name for name in content.names if f'/{name}'.endswith(f'/{topic}')}
-    renamed = {
-        name for name, messages in content.messages.items()
-        if name.rpartition('/')[2] == topic.rpartition('/')[2]
-        and {each.label for each in messages[0][1].layout.dim} >= set(ARRAY_LABELS[topic])
-    }
-    return [*sorted(kept), *sorted(renamed - kept)]
+    last, wanted = topic.rpartition('/')[2], set(ARRAY_LABELS[topic])
+    return sorted((
+        name for name, messages in content.messages.items() if f'/{name}'.endswith(f'/{topic}')
+        or (name.rpartition('/')[2] == last and wanted <= set(_labels(messages[0][1])))
+    ), key=lambda name: (not f'/{name}'.endswith(f'/{topic}'), name))
 
 
 def _tabulate(
-    path: Path, topic: str, labels: Sequence[str], messages: Sequence[tuple[int, Any]], joint: str,
-    begin_ns: int,
+    topic: str, name: str, messages: Sequence[tuple[int, Any]], prefix: str, begin_ns: int,
 ) -> Table:
-    """The messages of a topic, of several joints what is about one; '' for all of it."""
-    given = [each.label for each in messages[0][1].layout.dim] or labels
+    """The messages of a topic, of several joints what is about the one with this prefix."""
+    given = _labels(messages[0][1]) or ARRAY_LABELS[topic]
     if any(len(message.data) != len(given) for _, message in messages):
-        raise InputError(f'{path}: {topic} has a message without a value for each label')
+        raise InputError(f'{name} has a message without a value for each label')
     values = np.array([message.data for _, message in messages], dtype=np.float64).T
-    prefix = f'{joint}.' if joint else ''
     table = {label.removeprefix(prefix): column for label, column in zip(given, values, strict=True)
              if label.startswith(prefix)}
-    if missing := sorted(set(labels) - set(table)):
-        raise InputError(f'{path}: {topic} lacks {", ".join(missing)}')
+    if missing := sorted(set(ARRAY_LABELS[topic]) - set(table)):
+        raise InputError(f'{name} lacks {", ".join(missing)}')
     # A joint that was not answered has a row of nan.
     answered = ~np.isnan(list(table.values())).all(axis=0)
     table['stamp'] = np.array([stamp - begin_ns for stamp, _ in messages], dtype=np.float64)
-    return _rows(table, answered if joint else slice(None))
+    return _rows(table, answered if prefix else slice(None))
 
 
 def _rows(table: Table, chosen: Any) -> Table:
@@ -297,27 +294,24 @@ def _true_columns(v: Array, count: Array, truth: Table) -> Table:
     return {'u': u, **{f'true_{name}': truth[name][newest] for name in topics.BACKLASH}}
 
 
-def _median_period(path: Path, count: Array, stamps: Array) -> float:
-    if count.size < 2:
-        raise InputError(f'{path}: one sample does not show the sample period: give --config')
-    period = float(np.median(np.diff(stamps) / np.diff(count))) * 1e-9
+def _median_period(count: Array, stamps: Array) -> float:
+    period = float(np.median(np.diff(stamps) / np.diff(count))) * 1e-9 if count.size > 1 else 0.0
     if not period > 0.0:
-        raise InputError(f'{path}: its stamps do not show the sample period: give --config')
+        raise InputError('its stamps do not show the sample period: give --config')
     return period
 
 
-def _fields_of(message: Any, joint: str) -> Fields:
-    """What a message tells of G, of several joints what is about one."""
-    prefix = f'{joint}.' if joint else ''
+def _fields_of(message: Any, prefix: str) -> dict[str, list[float]]:
+    """What a message tells of G, of several joints what is about the one with this prefix."""
     ends = np.cumsum([each.size for each in message.layout.dim])
-    parts = zip(message.layout.dim, np.split(message.data, ends), strict=False)
-    return {each.label.removeprefix(prefix): values.tolist() for each, values in parts
-            if each.label.startswith(prefix)}
+    parts = zip(_labels(message), np.split(message.data, ends), strict=False)
+    return {label.removeprefix(prefix): values.tolist() for label, values in parts
+            if label.startswith(prefix)}
 
 
-def _learned_model(newest: Sequence[Fields]) -> LearnedModel | None:
+def _learned_model(models: Sequence[dict[str, list[float]]]) -> LearnedModel | None:
     """G as it was published last; none where that was not complete."""
     try:
-        return from_fields(newest[0])
+        return from_fields(models[-1])
     except (KeyError, IndexError, ValueError):
         return None

@@ -133,9 +133,9 @@ def other_bag(path: Path, run: RunRecord) -> None:
     [
         (None, 'does not exist'),
         (broken_bag, 'is damaged, and nothing of it can be read'),
-        (other_bag, 'holds no controller/signals, only /chatter'),
+        (other_bag, 'holds no message of controller/signals; its topics are /chatter'),
         (lambda path, run: write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
-         'holds no message of /controller/signals'),
+         'holds no message of controller/signals'),
         (lambda path, run: path.mkdir(), 'holds no bag, no record.npz and no samples.csv'),
     ],
 )

@@ -135,7 +135,7 @@ def test_bag_of_two_axes_gives_a_report_of_either(tmp_path, first, second, capsy
     assert report.main([str(bag), '--out', str(tmp_path / 'out')]) == 0
     assert 'this is pan; --axis tilt chooses another one' in capsys.readouterr().err
     assert report.main([str(bag), '--axis', 'roll', '--out', str(tmp_path / 'none')]) == 2
-    assert 'holds no controller/signals of axis roll' in capsys.readouterr().err
+    assert 'no message of controller/signals of axis roll; its topics' in capsys.readouterr().err
 
 
 def test_bag_of_two_controllers_at_once_gives_a_report(tmp_path, first, second):
