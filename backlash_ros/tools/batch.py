@@ -65,14 +65,13 @@ class Job(NamedTuple):
 class ParameterStatistics(NamedTuple):
     """Statistics of one estimated parameter over runs.
 
-    rmse_percent: of the truth, nan where that is 0. settling times [s]: inf for never. within:
-    share of runs within 1 % at the end. nees: mean of (error / std)^2, nan without standard
-    deviations; honest ones put it into nees_interval with 95 %.
+    settling times [s]: inf for never. within: share of runs within 1 % at the end. nees: mean of
+    (error / std)^2, nan without standard deviations; honest ones put it into nees_interval with
+    95 %.
     """
 
     bias: float
     rmse: float
-    rmse_percent: float
     settling_median: float
     settling_max: float
     within: float
@@ -298,10 +297,8 @@ def _statistics(outcomes: Sequence[Outcome], name: str) -> ParameterStatistics:
     known = bool(np.all(np.isfinite(std) & (std > 0.0)))
     # Quantiles of chi squared with n degrees of freedom: n times the mean has that distribution.
     low, high = chdtri(n, [0.975, 0.025]) / n
-    relative = error / np.where(truth == 0.0, nan, truth)
     return ParameterStatistics(
         float(error.mean()), float(np.sqrt(np.mean(error**2))),
-        100.0 * float(np.sqrt(np.mean(relative**2))),
         # The median of a number and "never" is never, not the nan of inf - inf.
         float(settling[n // 2]), float(settling[-1]),
         float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),

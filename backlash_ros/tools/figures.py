@@ -1,4 +1,4 @@
-"""Every figure of `report`, `compare` and `simulate --sweep`, and what others draw theirs with."""
+"""Every figure of `report` and `compare`, and what others draw theirs with."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.parameters.table import BY_NAME
 from backlash_ros.core.simulation.metrics import SETTLING_TOLERANCE
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.tools.runs import figure_data
@@ -75,10 +74,9 @@ def legend_above(axes: Axes) -> None:
     )
 
 
-def legend_below(figure: Figure, axes: Axes, title: str = '', columns: int = 4) -> None:
+def legend_below(figure: Figure, axes: Axes, columns: int = 4) -> None:
     """Put the legend of axes below all axes of the figure."""
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, title=title or None, loc='outside lower center', ncol=columns)
+    figure.legend(*axes.get_legend_handles_labels(), loc='outside lower center', ncol=columns)
 
 
 def limit_decades(axes: Axes, lowest: float, highest: float, decades: float = 8.0) -> None:
@@ -100,10 +98,6 @@ def curve(
 def zero_line(axes: Axes) -> None:
     """Draw a thin line at y = 0."""
     axes.axhline(0.0, color='#444444', linewidth=0.8)
-
-
-def _tolerance_line(axes: Axes) -> None:
-    axes.axhline(100.0 * SETTLING_TOLERANCE, color='#444444', linewidth=0.9, linestyle=':')
 
 
 def band(axes: Axes, t: Array, low: Array, high: Array, colour: str, name: str = '') -> None:
@@ -199,7 +193,7 @@ def draw_parameter_errors(
                               markersize=7, markeredgecolor='white', zorder=5)
         zero_line(absolute)
         absolute.set_ylim(*limits([error.values for error in errors], margin=0.08))
-        _tolerance_line(relative)
+        relative.axhline(100.0 * SETTLING_TOLERANCE, color='#444444', linewidth=0.9, linestyle=':')
         known = np.concatenate([line.values[part.rows] for line in percents])
         known = known[np.isfinite(known)]
         if known.size:
@@ -299,41 +293,6 @@ def draw_input(run: RunRecord, parts: Sequence[Part]) -> Figure:
         'control v [unit of v]': [Line(t, run.column('v'), HUES['v'])],
     }, parts)
     legend_above(grid[0, -1])
-    return figure
-
-
-def draw_sweep(
-    swept: str, values: Sequence[Any], lines: Mapping[str, Sequence[Sequence[float]]], others: str,
-) -> Figure:
-    """Relative RMSE of m, c_r, c_l [%] and the settling time of the slowest of them [s].
-
-    swept, values: the parameter of the horizontal axis. lines: by the values of the other
-    parameters, shape (values, 4). others: the names of these.
-    """
-    figure = new_figure(7.4)
-    panels = figure.subplots(2, 2).ravel().tolist()
-    numeric = all(isinstance(value, (int, float)) for value in values)
-    places = np.array(values if numeric else range(len(values)), dtype=float)
-    for i, (name, rows) in enumerate(lines.items()):
-        for panel, row in zip(panels, np.array(rows).T, strict=True):
-            panel.plot(places, row, color=CYCLE[i % len(CYCLE)], marker='osD^vP*X'[i % 8],
-                       linewidth=1.6, markersize=6, label=name)
-    for panel, name in zip(panels, BACKLASH, strict=False):
-        panel.set_yscale('log')
-        _tolerance_line(panel)
-        label(panel, f'RMSE of ${name}$ at the end', '% of the true value')
-    label(panels[3], 'Settled within 1 % (median; no point: never)', 'time [s]')
-    panels[3].set_xlim(panels[0].get_xlim())
-    panels[3].set_ylim(bottom=0.0)
-    unit = f' [{BY_NAME[swept].unit}]' if BY_NAME[swept].unit else ''
-    for panel in panels:
-        label(panel, x=f'{swept}{unit}')
-        if not numeric:
-            panel.set_xticks(places, list(map(str, values)))
-        elif places.min() > 0.0 and places.max() >= 20.0 * places.min():
-            panel.set_xscale('log')
-    if others:
-        legend_below(figure, panels[0], others)
     return figure
 
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from math import isfinite, nan
+from math import isfinite
 
 from tqdm import tqdm
 
-from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
@@ -102,20 +101,11 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     if swept:
         # The jobs of one change stand together.
         size = len(outcomes) // len(changes)
-        rows = [_sweep_row(outcomes[i * size:(i + 1) * size]) for i in range(len(changes))]
         header = [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %']
         print(format_table(header, [
-            [*map(batch.value_text, change.values()), *row]
-            for change, (row, _) in zip(changes, rows, strict=True)
+            [*map(batch.value_text, change.values()), *_sweep_row(outcomes[i * size:][:size])]
+            for i, change in enumerate(changes)
         ]))
-        from backlash_ros.tools.figures import draw_sweep, png
-        lines: dict[str, list[list[float]]] = {}
-        for change, (_, points) in zip(changes, rows, strict=True):
-            others = map(batch.value_text, list(change.values())[1:])
-            lines.setdefault(', '.join(others), []).append(points)
-        figure = draw_sweep(*sweeps[0], lines, ', '.join(swept[1:]))
-        write_atomically(directory / 'sweep.png', png(figure))
-        print(f'figure: {directory / "sweep.png"}')
     else:
         print(_seeds_table(outcomes))
     _print_shortfalls(jobs, outcomes)
@@ -136,20 +126,13 @@ def _seeds_table(outcomes: Sequence[Outcome]) -> str:
     return format_table(header[:shown], [row[:shown] for row in rows])
 
 
-def _sweep_row(outcomes: Sequence[Outcome]) -> tuple[list[str], list[float]]:
-    """RMSE of each parameter, settling time of the slowest, share within 1 %; and for the figure.
-
-    Of that: RMSE of m, c_r, c_l [% of the truth] and settling time [s], nan where there is none.
-    """
+def _sweep_row(outcomes: Sequence[Outcome]) -> list[str]:
+    """RMSE of each parameter, settling time of the slowest, share within 1 %."""
     if all(outcome['problem'] for outcome in outcomes):
-        return [*[NOTHING] * 3, 'broke off', NOTHING], [nan] * 4
+        return [*[NOTHING] * 3, 'broke off', NOTHING]
     of = statistics(outcomes).values()
-    settled = max(s.settling_median for s in of)
-    row = [*(f'{s.rmse:.3g}' for s in of), _seconds(settled),
-           f'{100.0 * min(s.within for s in of):.4g} %']
-    # The logarithm has no zero.
-    points = [*(max(s.rmse_percent, 1e-10) for s in of), settled]
-    return row, [value if isfinite(value) else nan for value in points]
+    return [*(f'{s.rmse:.3g}' for s in of), _seconds(max(s.settling_median for s in of)),
+            f'{100.0 * min(s.within for s in of):.4g} %']
 
 
 def _print_shortfalls(jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
