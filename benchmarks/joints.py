@@ -13,7 +13,6 @@ trajectory of examples/joint_trajectory.py: cycles, and whether each that was lo
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import sys
 import tempfile
@@ -26,6 +25,7 @@ import numpy as np
 import rclpy
 from builtin_interfaces.msg import Time
 from rclpy.executors import SingleThreadedExecutor
+from real_time.costs import processor_s, resident_mb
 from real_time.node_processes import (
     node_command,
     processes,
@@ -155,13 +155,13 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
             next_s = time.perf_counter()
             for k in range(samples):
                 if k == round(WARM_UP * samples):
-                    latencies, used, first = [], processor_s(pids), time.perf_counter()
+                    latencies, used, first = [], used_s(pids), time.perf_counter()
                 latencies.append(driver.sample(k * period_s, period_s))
                 next_s = max(next_s + period_s, time.perf_counter())
                 while (left := next_s - time.perf_counter()) > 0.0:
                     driver.spin(left)
-            share = (processor_s(pids) - used) / (time.perf_counter() - first)
-            resident_mb = sum(resident_of(pid) for pid in family(pids))
+            share = (used_s(pids) - used) / (time.perf_counter() - first)
+            resident_mb = sum(resident_mb(pid) for pid in family(pids))
         finally:
             driver.close()
         supervisor.stop()
@@ -260,16 +260,9 @@ def family(pids: Iterable[int]) -> list[int]:
     return found
 
 
-def processor_s(pids: Iterable[int]) -> float:
-    """Time of processors that they have used [s]."""
-    ticks = sum(int(value) for pid in family(pids) for value in _stat(pid)[11:13])
-    return ticks / os.sysconf('SC_CLK_TCK')
-
-
-def resident_of(pid: int) -> float:
-    """Memory of a process [MB]."""
-    pages = int(Path(f'/proc/{pid}/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
+def used_s(pids: Iterable[int]) -> float:
+    """Time of processors that they and all that they have started have used [s]."""
+    return sum(map(processor_s, family(pids)))
 
 
 def _stat(pid: int) -> list[str]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 from cases.geared_motor import motor
+from real_time.costs import COST_HEADER, COST_RATES_HZ, measure_costs
 from real_time.loop_latency import (
     BLOCK,
     LATENCY_HEADER,
@@ -119,6 +120,21 @@ def simulation_speeds(values: Mapping[str, object]) -> list[str]:
             f'{(SIMULATED_SAMPLES - ACQUIRED) / (end - acquired):.0f}']
 
 
+def measure_cost(duration_s: float) -> Section:
+    """What the processes of a loop cost."""
+    section = Section(
+        'What it costs',
+        'The default controller and `reference` as processes, beside a bare rclpy node that '
+        'publishes every number it gets, at the same rate; once the backlash is known. Times are '
+        'those of processors, of all threads; the process for fits is not counted.', COST_HEADER,
+    )
+    for rate in COST_RATES_HZ:
+        rows, checks = measure_costs(rate, duration_s)
+        section.rows += rows
+        section.checks += checks
+    return section
+
+
 def measure_soak(duration_s: float) -> Section:
     """Samples that are lost at 1 kHz, and what the controller keeps."""
     return Section(
@@ -128,7 +144,8 @@ def measure_soak(duration_s: float) -> Section:
 
 
 PARTS: dict[str, Callable[[float], Section]] = {
-    'step': measure_steps, 'latency': measure_latencies, 'lockstep': measure_lockstep,
+    'step': measure_steps, 'latency': measure_latencies, 'costs': measure_cost,
+    'lockstep': measure_lockstep,
     'simulate': measure_simulation, 'soak': measure_soak,
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections import deque
@@ -45,10 +46,6 @@ from backlash_ros.nodes.runtime.lifecycle import ManagedNode
 from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, stamp_ns_of
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import emit, run
-
-# Share of a period for which the controller sleeps after the command: on a busy processor the
-# driver, woken by the command, would have to wait for it otherwise.
-POST_COMMAND_SLEEP = 0.05
 
 
 class ControllerNode(ManagedNode):
@@ -98,11 +95,12 @@ class ControllerNode(ManagedNode):
         self._commands_of_rivals: Subscription | None = None  # heard while standing down
         self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
-        references = self._io.listen_to_references(
-            self._on_reference, KEPT_QOS if p.lockstep else 1
+        # Woken by each y_m, the process would take half as much time again.
+        references_qos = self._io.listen_to_references(
+            self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep
         )
         self.joints += [
-            Joint(self, joint, p.of_joint(joint), self._io, references.qos_profile)
+            Joint(self, joint, p.of_joint(joint), self._io, references_qos)
             for joint in p.joint_names
         ]
         if p.lockstep:
@@ -293,6 +291,7 @@ class ControllerNode(ManagedNode):
             self._outputs.append(outputs[''])
             self._pair()
         elif self._knows_rivals() or not any(loop.begins for loop in loops.loops):
+            self._io.take_references()
             steps = loops.answer(outputs)
             if steps:
                 self._use_spare_time(loops, next(iter(outputs.values())).received_ns)
@@ -313,7 +312,7 @@ class ControllerNode(ManagedNode):
                 self._follow_up(loops, steps)
 
     def _use_spare_time(self, loops: JointLoops, received_ns: int) -> None:
-        """Let the driver go on, then the next loop take up and submit fits.
+        """Let the driver go on, which the command has woken, then the next loop take up fits.
 
         Where the next output is waiting already, there is no time for what may be put off.
         received_ns: when the output came that was answered.
@@ -325,7 +324,7 @@ class ControllerNode(ManagedNode):
             self._behind += 1
         else:
             self._behind = 0
-            time.sleep(POST_COMMAND_SLEEP * period)
+            os.sched_yield()
         if self._behind % put_off == 0:
             self._turn = (self._turn + 1) % len(loops.loops)
             loops.loops[self._turn].core.refine(REFINE_SHARE * period)
@@ -378,6 +377,7 @@ class ControllerNode(ManagedNode):
         loops = self.loops
         if loops is None or not self.active:
             return
+        self._io.take_references()
         for joint in self.joints:
             joint.save_now_and_then()
         if loops.give_up_silent():

@@ -23,7 +23,6 @@ from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.phase import Event, Phase, after
 from backlash_ros.core.loop.sample_counter import NEXT_SAMPLE, Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import NOISE, Parameters
-from backlash_ros.core.plant.transfer_function import TransferFunction
 
 
 class Driver(NamedTuple):
@@ -67,6 +66,7 @@ class ControlLoop:
         self.referred_at: float | None = None
         self.executor = executor or Executor()
         self.core = build_controller(p, estimate, self.executor)
+        self.nominal = build_model(p)  # no parameter of it is live
         self.knows_v = v is not None
         if v is not None:
             self.core.motion = at_rest(v)
@@ -82,11 +82,6 @@ class ControlLoop:
     def estimate(self) -> Estimate:
         """What is known of the backlash."""
         return self.core.estimator.estimate
-
-    @property
-    def nominal(self) -> TransferFunction:
-        """G(z) as the parameters have it."""
-        return build_model(self._p)
 
     @property
     def v(self) -> float:

@@ -106,6 +106,7 @@ class DriverIo:
         self._node, self._p = node, p
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointState()  # the newest message of references
+        self._references: Subscription | None = None
         self._reports: Subscription | None = None
         self._reported: dict[str, deque[tuple[float, int]]] = {
             joint: deque(maxlen=KEPT_COMMANDS) for joint in p.joint_names
@@ -178,17 +179,27 @@ class DriverIo:
         )
 
     def listen_to_references(
-        self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int,
-    ) -> Subscription:
-        """Call hear with every y_m."""
-        def hear_values(message: Float64 | JointState) -> None:
-            if isinstance(message, JointState):
-                self._referred = message
+        self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int, polled: bool,
+    ) -> QoSProfile:
+        """Call hear with every y_m; returns with which quality of service. polled: as in listen."""
+        def hear_number(message: bytes, info: dict[str, Any]) -> None:
+            hear({'': number_of(message)})
+
+        def hear_joints(message: JointState, info: dict[str, Any]) -> None:
+            self._referred = message
             hear(self.values(message))
 
-        return self._node.create_subscription(
-            self.topics.reference_type, self.topics.reference, hear_values, qos
+        of_joints = self.topics.reference_type is JointState
+        self._references = self._node.listen(
+            self.topics.reference_type, self.topics.reference,
+            hear_joints if of_joints else hear_number, qos, raw=not of_joints, polled=polled,
         )
+        return self._references.qos_profile
+
+    def take_references(self) -> None:
+        """Serve the polled references."""
+        if self._references is not None:
+            serve_polled(self._references)
 
     def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
         """Call hear with every v that anybody sends to the driver."""
