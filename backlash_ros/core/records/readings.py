@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+FEWEST_STEPS = 20  # of y, by which a jump of it is judged
 NEARLY_ALL = 0.9  # share of what speaks for an explanation
 # Whole turns: degrees, radians, gradians, steps of encoders.
 WHOLE_TURNS = (360.0, 2.0 * np.pi, 400.0, 6400.0, 3600.0, *(2.0**n for n in range(8, 33)))
@@ -116,3 +117,28 @@ def unwrapped(values: Array) -> tuple[Array, float]:
             out[known[1:]] -= turn * np.cumsum(np.where(jumps, np.sign(steps), 0.0))
             return out, turn
     return values, 0.0
+
+
+def without_slips(y: Array, v: Array) -> tuple[Array, float]:
+    """y (N,) without rare jumps by a whole turn that v (N,) does not make, and the turn; 0: none.
+
+    Drivers that count turns lose one, or gain it, when they are restarted or read late.
+    """
+    known = np.flatnonzero(np.isfinite(y))
+    steps = np.diff(y[known])
+    if len(steps) < FEWEST_STEPS:
+        return y, 0.0
+    usual = 3.0 * float(np.percentile(np.abs(steps), 95.0))
+    jumps = np.flatnonzero(np.abs(steps) > 10.0 * usual)
+    moves = np.abs(np.diff(v, prepend=v[0]))
+    lively = 3.0 * float(np.percentile(moves, 95.0))
+    for turn in (2.0 * np.pi, 360.0) if 0 < len(jumps) <= 0.01 * len(steps) else ():
+        whole = np.abs(np.abs(steps[jumps]) - turn) <= usual + 1e-3 * turn
+        alone = [moves[max(known[k] - 5, 0):known[k + 1] + 5].max() <= lively for k in jumps]
+        if whole.all() and all(alone):
+            lost = np.zeros(len(known))
+            lost[jumps + 1] = turn * np.sign(steps[jumps])
+            out = y.copy()
+            out[known] -= np.cumsum(lost)
+            return out, turn
+    return y, 0.0

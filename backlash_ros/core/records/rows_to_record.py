@@ -8,9 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.limits import LARGEST_SIGNAL
-from backlash_ros.core.records.readings import failed, own_readings, quantum, unwrapped
+from backlash_ros.core.records.readings import (
+    failed,
+    own_readings,
+    quantum,
+    unwrapped,
+    without_slips,
+)
 from backlash_ros.core.records.record import Record, RecordError
-from backlash_ros.core.records.stamps import in_order, in_seconds
+from backlash_ros.core.records.stamps import in_order, in_seconds, spread_evenly
 from backlash_ros.core.records.timing import Rows, on_grid
 
 Array = NDArray[np.float64]
@@ -38,38 +44,61 @@ def record_of(
             notes.append(f'{name} is infinite in {infinite.sum()} rows: taken as lost')
             values[infinite] = np.nan
     table = table[:, in_order(stamps, said)]
+    _check(v=table[1], y=table[2])
+    sent = None
+    known_v, known_y = np.isfinite(table[1:3])
+    if (known_v & known_y).sum() < 0.05 * min(known_v.sum(), known_y.sum()):
+        said.append('v and y stand in rows of their own')
+        sent = table[:2, known_v]
+        table[1] = _held(np.where(np.arange(len(table[1])) > 0, table[1], sent[1, 0]))
+        table = table[:, known_y]
     same = (table[:3, 1:] == table[:3, :-1]) | (np.isnan(table[:3, 1:]) & np.isnan(table[:3, :-1]))
     again = np.append(False, same.all(axis=0))
     if again.any():
         said.append(f'{again.sum()} rows that repeat the one before left out')
         table = table[:, ~again]
-    _check(v=table[1], y=table[2])
-    # An angle that begins anew is far from the rows around as well.
-    bad, value = failed(unwrapped(table[2])[0])
-    if bad.any():
-        notes.append(
-            f'y reads exactly {value:.6g} in {bad.sum()} of {len(bad)} rows, far from the rows '
-            'around: taken for reads that failed'
-        )
-        table[2, bad] = np.nan
-    for i, name in ((2, 'y'), (1, 'v')):
-        table[i], turn = unwrapped(table[i])
-        if turn:
-            notes.append(f'{name} jumps by {turn:.6g} where it begins anew: the turns are counted')
     table = table[:, int(np.argmax(np.isfinite(table[1]))):]
-    t, v, y = table[0] - table[0, 0], _held(table[1]), table[2]
-    own, sensor_period = own_readings(t, y)
-    if sensor_period:
-        said.append(f'y repeats {len(y) / own.sum():.2g} times: {1.0 / sensor_period:.3g} Hz')
-    record = on_grid(Rows(t, v, y, own, None if commands is None else _held(table[3])), period)
+    t = spread_evenly(table[0] - table[0, 0], said, *table[1:3])
+    v, y = readings(t, _held(table[1]), table[2], said, notes)
+    if sent is not None:
+        sent[0] -= table[0, 0]
+    record = on_grid(Rows(t, v, y, None if commands is None else _held(table[3]), sent), period)
     return usable(replace(
         record, quantum=quantum(y), timing='; '.join([record.timing, *said]), notes=tuple(notes)
     ))
 
 
+def readings(
+    t: Array, v: Array, y: Array, said: list[str], notes: list[str],
+) -> tuple[Array, Array]:
+    """v (N,) and y (N,) at t (N,) without whole turns; y nan where it is no reading of its own.
+
+    What was done is added to said and notes.
+    """
+    # An angle that begins anew is far from the rows around as well.
+    bad, value = failed(unwrapped(y)[0])
+    if bad.any():
+        notes.append(
+            f'y reads exactly {value:.6g} in {bad.sum()} of {len(bad)} rows, far from the rows '
+            'around: taken for reads that failed'
+        )
+        y = np.where(bad, np.nan, y)
+    (y, turn_of_y), (v, turn_of_v) = unwrapped(y), unwrapped(v)
+    for name, turn in (('y', turn_of_y), ('v', turn_of_v)):
+        if turn:
+            notes.append(f'{name} jumps by {turn:.6g} where it begins anew: the turns are counted')
+    y, turn = without_slips(y, v)
+    if turn:
+        notes.append(f'y jumps by {turn:.6g}, a whole turn, while v does not: taken out')
+    own, sensor_period = own_readings(t, y)
+    if sensor_period:
+        said.append(f'y repeats {len(y) / own.sum():.2g} times: {1.0 / sensor_period:.3g} Hz')
+    return v, np.where(own, y, np.nan)
+
+
 def record_of_samples(t: Array, v: Array, y: Array, period: float) -> Record:
     """A record from samples (N,) of a run of this package, which have their true time t [s]."""
-    record = on_grid(Rows(t - t[0], v, y, np.isfinite(y)), period)
+    record = on_grid(Rows(t - t[0], v, y), period)
     return usable(replace(record, quantum=quantum(y)))
 
 

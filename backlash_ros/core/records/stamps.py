@@ -19,7 +19,6 @@ def in_seconds(
     unit_s: of the stamps, None where the log does not say it: then years since 1970 tell it, or the
     period. What was guessed is added to said. Raises RecordError where the period is needed.
     """
-    epoch = ((1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms'))  # stamps of this century
     known = np.empty(0) if t is None else t[np.isfinite(t)]
     if t is None or np.unique(known).size < 2:
         what = 'there is no column for t' if t is None else 't does not move'
@@ -27,13 +26,27 @@ def in_seconds(
             raise RecordError(f'{what}: give --period S, the time from row to row')
         said.append(f'{what}: rows are counted')
         return np.asarray(period * np.arange(count, dtype=float))
-    if unit_s is not None:
-        return np.asarray(t * unit_s)
-    for least, scale, unit in epoch:
+    unit_s = unit_s or _guessed_unit(known, period, said)
+    for around in (2.0**16, 2.0**32, 86400.0 / unit_s, 43200.0 / unit_s, 3600.0 / unit_s):
+        falls = np.diff(t, prepend=t[0]) < -0.5 * around
+        if 0 < falls.sum() < 0.1 * count:
+            counted = t + around * np.cumsum(falls)
+            steps = np.diff(counted)[falls[1:]]
+            if ((steps >= 0.0) & (steps <= 3.0 * typical_step(known))).all():
+                said.append(f't begins anew after {seconds(around * unit_s)}: counted on')
+                t = counted
+                break
+    # Exact differences of numbers that hardly fit.
+    return np.asarray((t - np.median(known)) * unit_s)
+
+
+def _guessed_unit(known: Array, period: float | None, said: list[str]) -> float:
+    """Unit [s] of stamps of which nothing else tells it."""
+    epochs = (1e17, 1e-9, 'ns'), (1e14, 1e-6, 'µs'), (1e11, 1e-3, 'ms')  # stamps of this century
+    for least, scale, unit in epochs:
         if np.median(np.abs(known)) > least:
             said.append(f't counts {unit} since 1970')
-            # Exact differences of numbers that hardly fit.
-            return np.asarray((t - known[0]) * scale)
+            return scale
     step = typical_step(known if known[-1] > known[0] else known[::-1])
     whole = bool((known == np.round(known)).all())
     if period is None:
@@ -42,15 +55,15 @@ def in_seconds(
             said.append(
                 't, in whole numbers, is taken as seconds; if it counts something else: --period'
             )
-        return t
+        return 1.0
     for scale in (1e-3, 1e-6, 1e-9, 60.0):
         if abs(step * scale / period - 1.0) < 0.3:
             said.append(f't counts {seconds(scale)}')
-            return t * scale
+            return scale
     if whole and step == 1.0:
         said.append('t counts the samples')
-        return t * period
-    return t
+        return period
+    return 1.0
 
 
 def typical_step(t: Array) -> float:
@@ -106,6 +119,31 @@ def in_order(t: Array, said: list[str], what: str = 'row') -> Rows:
         rows = rows[np.argsort(t[rows], kind='stable')]
         said.append(f'{count(moved)} out of order sorted by time')
     return rows
+
+
+def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
+    """Stamps (N,) of rows of which several in a row have the same one, of a clock that is coarse.
+
+    Where a signal (N,) moves within such a run as it does from run to run, rows were taken evenly;
+    else the same readings were written again, and the stamps stay.
+    """
+    begins = np.flatnonzero(np.diff(t, prepend=-np.inf) > 0.0)
+    lengths, spans = np.diff(begins), np.diff(t[begins])
+    if len(lengths) < 3 or np.median(lengths) < 2.0:
+        return t
+    within = np.diff(t) == 0.0
+    for signal in signals:
+        moves = np.abs(np.diff(signal))
+        if not np.nanmean(moves[within]) > 0.5 * np.nanmean(moves[~within]):
+            return t
+    period = float(np.median(spans[1:] / lengths[1:]))
+    # The first run may have begun before the log did; a pause is between two runs.
+    run = np.repeat(np.arange(len(begins)), np.diff(np.append(begins, len(t))))
+    place = np.arange(len(t)) - begins[run]
+    out = t[begins][run] + period * np.where(run == 0, place - lengths[0], place) + np.where(
+        run == 0, spans[0], 0.0)
+    said.append(f'up to {lengths.max()} rows share a stamp, and move: spread evenly')
+    return np.asarray(out)
 
 
 def _far_off(t: Array) -> NDArray[np.bool_]:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.loop.command_history import v_of_intervals
 from backlash_ros.core.loop.sample_counter import CLOCK_SLACK, JITTER
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
@@ -23,20 +24,20 @@ from backlash_ros.core.records.stamps import typical_step
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 BREAK = 3.0  # periods from row to row that are a gap
 MOST_SAMPLES = 1_000_000  # of a grid
 
 
 class Rows(NamedTuple):
-    """Rows in order. t (M,): from 0 [s]. own: whether y (M,) is a reading of its own."""
+    """Rows in order. t (M,): from 0 [s]. y (M,): nan where it is no reading of its own. sent
+    (2, K): times and values of v where it has its own, as in a log of events."""
 
     t: Array
     v: Array
     y: Array
-    own: Flags
     commands: Array | None = None
+    sent: Array | None = None
 
 
 class Numbering(NamedTuple):
@@ -105,8 +106,8 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
             'with --from and --to, or give --period'
         )
     commands = None if rows.commands is None else rows.commands[begin:end]
-    kept = Rows(t[begin:end] - t[begin], rows.v[begin:end], rows.y[begin:end], rows.own[begin:end],
-                commands)
+    sent = None if rows.sent is None else rows.sent - np.array([[t[begin]], [0.0]])
+    kept = Rows(t[begin:end] - t[begin], rows.v[begin:end], rows.y[begin:end], commands, sent)
     return kept, f'{len(ends) - 2} long gaps: the longest stretch, {end - begin} rows, is used; '
 
 
@@ -166,8 +167,7 @@ def _are_late(rows: Rows, found: Numbering) -> bool:
     if found.numbers[-1] + 1 > 1.3 * len(rows.t) or np.std(found.off) > found.period:
         return False  # too many are missing, or too late, to be numbered
     even = found.numbers.astype(float)
-    y = np.where(rows.own, rows.y, np.nan)
-    return rougher(rows.t, even, y) + rougher(rows.t, even, rows.v) > 0.05
+    return rougher(rows.t, even, rows.y) + rougher(rows.t, even, rows.v) > 0.05
 
 
 def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:
@@ -175,16 +175,21 @@ def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Reco
     count = int(index[-1]) + 1
     held = np.searchsorted(index, np.arange(count), side='right') - 1
     y = np.full(count, np.nan)
-    y[index[rows.own]] = rows.y[rows.own]
+    y[index] = rows.y
     missing = f', {count - len(index)} missing' if count > len(index) else ''
     commands = None if rows.commands is None else rows.commands[held]
-    return Record(rows.v[held], y, period, timing=said + missing, commands=commands)
+    v = rows.v[held]
+    if rows.sent is not None:
+        stamps, sent_ns = ((t * 1e9).astype(np.int64) for t in (rows.t, rows.sent[0]))
+        v = v_of_intervals(index, stamps, sent_ns, rows.sent[1], False)
+    return Record(v, y, period, timing=said + missing, commands=commands)
 
 
 def _true_instants(rows: Rows, period: float, said: str) -> Record:
     """v averaged over each period, y where it was read."""
     hidden, least = 0.5, 1e-3  # error of moving y that is hidden: of its noise, of its swing
-    t, y = rows.t[rows.own], rows.y[rows.own]
+    known = np.isfinite(rows.y)
+    t, y = rows.t[known], rows.y[known]
     equal = int(np.count_nonzero(np.diff(rows.t) == 0.0))
     said += f'; {equal} rows with equal stamps' if equal else ''
     kept = np.append(np.diff(t) > 0.0, True)
@@ -219,7 +224,8 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
     full = np.full(count, np.nan)
     full[index] = values
     commands = None if rows.commands is None else averaged(rows.t, rows.commands, step, count)
-    v = averaged(rows.t, rows.v, step, count)
+    sent = (rows.t, rows.v) if rows.sent is None else rows.sent
+    v = averaged(sent[0], sent[1], step, count)
     return Record(v, full, step, timing=said, commands=commands)
 
 

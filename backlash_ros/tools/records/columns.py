@@ -13,18 +13,20 @@ COMMAND = 'command'  # a fourth one, where v is what a motor encoder reports
 # Words of names, surest first; of the first line that fits any column, the column is taken.
 PATTERNS: Mapping[str, Sequence[str]] = {
     't': (
-        r't', r'time|timestamp|time stamp|stamp',
-        r'elapsed( time)?|secs?|seconds|uptime|zeit|date ?time',
-        r'(.* )?(time|timestamp|stamp)( s| sec| us| ms| ns)?', r'(ms|us|ns|millis|micros)',
+        r't', r'time|timestamp|time stamp|stamp|uhrzeit',
+        r'elapsed( time)?|secs?|seconds|uptime|date ?time|zeit',
+        r'(.* )?(time|timestamp|stamp)( s| secs?| us| ms| ns)?', r'(ms|us|ns|millis|micros)',
+        r'date|datum',
     ),
     'v': (
         r'v', r'command|cmd|control|goal|target|set ?point|sp|op|soll(wert)?',
-        r'(.* )?(goal|target|commanded|command|cmd|desired|set ?point|set|soll|control)( .*)?',
+        r'(.* )?(goal|target|commanded|commands?|cmd|desired|set ?point|set|soll|control)( .*)?',
+        r'.* v',
     ),
     'y': (
         r'y', r'position|pos|actual|measured|present|feedback|output|encoder|angle|pv|ist(wert)?',
         r'(.* )?(actual|present|measured|feedback|ist)( .*)?',
-        r'(.* )?(position|pos|output|encoder|angle)( .*)?',
+        r'(.* )?(position|pos|output|encoder|angle)( .*)?', r'.* y',
     ),
 }
 # What is neither v nor y, whatever else its name says.
@@ -34,7 +36,7 @@ UNITS_S = {
     unit: scale for scale, units in {
         1e-9: 'ns nsec nanoseconds', 1e-6: 'us µs μs usec microseconds micros',
         1e-3: 'ms msec milliseconds millis', 1.0: 's sec secs seconds', 60.0: 'min minutes',
-        3600.0: 'h hours',
+        3600.0: 'h hours', 86400.0: 'd days',
     }.items() for unit in units.split()
 }
 

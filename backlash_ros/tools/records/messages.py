@@ -14,7 +14,7 @@ from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED, v_of_intervals
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
-from backlash_ros.core.records.rows_to_record import usable
+from backlash_ros.core.records.rows_to_record import readings, usable
 from backlash_ros.core.records.stamps import in_order
 from backlash_ros.core.records.timing import MOST_SAMPLES, numbered, rounded
 from backlash_ros.tools.cli import InputError
@@ -92,13 +92,16 @@ def from_messages(
         slope, offset = np.polyfit(index, times, 1).tolist()
         late = float(np.std(times - slope * index - offset))
         step = rounded(slope, 2.0**0.5 * late / float(index[-1]))
-    y = np.full(int(index[-1]) + 1, np.nan)
+    y: NDArray[np.float64] = np.full(int(index[-1]) + 1, np.nan)
     y[index] = values
     v = v_of_intervals(index, stamps, *acted, reported)
     sent = v_of_intervals(index, stamps, *commands, False) if reported and commands else None
     missing = f', {len(y) - len(index)} missing' if len(y) > len(index) else ''
+    notes: list[str] = []
+    step_of_y = quantum(y)
+    v, y = readings(step * np.arange(len(y), dtype=float), v, y, said, notes)
     timing = '; '.join([f'{len(index)} messages of y, one every {seconds(step)}{missing}', *said])
-    return usable(Record(v, y, step, quantum(y), timing=timing, commands=sent))
+    return usable(Record(v, y, step, step_of_y, timing=timing, notes=tuple(notes), commands=sent))
 
 
 def _by_time(messages: Messages, begin_ns: int, said: list[str]) -> Messages:

@@ -13,7 +13,7 @@ from backlash_ros.core.records.rows_to_record import record_of, record_of_sample
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord
 from backlash_ros.tools.cli import WHOLE_SPAN, InputError, Span
 from backlash_ros.tools.config import effective_parameters
-from backlash_ros.tools.records.columns import COMMAND, choose_columns, unit_of
+from backlash_ros.tools.records.columns import COMMAND, choose_columns
 from backlash_ros.tools.records.table import Table, read_table
 from backlash_ros.tools.runs.files import RECORD_FILE, SAMPLE_COLUMNS, SAMPLES_FILE, Run
 
@@ -66,10 +66,11 @@ def _read(path: Path, period: float | None, axis: str, columns: Mapping[str, str
 
 
 def _from_table(table: Table, period: float | None, given: Mapping[str, str]) -> Record:
+    table = table.by_name()
     chosen, said = choose_columns(table.names, given, table.path)
-    signals = {role: table.numbers(name, times=role == 't') for role, name in chosen.items()}
-    record = record_of(signals.get('t'), signals['v'], signals['y'], period,
-                       unit_of(chosen.get('t', '')), signals.get(COMMAND))
+    t, unit_s = table.times(chosen.pop('t')) if 't' in chosen else (None, None)
+    signals = {role: table.numbers(name) for role, name in chosen.items()}
+    record = record_of(t, signals['v'], signals['y'], period, unit_s, signals.get(COMMAND))
     return replace(record, notes=(*filter(None, [said]), *table.notes, *record.notes))
 
 

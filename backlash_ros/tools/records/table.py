@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.tools.cli import InputError
-from backlash_ros.tools.records.columns import columns_of
+from backlash_ros.tools.records.columns import UNITS_S, columns_of, unit_of
+from backlash_ros.tools.records.dates import times_of
 
 Array = NDArray[np.float64]
 
@@ -43,46 +44,70 @@ class Table:
     comma: bool = False
     notes: tuple[str, ...] = ()
 
-    def numbers(self, name: str, times: bool = False) -> Array:
-        """A column as numbers (N,), nan where there is none; raises InputError.
+    def times(self, name: str) -> tuple[Array, float | None]:
+        """Stamps (N,), and their unit [s] where the file tells it; raises InputError."""
+        cells = self.cells[self.names.index(name)]
+        # As the first ones are.
+        numeric = [isinstance(cell, float) or _number(cell, self.comma) is not None
+                   for cell in cells[:60]]
+        if not sum(numeric) > 0.5 * len(numeric):
+            dates = times_of([str(cell) for cell in cells])
+            if np.isfinite(dates).mean() > 0.5:
+                return dates, 1.0
+        t = self.numbers(name, 'time')
+        if re.fullmatch('date|datum', name.lower()) and 2e4 < np.nanmedian(t) < 1e5:
+            return t, 86400.0  # of a table calculation
+        for other in self.names:
+            # In two columns, as in headers of ROS messages.
+            if re.fullmatch(r'(.*)n(ano)?(secs?)', other) and re.sub(
+                    r'n(ano)?(secs?)$', r'\2', other).rstrip('s') == name.rstrip('s'):
+                return t + 1e-9 * self.numbers(other), 1.0
+        return t, unit_of(name)
 
-        times: dates in ISO 8601 and times of day are numbers too, in seconds.
-        """
+    def numbers(self, name: str, what: str = 'number') -> Array:
+        """A column as numbers (N,), nan where there is none; raises InputError."""
         cells = self.cells[self.names.index(name)]
         if isinstance(cells, np.ndarray):
             return cells
-        values, broken = np.full(len(cells), nan), []
-        for k, cell in enumerate(cells):
-            value = _number(cell, self.comma)
-            if value is None and times:
-                value = _date(cell)
-            if value is not None:
-                values[k] = value
-            elif cell.lower() not in NOT_KNOWN:
-                broken.append(k)
+        read = [_number(cell, self.comma) for cell in cells]
+        values = np.array([nan if value is None else value for value in read])
+        broken = [k for k in np.flatnonzero(np.isnan(values)) if cells[k].lower() not in NOT_KNOWN]
         if len(broken) > MOST_BROKEN * len(cells):
             raise InputError(
                 f'{self.path}: column {name!r}: {cells[broken[0]]!r} in row {broken[0] + 1} is no '
-                f'{"time" if times else "number"}, as in {len(broken)} of {len(cells)} rows: '
+                f'{what}, as in {len(broken)} of {len(cells)} rows: '
                 f'choose another column with --columns; {columns_of(self.names)}'
             )
         return values
 
+    def by_name(self) -> Table:
+        """The table with a column for each name that stands in a cell, where a row has one value.
+
+        The same table where it is none of names and values.
+        """
+        of_values = [k for k, name in enumerate(self.names)
+                     if re.fullmatch(r'.*(value|data|reading)', name.lower())]
+        words = [k for k, cells in enumerate(self.cells) if not isinstance(cells, np.ndarray)
+                 and 2 <= len({*cells}) <= 20
+                 and all(cell and _number(cell, self.comma) is None for cell in cells)]
+        if len(of_values) != 1 or len(words) != 1:
+            return self
+        keys, values = self.cells[words[0]], self.cells[of_values[0]]
+        kept = [k for k in range(len(self.names)) if k not in (words[0], of_values[0])]
+        names = sorted({str(key) for key in keys})
+        return Table(self.path, (*(self.names[k] for k in kept), *names), (
+            *(self.cells[k] for k in kept),
+            *([str(value) if key == name else '' for key, value in zip(keys, values, strict=True)]
+              for name in names)), self.comma, self.notes)
+
 
 def _number(cell: str, comma: bool) -> float | None:
+    if ',' in cell:
+        # What stands last is the decimal sign where both occur.
+        decimal = cell.rfind(',') > cell.rfind('.') if '.' in cell else comma
+        cell = cell.replace('.', '').replace(',', '.') if decimal else cell.replace(',', '')
     try:
-        return float(cell.replace(',', '.') if comma else cell)
-    except ValueError:
-        return None
-
-
-def _date(cell: str) -> float | None:
-    """Seconds of a date, or of a time of day; all stamps of one log are of one zone."""
-    text = re.sub(r'( ?Z| UTC|[+-]\d\d:?\d\d)$', '', cell.strip('"'))
-    text = text.replace('/', '-').replace(',', '.')
-    text = text if '-' in text else f'1970-01-01 {text}'
-    try:
-        return float(np.datetime64(text).astype('datetime64[ns]').astype(np.int64)) * 1e-9
+        return float(cell)
     except ValueError:
         return None
 
@@ -95,10 +120,11 @@ def read_table(path: Path) -> Table:
         raise InputError(f'{path}: cannot be read: {error}') from None
     if data[:4] == b'PAR1':
         return _from_parquet(path)
-    wide = data[:2] in (b'\xff\xfe', b'\xfe\xff')
+    wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else \
+        'utf-16-le' if b'\0' in data and not data[1:200:2].strip(b'\0') else ''
     if b'\0' in data[:4096] and not wide:
         raise InputError(f'{path}: is no text: give a CSV, a Parquet file, or the folder of a bag')
-    for encoding in ('utf-16',) if wide else ('utf-8-sig', 'latin-1'):
+    for encoding in (wide,) if wide else ('utf-8-sig', 'latin-1'):
         try:
             return _from_text(path, data.decode(encoding))
         except UnicodeDecodeError:
@@ -107,57 +133,55 @@ def read_table(path: Path) -> Table:
 
 
 def _from_text(path: Path, text: str) -> Table:
-    no_table = 'holds no table: give rows of numbers with t, v and y, separated by , ; or tabs'
-    lines = text.replace('\0', '').splitlines()
-    separator, count = _separator(lines)
-    rows = [_split(line, separator) for line in lines]
-    cells = [cell for row in rows if len(row) == count for cell in row]
-    # A decimal comma needs another separator.
-    comma = separator != ',' and sum(',' in cell for cell in cells) > sum(
-        '.' in cell for cell in cells)
-
-    def has_number(row: Sequence[str]) -> bool:
-        return any(_number(cell, comma) is not None for cell in row)
-
+    lines = [line for line in text.replace('\0', '').replace('−', '-').splitlines()
+             if line.strip()]
+    comments = [line.lstrip().startswith(('#', '%', '//')) for line in lines]
+    separator, count = _separator(
+        [line for line, comment in zip(lines, comments, strict=True) if not comment])
+    rows = [_split(line.lstrip('#%/ \t') if comment else line.strip(' \r'), separator)
+            for line, comment in zip(lines, comments, strict=True)]
+    numeric = [any(_number(cell, True) is not None for cell in row) for row in rows]
     # A last row may be torn; trailing separators may be missing.
-    data = [count - 1 <= len(row) <= count + 1 and has_number(row) for row in rows]
+    data = [count - 1 <= len(row) <= count + 1 and number and not comment
+            for row, number, comment in zip(rows, numeric, comments, strict=True)]
     if not count or not any(data):
-        raise InputError(f'{path}: {no_table}')
+        raise InputError(f'{path}: holds no table: give rows of numbers with t, v and y, separated '
+                         'by , ; or tabs')
     # From the middle of the file upwards: a table may stand below other ones.
-    head = min(np.flatnonzero(data).tolist(), key=lambda k: abs(k - len(rows) // 2))
-    filled = sum(map(bool, rows[head]))
-    names: list[str] = []
-    while head >= 0 and not names:
+    first = min(np.flatnonzero(data).tolist(), key=lambda k: abs(k - len(rows) // 2))
+    filled = sum(map(bool, rows[first]))
+
+    def is_head(k: int) -> bool:
+        return k >= 0 and not numeric[k] and sum(map(bool, rows[k])) >= max(2, filled - 1)
+
+    head = next((k for k in range(first - 1, -1, -1) if is_head(k)), -1)
+    # A head that comes again belongs to the same table.
+    head = rows.index(rows[head]) if head >= 0 else head
+    units: list[str] = []
+    if is_head(head - 1) and _are_units(rows[head]):
+        units = rows[head]
         head -= 1
-        row = rows[head] if head >= 0 else []
-        if row and _is_comment(lines[head]):
-            row = _split(lines[head].lstrip('#%/ \t'), separator)
-        width = max((k + 1 for k, cell in enumerate(row) if cell), default=0)
-        if width >= max(2, filled - 1) and not has_number(row):
-            names = row[:width]
-    names = _told_apart(names, count)
-    below = range(head + 1, len(rows))
+    names = _told_apart(rows[head] if head >= 0 else [], units, count)
+    heads = [units, rows[head]] if head >= 0 else []
+    below = [k for k in range(head + 1, len(rows)) if not comments[k] and rows[k] not in heads]
     body = [[*rows[k], *[''] * (count - len(rows[k]))][:count] for k in below if data[k]]
-    skipped = sum(
-        not data[k] and lines[k].strip() != '' and not _is_comment(lines[k]) for k in below)
+    skipped = len(below) - len(body)
     if skipped > max(MOST_BROKEN * len(body), 3.0):
         raise InputError(
             f'{path}: {skipped} of {skipped + len(body)} lines are no rows of its table: '
             f'{columns_of(names)}; leave one table with t, v and y'
         )
+    cells = [cell for row in body for cell in row]
+    comma = sum(',' in cell for cell in cells) > sum('.' in cell for cell in cells)
     notes = (f'{skipped} broken line{"s" if skipped > 1 else ""} left out',) if skipped else ()
     return Table(path, tuple(names), tuple(zip(*body, strict=True)), comma, notes)
-
-
-def _is_comment(line: str) -> bool:
-    return line.lstrip().startswith(('#', '%', '//'))
 
 
 def _split(line: str, separator: str) -> list[str]:
     if separator == ' ':
         return line.split()
     if '"' not in line:
-        return [cell.strip() for cell in line.split(separator)] if line else []
+        return [cell.strip() for cell in line.split(separator)]
     try:
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
     except csv.Error:
@@ -168,15 +192,12 @@ def _separator(lines: list[str]) -> tuple[str, int]:
     """What separates the cells, and how many a row has; 0 where there is no table."""
     looked_at = 200  # lines by which the separator is told, from the middle of the file
     begin = max(len(lines) // 2 - looked_at // 2, 0)
-    part = [line for line in lines[begin:begin + looked_at]
-            if any(sign.isdigit() for sign in line) and not _is_comment(line)]
+    part = [line for line in lines[begin:begin + looked_at] if re.search(r'\d', line)]
     best, most = (',', 0), 0.5
-    for separator in ('\t', ';', ',', '|', ' '):
-        rows = [_split(line, separator) for line in part]
-        counts = Counter(
-            len(row) for row in rows
-            if len(row) > 1 and any(_number(cell, separator != ',') is not None for cell in row)
-        )
+    for separator in '\t;,| ':
+        rows = [_split(line.strip(' \r'), separator) for line in part]
+        counts = Counter(len(row) for row in rows if len(row) > 1 and any(
+            _number(cell, True) is not None for cell in row))
         for count, times in counts.most_common(1):
             # The first of those that explain as much: a comma may be a decimal sign.
             if times / len(part) > 1.05 * most:
@@ -184,11 +205,21 @@ def _separator(lines: list[str]) -> tuple[str, int]:
     return best
 
 
-def _told_apart(head: Sequence[str], count: int) -> list[str]:
+def _are_units(row: Sequence[str]) -> bool:
+    """Whether a row below the names holds units, like [ms], deg, mm/s."""
+    bare = [cell.strip('[]() ').lower() for cell in row]
+    return all(len(cell) <= 9 for cell in bare) and (
+        len({*bare}) < len(bare) or any(cell in UNITS_S for cell in bare)
+        or all(cell[:1] in '[(' for cell in row))
+
+
+def _told_apart(head: Sequence[str], units: Sequence[str], count: int) -> list[str]:
     """Names of all columns: numbers for those without, a second one of a name with its number."""
     names = [(head[k] if k < len(head) else '') or str(k + 1) for k in range(count)]
     again = [names[:k].count(name) + 1 for k, name in enumerate(names)]
-    return [f'{name} ({n})' if n > 1 else name for name, n in zip(names, again, strict=True)]
+    names = [f'{name} ({n})' if n > 1 else name for name, n in zip(names, again, strict=True)]
+    return [f'{name} [{units[k].strip("[]() ")}]' if k < len(units) and units[k] else name
+            for k, name in enumerate(names)]
 
 
 def _from_parquet(path: Path) -> Table:

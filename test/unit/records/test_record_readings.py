@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from backlash_ros.core.records.readings import failed, own_readings, quantum, unwrapped
+from backlash_ros.core.records.readings import (
+    failed,
+    own_readings,
+    quantum,
+    unwrapped,
+    without_slips,
+)
 from backlash_ros.core.records.record import Record
 from backlash_ros.core.records.rows_to_record import record_of
 
@@ -75,6 +81,21 @@ def test_what_only_jumps_is_not_unwrapped(values: Array) -> None:
     found, told = unwrapped(values)
     assert told == 0.0
     assert found is values
+
+
+@pytest.mark.parametrize('turn', [2.0 * np.pi, -360.0])
+def test_a_turn_that_was_lost_is_taken_out_and_said(turn: float) -> None:
+    slipped = MOTION + NOISE + np.where((T > 3.0) & (T < 9.0), turn, 0.0)
+    record = record_of(T, 1.2 * MOTION, slipped)
+    assert record.y == pytest.approx(MOTION + NOISE, abs=1e-9)
+    assert 'a whole turn, while v does not: taken out' in record.notes[0]
+
+
+@pytest.mark.parametrize(('v', 'y'), [
+    (SQUARE, SQUARE), (MOTION, MOTION + np.where(T > 3.0, 6.0, 0.0)), (STEPPED, 9.0 * STEPPED),
+], ids=['v jumps', 'no whole turn', 'stepped'])
+def test_what_v_does_and_what_is_no_turn_is_kept(v: Array, y: Array) -> None:
+    assert without_slips(y, v)[1] == 0.0
 
 
 @pytest.mark.parametrize(('y', 'step'), [

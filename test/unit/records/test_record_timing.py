@@ -112,7 +112,27 @@ def test_a_longer_period_than_that_of_the_stamps_is_kept_with_the_time() -> None
 def test_equal_stamps_of_a_coarse_clock_keep_the_mean_period() -> None:
     for rows in (2, 3, 8):
         stamps = even()[rows * (np.arange(COUNT) // rows)]
-        assert log(even(), stamps=stamps).sample_period == pytest.approx(PERIOD_S, rel=0.01)
+        record = log(even(), stamps=stamps)
+        assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-6)
+        assert record.lost == 0
+        assert off(record) < 1.1e-3
+
+
+def test_rows_with_equal_stamps_that_do_not_move_are_one_reading() -> None:
+    stamps = even()[2 * (np.arange(COUNT) // 2)]
+    record = record_of(stamps, command(stamps), position(stamps) + 1e-9 * even())
+    assert record.sample_period == pytest.approx(2.0 * PERIOD_S, rel=1e-3) or record.lost > 500
+
+
+@pytest.mark.parametrize(('around', 'unit_s'), [
+    (86400.0, 1.0), (2.0**32, 1e-3), (2.0**32, 1e-6), (2.0**16, 1e-3), (3600.0, 1.0),
+])
+def test_a_clock_that_begins_anew_is_counted_on(around: float, unit_s: float) -> None:
+    stamps = np.round(np.mod(around - 5.0 / unit_s + even() / unit_s, around), 6)
+    record = record_of(stamps, command(even()), position(even()), unit_s=unit_s)
+    assert record.y.tolist() == position(even()).tolist()
+    assert record.sample_period == pytest.approx(PERIOD_S, rel=1e-6)
+    assert 'counted on' in record.timing
 
 
 def test_missing_rows_of_even_stamps_are_counted() -> None:
