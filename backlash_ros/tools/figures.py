@@ -318,7 +318,7 @@ def draw_error_curves(loops: Sequence[figure_data.ErrorCurves], window_s: float)
         if highest := [float(size.max()) for size in known if size.size]:
             # Not the least of all, as an error begins at zero; a law that diverges leaves the axes.
             low = float(np.percentile(np.concatenate(known), 2))
-            limit_decades(axes, low, min(max(highest), 1e3 * min(highest)))
+            limit_decades(axes, low, min(max(highest), 1e3 * float(np.median(highest))))
     label(grid[0, 0], 'Control error')
     label(grid[-1, 0], 'Tracking error, where y is meant to follow' if tracking else '')
     legend_below(figure, grid[0, 0], columns=3)

@@ -36,9 +36,10 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     Prints on stderr what the user has to know about the source. Raises InputError for a run without
     samples.
     """
-    for note in run.notes:
-        print(f'report: warning: {note}', file=sys.stderr)
     summary = summarise(run.record, run.parameters, run.latency_s)
+    notes = [*run.notes, *_losses(summary, run.parameters)]
+    for note in notes:
+        print(f'report: warning: {note}', file=sys.stderr)
     files.write_run(run.record, out)
     files.write_summary(summary, out / files.SUMMARY_FILE)
     folded = None
@@ -51,12 +52,20 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     ]
     for picture in pictures:
         write_atomically(out / picture.name, picture.data)
-    notes = [f'{note[0].upper()}{note[1:]}.' for note in run.notes]
     write_atomically(out / REPORT_PAGE, page(
-        'Adaptive backlash inverse control', headline(summary), notes, [_tables(summary)],
-        pictures, folded,
+        'Adaptive backlash inverse control', headline(summary),
+        [f'{note[0].upper()}{note[1:]}.' for note in notes], [_tables(summary)], pictures, folded,
     ))
     return summary
+
+
+def _losses(summary: Mapping[str, Any], parameters: Parameters | None) -> Iterator[str]:
+    """A sentence on lost samples, where they are many and nobody has asked for them."""
+    lost = summary['lost_samples']
+    total = lost + summary['samples']
+    if lost > 0.01 * total and not (parameters and parameters.output_loss):
+        yield (f'{lost} of {total} samples were lost: what the figures show at these times is not '
+               'the doing of the law; is the machine too busy for this sample period?')
 
 
 def _figures(
@@ -167,6 +176,7 @@ def _tables(summary: Mapping[str, Any]) -> str:
         ('began with', f'{began}: {escape(first["from"])}' if first['from'] else began),
         ('control error RMS, last second', number(summary['control_error_rms'], 4, '[unit of u]')),
         ('tracking error RMS, last half',
+         'y is not to follow y<sub>m</sub>' if summary['structure'] == 'proportional' else
          number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)),
         ('latency y → v, median', number(latency['p50'], 3, 'ms')),
         ('latency y → v, 99th percentile', number(latency['p99'], 3, 'ms')),

@@ -117,8 +117,9 @@ class ControllerState:
             return 'no diagnostics yet'
         if silent_s := self.silent_s(now_s):
             return f'silent for {silent_s:.0f} s'
-        # An unconfigured or inactive controller has no state of the estimates to tell.
-        return self.values.get('state') or self.message.partition(':')[0]
+        # What the estimates were when it was deactivated is no state of the controller.
+        beginning = self.message.partition(':')[0]
+        return beginning if beginning == 'inactive' else self.values.get('state') or beginning
 
 
 class FollowedControllers:

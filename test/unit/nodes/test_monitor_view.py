@@ -109,3 +109,5 @@ def test_an_inactive_controller_is_told_by_its_message() -> None:
     say(state, 'unconfigured', values={})
     assert state.word(100.0) == 'unconfigured'
     assert any('unconfigured' in line for line in shown([state]))
+    say(state, 'inactive: no control is published', values={'state': 'tracking'})
+    assert state.word(100.0) == 'inactive'

@@ -161,6 +161,16 @@ def test_file_of_another_kind_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures('undrawn')
+@pytest.mark.parametrize(('lost', 'meant', 'said'), [(1, 0.0, 0), (3, 0.0, 1), (3, 0.1, 0)])
+def test_many_lost_samples_are_named_unless_they_were_asked_for(
+    run, tmp_path, capsys, lost, meant, said,
+):
+    of_losses = RunRecord(run.rows, run.sample_period, lost)
+    report.write_report(Run(of_losses, PARAMETERS.replaced({'output_loss': meant})), tmp_path)
+    assert capsys.readouterr().err.count(f'{lost} of {120 + lost} samples were lost') == said
+
+
+@pytest.mark.usefixtures('undrawn')
 def test_run_of_one_sample_has_a_report(tmp_path: Path) -> None:
     run = build_closed_loop(PARAMETERS).run(1)
     assert report.write_report(Run(run, PARAMETERS), tmp_path)['samples'] == 1
