@@ -38,13 +38,14 @@ setup(
     python_requires='>=3.10',
     # rclpy is not listed: a ROS machine has it under another name than the package index.
     install_requires=[
-        'aiohttp', 'matplotlib', 'mcap', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm',
+        'matplotlib', 'mcap', 'numpy', 'PyYAML', 'rich', 'rosbags', 'scipy', 'tqdm',
     ],
     extras_require={
         'cluster': ['distributed'],
         'parquet': ['pyarrow'],
         'test': [
-            'distributed', 'hypothesis', 'mcap-ros2-support', 'pyarrow', 'pytest', 'pytest-timeout',
+            'aiohttp', 'distributed', 'hypothesis', 'mcap-ros2-support', 'pyarrow', 'pytest',
+            'pytest-timeout',
         ],
     },
     entry_points={

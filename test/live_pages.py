@@ -3,12 +3,12 @@
 import json
 import os
 import re
-from collections.abc import AsyncIterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
-from aiohttp import ClientResponse
-from bringup_processes import Session, wait_until
+from bringup_processes import DEADLINE_S, Session, wait_until
 
 ADDRESS = re.compile(r'http://127\.0\.0\.1:\d+$', re.MULTILINE)
 LISTENING = '0A'
@@ -24,10 +24,14 @@ def address_of(session: Session) -> str:
     return found[0]
 
 
-async def frames(response: ClientResponse) -> AsyncIterator[dict[str, Any]]:
-    """What a stream of events holds, one after the other."""
-    while line := await response.content.readuntil(b'\n\n'):
-        yield json.loads(line.removeprefix(b'data: '))
+def frames(address: str) -> Iterator[dict[str, Any]]:
+    """What a page is sent, one answer after the other."""
+    known = 0
+    while True:
+        with urlopen(f'{address}/frame?known={known}', timeout=DEADLINE_S) as response:
+            frame = json.load(response)
+        known = frame['count']
+        yield frame
 
 
 def listening_addresses(process: int) -> set[str]:

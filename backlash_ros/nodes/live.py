@@ -6,9 +6,8 @@ The page is served to this machine alone, at an address that is printed.
 from __future__ import annotations
 
 import argparse
-import asyncio
-import socket
 import sys
+import threading
 import time
 from collections.abc import Sequence
 
@@ -17,19 +16,12 @@ from rclpy.utilities import remove_ros_args
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
 from backlash_ros.nodes.watching.followed import ControllerState, FollowedControllers, give_way
-from backlash_ros.nodes.watching.page_server import (
-    HOST,
-    CurvePoints,
-    PageServer,
-    as_json,
-    bound_socket,
-    rounded,
-)
+from backlash_ros.nodes.watching.page_server import CurvePoints, PageServer, rounded
 from backlash_ros.options import LARGEST_PORT, OptionParser
 from backlash_ros.topics import BACKLASH
 
 LIVE = 'live'
-SHOWN_S = 10.0  # width of the curves
+SHOWN_S, FRAME_PERIOD_S = 10.0, 0.1  # width of the curves, time between two looks
 LIVE_LABELS = (
     *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
     'y_m', 'y', 'u_d', 'v', 'u_hat',
@@ -39,51 +31,46 @@ LIVE_LABELS = (
 class LiveNode(ProcessNode):
     """Shows every controller of the domain, or those of some namespaces.
 
-    wanted: names of controllers or namespaces, none for all. bound: where the page is served.
+    wanted: names of controllers or namespaces, none for all.
     """
 
-    def __init__(self, wanted: Sequence[str], bound: socket.socket) -> None:
+    def __init__(self, wanted: Sequence[str], server: PageServer) -> None:
         super().__init__(LIVE)
         # A machine that is held up for a second loses no point.
         self._followed = FollowedControllers(self, wanted, LIVE_LABELS, depth=30)
-        self._socket = bound
+        self._server = server
         self._start_ns = time.time_ns()
         self._points: dict[str, CurvePoints] = {}
 
     def work(self, executor: PromptExecutor) -> None:
         """Serve the page until a signal ends it."""
-        asyncio.run(self._serve(executor))
-
-    async def _serve(self, executor: PromptExecutor) -> None:
-        frame_period_s = 0.1  # between two frames of the page
-        server = PageServer(self._socket, self._head, kept=round(SHOWN_S / frame_period_s))
-        await server.start()
-        address = f'http://{HOST}:{self._socket.getsockname()[1]}'
+        threading.Thread(
+            target=self._server.serve_forever, args=[FRAME_PERIOD_S], daemon=True
+        ).start()
         if ENABLED:
-            emit('ready', address=address)
+            emit('ready', address=self._server.address)
         else:
-            print(address, flush=True)
+            print(self._server.address, flush=True)
         due_s = time.monotonic()
-        try:
-            while not self.stopping:
-                executor.spin_once(timeout_sec=0.0)  # the look for further controllers
-                self._followed.take_diagnostics()
-                await server.add(as_json({
-                    name: self._points.setdefault(name, CurvePoints(self._start_ns))
-                    .take(state.watch()) for name, state in self._followed.by_name.items()
-                }))
-                due_s = max(due_s + frame_period_s, time.monotonic())
-                await asyncio.sleep(due_s - time.monotonic())
-        finally:
-            await server.stop()
+        while not self.stopping:
+            executor.spin_once(timeout_sec=0.0)  # the look for further controllers
+            self._followed.take_diagnostics()
+            self._server.add(self._state(), {
+                name: self._points.setdefault(name, CurvePoints(self._start_ns))
+                .take(state.watch()) for name, state in self._followed.by_name.items()
+            })
+            now_s = time.monotonic()
+            due_s = max(due_s + FRAME_PERIOD_S, now_s)
+            time.sleep(due_s - now_s)
+        self._server.shutdown()
 
-    def _head(self) -> str:
+    def _state(self) -> dict[str, object]:
         by_name, now_s = self._followed.by_name, time.monotonic()
-        return as_json({
+        return {
             'now': round(1e-9 * (time.time_ns() - self._start_ns), 3), 'shown': SHOWN_S,
             'awaited': self._followed.awaited,
             'controllers': [content_of(by_name[name], now_s) for name in sorted(by_name)],
-        })[1:-1]
+        }
 
 
 def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
@@ -117,12 +104,12 @@ def main(args: list[str] | None = None) -> int:
     if not 0 <= options.port <= LARGEST_PORT:
         parser.error(f'--port={options.port}: must be from 0 (a free one) to {LARGEST_PORT}')
     try:
-        bound = bound_socket(options.port)
+        server = PageServer(options.port, kept=round(SHOWN_S / FRAME_PERIOD_S))
     except OSError as error:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
     give_way()
-    with bound:
-        return run(LIVE, lambda: LiveNode(options.name, bound), ros_arguments(arguments))
+    with server:
+        return run(LIVE, lambda: LiveNode(options.name, server), ros_arguments(arguments))
 
 
 if __name__ == '__main__':

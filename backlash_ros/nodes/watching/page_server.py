@@ -1,17 +1,18 @@
-"""Serves the page and its stream of server-sent events, to browsers of this machine alone."""
+"""Serves the live page, and what it asks for ten times a second, to browsers of this machine."""
 
 from __future__ import annotations
 
-import asyncio
 import json
-import socket
+import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from math import isfinite
 from pathlib import Path
-
-from aiohttp import web
-from aiohttp.typedefs import Handler
+from threading import Lock
+from typing import Any
 
 HOST = '127.0.0.1'
 Curves = dict[str, list[float | None]]
@@ -20,11 +21,6 @@ Curves = dict[str, list[float | None]]
 def rounded(value: float) -> float | None:
     """A number for JSON, which has no nan: None."""
     return float(f'{value:.7g}') if isfinite(value) else None
-
-
-def as_json(content: object) -> str:
-    """Without spaces."""
-    return json.dumps(content, separators=(',', ':'), allow_nan=False)
 
 
 class CurvePoints:
@@ -58,96 +54,73 @@ class CurvePoints:
         return curves
 
 
-def bound_socket(port: int) -> socket.socket:
-    """A socket that listens on this port of this machine, 0 for a free one; raises OSError."""
-    bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    try:
-        # A port that was used a minute ago is free.
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind((HOST, port))
-        bound.listen()
-    except OSError:
-        bound.close()
-        raise
-    return bound
+class PageServer(ThreadingHTTPServer):
+    """Answers each browser in a thread of its own, so that a slow one holds up nobody.
 
-
-@web.middleware
-async def for_this_machine(request: web.Request, handler: Handler) -> web.StreamResponse:
-    """Refuse whoever came here by another name."""
-    # A page from elsewhere may let a name of its own point here, and read along.
-    if request.host.partition(':')[0] not in (HOST, 'localhost'):
-        raise web.HTTPForbidden(text=f'only {HOST} is served\n')
-    return await handler(request)
-
-
-class PageServer:
-    """Sends every reader what is new, at the pace that it takes it.
-
-    Nothing is queued for a reader: when it has taken one frame it gets the next with all portions
-    that have been added, as far back as they are kept.
-
-    head: what a frame holds besides, as members of a JSON object. kept: how many portions are.
+    port: 0 for a free one; raises OSError. kept: portions of curves for who has asked last so long
+    ago. began: tells this server from one that was here before.
     """
 
-    def __init__(self, bound: socket.socket, head: Callable[[], str], kept: int) -> None:
-        self._socket, self._head = bound, head
-        self._portions: deque[str] = deque(maxlen=kept)  # each of them JSON
-        self._count = 0  # of portions so far
-        self._renewed = asyncio.Condition()
-        self._readers = 0
-        application = web.Application(middlewares=[for_this_machine])
-        application.router.add_get('/', self._page)
-        application.router.add_get('/events', self._events)
-        self._runner = web.AppRunner(
-            # Some browsers do not take what they are sent.
-            application, access_log=None, handle_signals=False, shutdown_timeout=0.2,
-        )
+    daemon_threads = True
 
-    async def start(self) -> None:
-        """Begin to serve."""
-        await self._runner.setup()
-        await web.SockSite(self._runner, self._socket).start()
+    def __init__(self, port: int, kept: int) -> None:
+        super().__init__((HOST, port), PageRequest)
+        self.address = f'http://{HOST}:{self.server_address[1]}'
+        self._began = time.time_ns()
+        self._state, self._count = '{}', 0  # the newest state, how many portions there were
+        self._portions: deque[str] = deque(maxlen=kept)
+        self._lock = Lock()
 
-    async def add(self, portion: str) -> None:
-        """Send it to every reader that waits, and to the others when they can take it."""
-        self._portions.append(portion)
-        self._count += 1
-        async with self._renewed:
-            self._renewed.notify_all()
+    def add(self, state: Mapping[str, object], portion: Mapping[str, Curves]) -> None:
+        """Have this ready for whoever asks: what the page says, and the newest points of curves."""
+        texts = [json.dumps(each, separators=(',', ':'), allow_nan=False)
+                 for each in (state, portion)]
+        with self._lock:
+            self._state, self._count = texts[0], self._count + 1
+            self._portions.append(texts[1])
 
-    async def stop(self) -> None:
-        """End all streams."""
-        await self._runner.cleanup()
+    def frame(self, known: int) -> str:
+        """The state and the portions that somebody is missing who has so many, as JSON."""
+        with self._lock:
+            first = len(self._portions) - self._count + known if known <= self._count else 0
+            missing = ','.join(list(self._portions)[max(first, 0):])
+            return (f'{{"state":{self._state},"began":{self._began},"count":{self._count},'
+                    f'"portions":[{missing}]}}')
 
-    async def _page(self, request: web.Request) -> web.StreamResponse:
-        page = Path(__file__).with_name('page.html')
-        return web.Response(
-            text=page.read_text(encoding='utf-8'), content_type='text/html',
-            headers={'Cache-Control': 'no-store'},
-        )
 
-    async def _events(self, request: web.Request) -> web.StreamResponse:
-        most_readers = 16  # pages that are open at once
-        if self._readers >= most_readers:
-            raise web.HTTPServiceUnavailable(text=f'{most_readers} pages are open already\n')
-        response = web.StreamResponse(
-            headers={'Content-Type': 'text/event-stream', 'Cache-Control': 'no-store'}
-        )
-        self._readers += 1
-        try:
-            await response.prepare(request)
-            known = 0  # portions that the reader has
-            while True:
-                missing = list(self._portions)[max(len(self._portions) - self._count + known, 0):]
-                known = self._count
-                # Waits here, and here alone, for a browser that is slow.
-                await response.write(
-                    f'data: {{{self._head()},"portions":[{",".join(missing)}]}}\n\n'.encode()
-                )
-                async with self._renewed:
-                    await self._renewed.wait()
-        except ConnectionResetError:
-            return response  # the page was closed
-        finally:
-            self._readers -= 1
+class PageRequest(BaseHTTPRequestHandler):
+    """What a browser asks for: / is the page, /frame?known=N what it is missing."""
+
+    server: PageServer
+    protocol_version = 'HTTP/1.1'  # one connection for all frames
+    timeout = 10.0  # [s] for a browser that has fallen silent
+
+    def do_GET(self) -> None:
+        """Answer it; called by the library."""
+        path, _, known = self.path.partition('?known=')
+        # A page from elsewhere may let a name of its own point here, and read along.
+        if self.headers.get('Host', '').partition(':')[0] not in (HOST, 'localhost'):
+            self.send_error(HTTPStatus.FORBIDDEN, f'only {HOST} is served')
+        elif path == '/':
+            self._answer('text/html', Path(__file__).with_name('page.html').read_bytes())
+        elif path == '/frame':
+            frame = self.server.frame(int(known) if known.isdecimal() else 0)
+            self._answer('application/json', frame.encode())
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def handle(self) -> None:
+        """Answer until the browser has gone."""
+        with suppress(OSError):
+            super().handle()
+
+    def log_message(self, *message: Any) -> None:
+        """Nobody reads of each request."""
+
+    def _answer(self, kind: str, content: bytes) -> None:
+        self.send_response(HTTPStatus.OK)
+        for name, value in (('Content-Type', f'{kind}; charset=utf-8'),
+                            ('Content-Length', str(len(content))), ('Cache-Control', 'no-store')):
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
