@@ -21,7 +21,7 @@ from backlash_ros.options import LARGEST_PORT, OptionParser
 from backlash_ros.topics import BACKLASH
 
 LIVE = 'live'
-SHOWN_S, FRAME_PERIOD_S = 10.0, 0.1  # width of the curves, time between two looks
+SHOWN_S, PAGE_PERIOD_S = 10.0, 0.1  # width of the curves, time between two looks
 LIVE_LABELS = (
     *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
     'y_m', 'y', 'u_d', 'v', 'u_hat',
@@ -45,7 +45,7 @@ class LiveNode(ProcessNode):
     def work(self, executor: PromptExecutor) -> None:
         """Serve the page until a signal ends it."""
         threading.Thread(
-            target=self._server.serve_forever, args=[FRAME_PERIOD_S], daemon=True
+            target=self._server.serve_forever, args=[PAGE_PERIOD_S], daemon=True
         ).start()
         if ENABLED:
             emit('ready', address=self._server.address)
@@ -60,7 +60,7 @@ class LiveNode(ProcessNode):
                 .take(state.watch()) for name, state in self._followed.by_name.items()
             })
             now_s = time.monotonic()
-            due_s = max(due_s + FRAME_PERIOD_S, now_s)
+            due_s = max(due_s + PAGE_PERIOD_S, now_s)
             time.sleep(due_s - now_s)
         self._server.shutdown()
 
@@ -104,7 +104,7 @@ def main(args: list[str] | None = None) -> int:
     if not 0 <= options.port <= LARGEST_PORT:
         parser.error(f'--port={options.port}: must be from 0 (a free one) to {LARGEST_PORT}')
     try:
-        server = PageServer(options.port, kept=round(SHOWN_S / FRAME_PERIOD_S))
+        server = PageServer(options.port, kept=round(SHOWN_S / PAGE_PERIOD_S))
     except OSError as error:
         parser.error(f'--port={options.port}: {error.strerror}: choose another one, or none')
     give_way()
