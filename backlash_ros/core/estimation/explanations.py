@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import inf, sqrt
 from typing import NamedTuple
@@ -11,14 +12,14 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
-from backlash_ros.core.estimation.fit import FIRST_STEPS, Problem
+from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.posterior import Fit, Prior, Start
 from backlash_ros.core.estimation.search import search
 
 Array = NDArray[np.float64]
 
-CANDIDATES, APART = 6, 0.02  # best gaps of a search that are fitted, and their relative distance
+CANDIDATES, APART = 3, 0.1  # best gaps of a search that are fitted, and their relative distance
 WALKS = (0.005, 0.02, 0.08)  # of u over the whole record, over m times the gap, that are compared
 FAR_BEHIND = 30.0  # log-likelihood by which a candidate, or no walk of u, is given up
 BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
@@ -106,24 +107,29 @@ def afresh(
     family = setup.family
     if np.isfinite(record.y).sum() < 15 + 2 * family.count or np.ptp(record.v) == 0.0:
         return None
-    found, null = search(family, record.v, record.y, setup.noise_std, setup.widest)
-    if not found or found[0].evidence < null + settings.ENGAGED:
-        return None
     p = problem_of(setup, record) if like is None else \
         problem_of(setup, record, of_xi(like), most_scale=like.scale)
     # The noise of a first step is at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
-    fits: list[Fit] = []
-    gaps: list[float] = []
     xi = np.zeros(family.count) if like is None else like.theta[3:]
-    for _, gap, p0, m in found:
-        if len(gaps) == CANDIDATES:
+    fits: list[Fit] = []
+    # Once more around G as the best of the first gaps has it.
+    for _ in range(2 if family.count and like is None else 1):
+        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
+        if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break
-        if m * found[0].m > 0.0 and all(abs(gap - other) > APART * other for other in gaps):
-            gaps.append(gap)
-            theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
-            start = p.step(Fit(np.zeros(1), p0, theta, noise), 1.0, held=True)
-            fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
+        gaps: list[float] = []
+        for _, gap, p0, m in found:
+            if len(gaps) == CANDIDATES:
+                break
+            if m * found[0].m > 0.0 and all(abs(gap - other) > APART * other for other in gaps):
+                gaps.append(gap)
+                theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
+                start = p.step(Fit(np.zeros(1), p0, theta, noise), 1.0, held=True)
+                fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
+        xi = max(fits, key=lambda f: f.evidence).theta[3:]
+    if not fits:
+        return None
     if also is not None and also.m > 0.0:
         begins = replace(also.without_intervals, x=np.zeros(1))
         fits.append(p.finished(p.fitted(begins, FIRST_STEPS)))
@@ -138,8 +144,9 @@ def afresh(
     if best.m < 0.0:
         return best
     best = _begun_elsewhere(p, best)
-    apart, best = spread(best, fits), p.with_intervals(best)
-    return replace(with_walk(setup, p, best) if walks else best, spread=apart)
+    best = p.with_intervals(best)
+    best = replace(best, spread=spread(p, best, fits))
+    return with_walk(setup, p, best) if walks else best
 
 
 def with_walk(setup: Setup, p: Problem, f: Fit) -> Fit:
@@ -181,15 +188,41 @@ def _begun_elsewhere(p: Problem, f: Fit) -> Fit:
     return f if likeliest is f else p.finished(p.fitted(likeliest))
 
 
-def spread(best: Fit, fits: list[Fit]) -> Array:
-    """What the other fits add to the covariance of m, c_r, c_l around the best: their mixture."""
-    valid = [f for f in fits if f.valid]
-    share = np.exp([f.evidence - best.evidence for f in valid])
-    share /= max(float(share.sum()), 1e-300)
+def spread(p: Problem, best: Fit, others: Sequence[Fit] = ()) -> Array:
+    """What the covariance of m, c_r, c_l lacks around the best fit (3, 3).
+
+    That is the mixture with other fits, and what the readings leave open along the gap, all else
+    fitted: three deviations from the best they should be less likely by 4.5, or it is as far as it
+    takes until they are less likely at all.
+    """
     out = np.zeros((3, 3))
-    for each, f in zip(share, valid, strict=True):
+    valid = [f for f in (best, *others) if f.valid]
+    share = np.exp([f.evidence - best.evidence for f in valid])
+    for each, f in zip(share / max(float(share.sum()), 1e-300), valid, strict=True):
         apart = f.crossings - best.crossings
         out += each * np.outer(apart, apart)
+    if not best.valid or not best.gap > 0.0 or not best.cov[2, 2] > 0.0:
+        return out
+    weights, std, v = p.weights(best), sqrt(best.cov[2, 2]), float(p.v[0])
+    likeliest, widest = p.log_posterior(best, weights), 2.0 * float(np.ptp(p.v))
+    for away in (-3.0, 3.0):
+        wider = np.zeros((3, 3))
+        for reach in away * 3.0 ** np.arange(6.0):
+            gap = best.gap + reach * std
+            if not 0.0 < gap < widest:
+                break
+            there = replace(
+                best, p0=v + (best.p0 - v) * gap / best.gap,
+                theta=best.theta + best.cov[:, 2] * reach / std,
+            )
+            for _ in range(FEW_STEPS):
+                there = p.kept(p.step(there, held=True))
+            behind = max(likeliest - p.log_posterior(there, weights), 1.0)
+            apart = there.crossings - best.crossings
+            wider = max(0.5 / behind - reach**-2, 0.0) * np.outer(apart, apart)
+            if behind > 2.0 or there.m <= 0.0:
+                break
+        out += 0.5 * wider
     return out
 
 

@@ -34,13 +34,16 @@ LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
 KNOTS, KNOT_SAMPLES = 36, 8  # of a walk over a record at most, and samples between them at least
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 LONGEST_STEP = 2.0  # prior deviations by which G moves at once
+NEAR_EDGE = 3.0  # readings near an edge of their interval, for every unknown
 
 
 @dataclass
 class _Evaluated:
-    """What a record is by the values of a fit: p, u and y (N,), and what was asked of them."""
+    """What a record is by the values of a fit: G as b / a, p, u and y (N,), and what was asked."""
 
     fit: Fit
+    b: list[float]
+    a: list[float]
     p: Array
     u: Array
     y: Array
@@ -104,7 +107,7 @@ class Problem:
         if len(f.knots):
             u += walk(f.knots, len(self.v))
         b, a = self.family.at(f.xi)
-        one = _Evaluated(f, p, u, filtered(b, a, u, f.x))
+        one = _Evaluated(f, b, a, p, u, filtered(b, a, u, f.x))
         self._newest = [one, *self._newest[:2]]
         return one
 
@@ -122,7 +125,10 @@ class Problem:
     def _likelihood(self, f: Fit) -> Likelihood:
         one, how = self._evaluated(f), (f.noise_std, f.step)
         if how not in one.likelihoods:
-            one.likelihoods[how] = likelihood(self.y - one.y, *how)
+            found = likelihood(self.y - one.y, *how)
+            # In such units that a reading more or less makes no fit the likelier one.
+            density = found.log_density + log(self.step_of_readings or self.nominal)
+            one.likelihoods[how] = found._replace(log_density=density)
         return one.likelihoods[how]
 
     def log_posterior(self, f: Fit, w: Array | None = None) -> float:
@@ -155,12 +161,12 @@ class Problem:
     def step(self, f: Fit, most_scale: float = np.inf, held: bool = False) -> Fit:
         """The values that the linearization around f makes likeliest, with their posterior.
 
-        held: whether gap and beginning stay, so that all else fits them. Raises LinAlgError where
-        the numbers get too large.
+        held: whether the gap stays, so that all else fits it. Raises LinAlgError where the numbers
+        get too large.
         """
         weights = self.weights(f)
         _, score, information = self._likelihood(f)
-        x = _padded(f.x, len(self.family.at(f.xi)[1]) - 1)
+        x = _padded(f.x, len(self._evaluated(f).a) - 1)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
         beside = np.concatenate(self._beside(replace(f, x=x), len(beta), held))
         count = len(self.v)
@@ -183,8 +189,8 @@ class Problem:
 
     def jacobian(self, f: Fit, out: Array | None = None) -> Array:
         """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P); out: where they are written."""
-        b, a = self.family.at(f.xi)
         one = self._evaluated(f)
+        b, a = one.b, one.a
         side = engaged(self.v, one.p, max(f.gap, 0.0))
         # A side that has not moved p yet leaves it where it began.
         side[:int(np.argmax(np.append(one.p != f.p0, True)))] = NEITHER
@@ -211,7 +217,7 @@ class Problem:
         return out
 
     def _beside(self, f: Fit, size: int, held: bool) -> list[Array]:
-        """Rows of what is known beside the samples, or what gap and beginning are held at."""
+        """Rows of what is known beside the samples, and what the gap is held at."""
         vague = 100.0  # prior deviation of the state before a record, over the largest reading
         tight = 1e6  # weight of a beginning that is known
         first = size - 3 - self.family.count  # place of m
@@ -226,8 +232,7 @@ class Problem:
         begin[0, first - 1] = 1.0
         if held:
             wide[0, first + 2], wide[0, -1] = tight, tight * f.gap
-            begin[0, first - 1], begin[0, -1] = tight, tight * f.p0
-        elif self.start is None:  # anywhere within the gap of now
+        if self.start is None:  # anywhere within the gap of now
             begin[0, -1] = self.v[0] + 0.5 * f.gap
             begin *= sqrt(12.0) / max(f.gap, 1e-9)
         else:
@@ -319,12 +324,12 @@ class Problem:
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
             most = 1.0 if k < far_steps < steps else np.inf
-            new = self._kept(self.step(f, most))
+            new = self.kept(self.step(f, most))
             there = _towards(f, new)
             value = self.log_posterior(there, weights)
             if not value > best - 0.5:
                 # Beyond a kink of the play, where another side was engaged, it may be better.
-                again = _towards(there, self._kept(self.step(there, most)))
+                again = _towards(there, self.kept(self.step(there, most)))
                 of_again = self.log_posterior(again, weights)
                 if of_again > best:
                     there, value = again, of_again
@@ -333,8 +338,13 @@ class Problem:
                 length *= 0.3
                 there = _towards(f, new, length)
                 value = self.log_posterior(there, weights)
-            if not value > best - 50.0:  # f stands: only its posterior is new
-                return replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
+            if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
+                f = replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
+                noise_std = f.noise_std if f.step else self._noise_of(f)
+                if noise_std > 0.9 * f.noise_std:
+                    return f
+                f = replace(f, noise_std=noise_std)
+                continue
             moved = abs(there.gap - f.gap) / max(sqrt(max(new.cov[2, 2], 0.0)), 1e-300)
             f = there
             if not f.step:
@@ -343,7 +353,7 @@ class Problem:
                 break
         return f
 
-    def _kept(self, f: Fit) -> Fit:
+    def kept(self, f: Fit) -> Fit:
         """The same with its gap and its beginning where they can be."""
         gap = min(max(f.gap, 0.0), 2.0 * float(np.ptp(self.v)))
         theta = np.concatenate([f.theta[:2], [gap], f.theta[3:]])
@@ -391,26 +401,33 @@ class Problem:
     def with_intervals(self, f: Fit) -> Fit:
         """The finished fit, by intervals where readings have a step that the noise does not hide.
 
-        With less and less noise beside the rounding while that is likelier.
+        The noise beside the rounding is the likeliest of a grid, but as large as leaves a few
+        readings near an edge of their interval for every unknown: fewer are no normal posterior.
         """
-        step = self.step_of_readings
-        if not step or (not f.step and f.noise_std > 0.75 * step) or f.m <= 0.0:
-            return self.finished(f)
-        if f.step:
-            levels = [f.noise_std * q for q in (1.0, 0.5, 2.0)]
-            levels = [level for level in levels if step / 40.0 < level < step / 3.9]
-        else:
-            levels = (step * 0.25 ** np.arange(1.0, 3.5, 0.5)).tolist()
-        found: Fit | None = None
-        for level in levels:
-            begin = replace(found or f, step=step, noise_std=float(level))
-            g = self.finished(self.fitted(begin, FEW_STEPS))
-            if found is None or g.evidence > found.evidence:
-                found = g
-            elif not f.step:
-                break
-        if found is not None and found.rms < 1.5 * f.noise:
-            return found
+        step, unknowns = self.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
+        largest = 0.25 * step
+        edges = NEAR_EDGE * unknowns / max(float(self.weights(f).sum()), 1.0)
+        least = step * max(1.0 / 64.0, edges)
+        hidden = not f.step and f.noise_std > 0.75 * step
+        if not step or f.m <= 0.0 or least > largest or hidden:
+            return self.finished(self.fitted(f.without_intervals) if f.step else f)
+
+        def at(level: float, begin: Fit) -> Fit:
+            return self.finished(
+                self.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
+
+        first = max(min(f.noise_std if f.step else largest, largest), least)
+        best = at(first, f)
+        for factor in (0.5, 2.0):
+            while best.noise_std == first or (best.noise_std < first) is (factor < 1.0):
+                if not least <= factor * best.noise_std <= largest:
+                    break
+                other = at(factor * best.noise_std, best)
+                if other.evidence <= best.evidence:
+                    break
+                best = other
+        if best.rms < 1.5 * f.noise:
+            return best
         return self.finished(self.fitted(f.without_intervals))
 
     def state(self, f: Fit) -> Array:

@@ -207,7 +207,8 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
     if count >= before.thorough_at:
         after = replace(after, thorough_at=int(1.4 * count))
         short = count <= SHORT_SEARCH and before.older is None
-        fit = replace(problem.with_intervals(fit), spread=fit.spread * 0.0)
+        fit = problem.with_intervals(fit)
+        fit = replace(fit, spread=spread(problem, fit))
         fit = _beside_others(setup, record, problem, fit) if short else fit
         fit = with_walk(setup, problem, fit)
     else:
@@ -228,7 +229,7 @@ def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> 
         return fit
     fit, other = problem.comparable([fit, other])
     best = other if other.evidence > fit.evidence + 3.0 else fit
-    return replace(best, spread=spread(best, [fit, other]))
+    return replace(best, spread=spread(problem, best, [fit, other]))
 
 
 def _contradicts(problem: Problem, fit: Fit, z: Array, new: int) -> bool:

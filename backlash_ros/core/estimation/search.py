@@ -35,18 +35,19 @@ class Hypothesis(NamedTuple):
 
 
 def search(
-    family: PlantFamily, v: Array, y: Array, noise_std: float, widest: float,
+    family: PlantFamily, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
 ) -> tuple[list[Hypothesis], float]:
     """Hypotheses, and the evidence of a u that never moves.
 
     The likeliest one and those of other gaps that are likelier than their neighbours come first.
 
-    v, y: (N,), y nan where lost. widest: gap that is considered.
+    v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
+    G is linearized.
     """
     none = 1e-9  # gap that counts as none, over the swing of v
     smallest = 0.01  # gap that is compared, over the swing of v
     peaks = 3  # that come first
-    compared = _Comparison(family, v, y, noise_std)
+    compared = _Comparison(family, v, y, noise_std, xi.tolist())
     swing = float(np.ptp(v))
     top = min(swing, widest)
     gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, GAPS))
@@ -69,11 +70,12 @@ def _peaks(found: list[Hypothesis]) -> list[Hypothesis]:
 class _Comparison:
     """Gaps compared by one record. null: evidence of a u that never moves."""
 
-    def __init__(self, family: PlantFamily, v: Array, y: Array, noise_std: float) -> None:
+    def __init__(
+        self, family: PlantFamily, v: Array, y: Array, noise_std: float, xi: list[float],
+    ) -> None:
         self._family, self._v = family, v
-        zero = [0.0] * family.count
-        self._b, self._a = family.at(zero)
-        self._slopes = family.slopes(zero)
+        self._b, self._a = family.at(xi)
+        self._slopes = family.slopes(xi)
         self._known = np.isfinite(y)
         self._begins, self._weights = _bins(v, self._known)
         common = np.column_stack([
