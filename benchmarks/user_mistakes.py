@@ -4,9 +4,10 @@
 
 Controller, reference and examples/motor_driver.py run with config/geared_motor.yaml, each as a
 process. Each case makes one mistake; the line that names it must be in the terminal and in
-/diagnostics within 3 s. What is wrong from the start counts from the first output on. The last
+/diagnostics within 3 s. What is wrong from the start counts from the first output on. Further
 cases are no mistakes: a sensor with an offset, a G(z) that is far too slow, half of every processor
-taken by something else. Nothing may be an error then.
+taken by something else. Nothing may be an error then. Last, in simulated time, drivers that are 0
+to 9 % slow, for --minutes each: their rate is named, and nothing else.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from fault_loop.sound_driver import blamed
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -49,7 +51,7 @@ LONGEST_S = 15.0  # that a line is waited for
 START_S = 30.0  # for the processes to begin
 SOUND_S = 3.0  # of the loop before a mistake that is made while it runs
 LOOK_S = 0.02
-LOAD, SOUND_FOR_S, BUSY = 0.5, 25.0, 'busy machine'
+LOAD, SOUND_FOR_S, BUSY, SLOW = 0.5, 25.0, 'busy machine', 'slow drivers'
 STALL_S = 0.012  # the controller is held up so long, after every look
 # Of a load that is five times as slow as the one that is there.
 SLOW_LOAD = ('plant.numerator:=[0.0069, 0.0062]', 'plant.denominator:=[1.0, -1.8593, 0.8724]')
@@ -296,13 +298,30 @@ def check_sound(name: str) -> Check:
         )
 
 
+def check_slow(minutes: float) -> Iterator[Check]:
+    """Whether no healthy part is blamed though a driver does not keep its rate."""
+    for hz in (50.0, 100.0, 200.0, 500.0):
+        for slow in (0.0, 0.005, 0.03, 0.09):
+            values = {
+                'output_noise_std': 1e-3, 'estimator.output_noise_std': 1e-3,
+                'plant.uncertainty': 0.2, 'frequency': 0.126 * hz,
+                'structure': 'tracking' if slow == 0.03 else 'proportional',
+            }
+            _, kinds = blamed(hz, slow, 0.05, 60.0 * minutes, values)
+            yield Check(
+                f'{hz:g} Hz, {slow:.1%} slow, for {minutes:g} min', 'rate' if slow else 'nothing',
+                ', '.join(kinds) or 'nothing', set(kinds) == ({'rate'} if slow else set()),
+            )
+
+
 def main() -> int:
     """Return 0 if every bound holds, else 1."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument('--case', choices=[*(each.name for each in MISTAKES), *SOUND],
+    parser.add_argument('--case', choices=[*(each.name for each in MISTAKES), *SOUND, SLOW],
                         action='append',
                         help='instead of all; may be repeated')
+    parser.add_argument('--minutes', type=float, default=0.5, help='of each slow driver')
     arguments = parser.parse_args()
     print(machine())
     checks = []
@@ -313,6 +332,8 @@ def main() -> int:
         print(f'{mistake.name}:\n  {seen.line}', flush=True)
         checks.append(judge(mistake, seen))
     checks += [check_sound(name) for name in SOUND if name in (arguments.case or SOUND)]
+    if SLOW in (arguments.case or [SLOW]):
+        checks += check_slow(arguments.minutes)
     print()
     print(text_table(CHECK_HEADER, [check.row for check in checks]))
     return 0 if all(check.holds for check in checks) else 1

@@ -65,7 +65,8 @@ SENSOR_FAULTS = ('sign', 'constant', 'stuck', 'another axis', 'spikes', 'nan')
 class Driver:
     """Publishes y, applies the newest v, and reports it where it is asked to.
 
-    origin: the v that a motor encoder shows where v is 0.
+    origin: the v that a motor encoder shows where v is 0. slow: share by which its period is longer
+    than it is told. jitter: share of a period by which stamps scatter.
     """
 
     p: Parameters
@@ -74,6 +75,8 @@ class Driver:
     sensor: Sensor
     reports: bool
     origin: float = 0.0
+    slow: float = 0.0
+    jitter: float = 0.0
     loses: bool = False
     loses_reports: bool = False
     repeats: bool = False
@@ -87,7 +90,7 @@ class Driver:
     def __post_init__(self) -> None:
         self.plant = build_plant(self.p)
         self.reference: Callable[[float], float] = build_reference(self.p)
-        self.period_ns = round(self.p.sample_period * 1e9)
+        self.period_ns = round(self.p.sample_period * 1e9 * (1.0 + self.slow))
 
     @property
     def time_ns(self) -> int:
@@ -111,6 +114,8 @@ class Driver:
             self.number = 0
         self.number += 1
         now = self.time_ns
+        if self.jitter:
+            now += round(self.rng.random() * self.jitter * self.period_ns)
         if self.reports and not (self.loses_reports and self.rng.random() < LOSSES):
             self.applied.append((v + self.origin, now - REPORT_NS))
         if self.loses and self.rng.random() < LOSSES:

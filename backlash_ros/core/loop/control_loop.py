@@ -89,6 +89,11 @@ class ControlLoop:
         return self.core.motion.v
 
     @property
+    def unreferred_s(self) -> float:
+        """Time since the newest reference [s], 0 before the first."""
+        return 0.0 if self.referred_at is None else self._driver.steady_s() - self.referred_at
+
+    @property
     def begins(self) -> bool:
         """Whether the next command is the first one, since the start or an interruption."""
         return self.phase in (Phase.BEGINS, Phase.SILENT)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite, nan
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 from backlash_ros.core.estimate import Status
+from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.law import LawReport
+from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD, Period
 from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.loop.loop_statistics import Counts
+from backlash_ros.core.parameters import Parameters
 
 LONGEST_TEXT = 99  # `ros2 topic echo` cuts off at 128, and a terminal line holds more besides
 # Share of late, lost or bad samples from which on the loop is told to suffer from them, and an
@@ -136,7 +139,8 @@ class LoopFigures(Counts):
         the period is not known, the rate is wrong only if nearly all intervals are off to the same
         side by a tenth.
         """
-        if self.period.differs_from(self.sample_period, 0.005) or self.is_stretched:
+        # From 0.5 % on, less what is not known of the period after a second.
+        if self.period.differs_from(self.sample_period, 0.0045) or self.is_stretched:
             return 1.0 / self.period.mean
         low, mean, high = self.intervals_s
         off = low > 1.1 * self.sample_period or high < self.sample_period / 1.1
@@ -153,6 +157,32 @@ class LoopFigures(Counts):
     def unexplained(self) -> bool:
         """Whether so much motion is explained by nothing that it is worth naming."""
         return 0.05 <= self.law.unexplained < inf
+
+
+def figures_of_loop(
+    loop: ControlLoop, p: Parameters, period: Period, counts: Mapping[str, int],
+) -> LoopFigures:
+    """What a loop knows by itself, without those who are on its topics.
+
+    counts: gained lately. period: of the driver.
+    """
+    statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
+    lately, timeout = cast(Mapping[str, Any], counts), p.timeout.reference
+    return LoopFigures(
+        **lately, sample_period=p.sample_period, standing_down=loop.standing_down,
+        status=estimate.status if statistics.used else None,
+        inconsistent_s=statistics.inconsistent * p.sample_period,
+        law=law.report, adapting=law.adapting, given=was_given(estimate),
+        silent_s=p.timeout.plant_output if loop.silent else 0.0, on_timeout=p.on_timeout,
+        referred=isfinite(loop.y_m),
+        reference_silent_s=0.0 if p.lockstep or not 0.0 < timeout < loop.unreferred_s else timeout,
+        # In lockstep the outputs come as fast as the machine goes.
+        intervals_s=(nan, nan, nan) if p.lockstep else statistics.intervals_s(),
+        period=UNKNOWN_PERIOD if p.lockstep else period,
+        age_s=nan if p.lockstep else statistics.age_s(),
+        still=statistics.still, v_swing=statistics.still_swing,
+        gap=estimate.c_r - estimate.c_l if estimate.learned else nan,
+    )
 
 
 Row = tuple[str, Level, bool, str]  # kind, level, whether it holds, text with figure and cure

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
-from math import isfinite, isnan, nan
-from typing import Any, cast
+from dataclasses import replace
+from math import isnan, nan
+from typing import Any
 
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from backlash_ros.core.estimates_file import was_given
 from backlash_ros.core.loop.control_loop import ControlLoop
-from backlash_ros.core.loop.diagnosis import LONGEST_TEXT, LoopFigures, Peer, TopicFigures
-from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD, Period
+from backlash_ros.core.loop.diagnosis import (
+    LONGEST_TEXT,
+    LoopFigures,
+    Peer,
+    TopicFigures,
+    figures_of_loop,
+)
+from backlash_ros.core.loop.driver_period import Period
 from backlash_ros.core.loop.finding import Finding, Level
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import stated_deviations
@@ -78,29 +83,18 @@ def figures_of(
     counts: gained lately. period: of the driver. references: with which quality of service the
     controller listens to them.
     """
-    statistics, estimate, law = loop.statistics, loop.estimate, loop.core.estimator
-    to, timeout, lately = io.topics, p.timeout.reference, cast(Mapping[str, Any], counts)
-    # Hardware on topics falls silent where all joints are where they belong.
-    overdue = loop.referred_at is not None and not (p.lockstep or io.in_joint_space) \
-        and 0.0 < timeout < time.monotonic() - loop.referred_at
-    return LoopFigures(
-        **lately, sample_period=p.sample_period,
+    to, figures = io.topics, figures_of_loop(loop, p, period, counts)
+    if io.simulated_time:
+        # Stamps of simulated time have nothing to do with the time of arrival.
+        figures.age_s = nan
+    if io.in_joint_space:
+        # Hardware on topics falls silent where all joints are where they belong.
+        figures.reference_silent_s = 0.0
+    return replace(
+        figures, rivals=rivals, repeats_stamps=io.stamps.repeated,
         output=publishers_of(node, to.output, to.output_type, output_qos(p, DEPTH)),
         reference=publishers_of(node, to.reference, to.reference_type, references),
         control=subscribers_of(node, to.control, to.control_type),
-        rivals=rivals, standing_down=loop.standing_down,
-        status=estimate.status if statistics.used else None,
-        inconsistent_s=statistics.inconsistent * p.sample_period,
-        law=law.report, adapting=law.adapting, given=was_given(estimate),
-        silent_s=p.timeout.plant_output if loop.silent else 0.0, on_timeout=p.on_timeout,
-        referred=isfinite(loop.y_m), reference_silent_s=timeout if overdue else 0.0,
-        # In lockstep the outputs come as fast as the machine goes.
-        intervals_s=(nan, nan, nan) if p.lockstep else statistics.intervals_s(),
-        period=UNKNOWN_PERIOD if p.lockstep else period, repeats_stamps=io.stamps.repeated,
-        # Stamps of simulated time have nothing to do with the time of arrival.
-        age_s=nan if p.lockstep or io.simulated_time else statistics.age_s(),
-        still=statistics.still, v_swing=statistics.still_swing,
-        gap=estimate.c_r - estimate.c_l if estimate.learned else nan,
     )
 
 
