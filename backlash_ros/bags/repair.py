@@ -9,7 +9,6 @@ from collections import Counter
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Writer, WriterError
@@ -27,33 +26,16 @@ from backlash_ros.bags.writer import STORAGE, lock_folder, sync_path
 from backlash_ros.options import BAD_INPUT, DONE, FAILED
 
 
-class Repair(NamedTuple):
-    """What was saved: messages by topic, and the time from the first to the last of them."""
-
-    why: str
-    messages: Counter[str]
-    duration_s: float
-    original: Path
-
-
 def repair_command(path: Path) -> int:
     """Repair a bag and print the outcome; returns the exit code."""
     try:
-        done = repair(path)
+        print('\n'.join(repair(path) or [f'{path} is complete: nothing to repair']))
     except BagError as error:
         print(f'recorder: {error}', file=sys.stderr)
         return BAD_INPUT if isinstance(error, NoBagError) else FAILED
     except KeyboardInterrupt:
         print(f'recorder: interrupted, nothing of {path} is lost', file=sys.stderr)
         return FAILED
-    if done is None:
-        print(f'{path} is complete: nothing to repair')
-        return DONE
-    print(f'{path} {done.why}; saved: {done.duration_s:.3f} s')
-    width = max(map(len, done.messages))
-    for topic, messages in sorted(done.messages.items()):
-        print(f'  {topic:<{width}}  {messages:>8} messages')
-    print(f'the original is kept: {done.original}')
     return DONE
 
 
@@ -65,10 +47,11 @@ def damage(bag: Path) -> str:
     return reader.damage or ('' if (bag / BAG_METADATA).is_file() else f'has no {BAG_METADATA}')
 
 
-def repair(bag: Path) -> Repair | None:
+def repair(bag: Path) -> list[str]:
     """Put a complete bag in the place of a damaged one, which is kept beside it.
 
-    None for a bag that is complete. Raises BagError, NoBagError where there is none.
+    Returns what was saved, in lines, nothing for a bag that is complete. Raises BagError,
+    NoBagError where there is none.
     """
     bag = bag.resolve()
     if bag.is_file():
@@ -80,7 +63,7 @@ def repair(bag: Path) -> Repair | None:
         raise BagError(f'{bag}: is being recorded: stop its recorder first') from None
     try:
         why = damage(bag)
-        return _rewrite(reader, why) if why else None
+        return _rewrite(reader, why) if why else []
     except (OSError, sqlite3.Error, WriterError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise BagError(
@@ -92,7 +75,7 @@ def repair(bag: Path) -> Repair | None:
             os.close(descriptor)
 
 
-def _rewrite(reader: BagReader, why: str) -> Repair:
+def _rewrite(reader: BagReader, why: str) -> list[str]:
     bag = reader.path
     messages: Counter[str] = Counter()
     first, last = 2**63, 0
@@ -118,7 +101,12 @@ def _rewrite(reader: BagReader, why: str) -> Repair:
         bag.rename(original)
         repaired.rename(bag)
         sync_path(bag.parent)
-    return Repair(why, messages, (last - first) * 1e-9, original)
+    width = max(map(len, messages))
+    return [
+        f'{bag} {why}; saved: {(last - first) * 1e-9:.3f} s',
+        *(f'  {topic:<{width}}  {n:>8} messages' for topic, n in sorted(messages.items())),
+        f'the original is kept: {original}',
+    ]
 
 
 def _announce(writer: Writer, topic: Topic) -> Connection:

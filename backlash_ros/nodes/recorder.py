@@ -40,12 +40,6 @@ from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, run
 from backlash_ros.options import BAD_INPUT, FAILED
 
 RECORDER_DEPTH = 10_000  # messages that may wait while the disk is slow
-# All but those that io.style names; y comes last of all: it starts the loop.
-OF_THE_LOOP: dict[str, type[Any]] = {
-    topics.ESTIMATES: Float64MultiArray, topics.SIGNALS: Float64MultiArray,
-    topics.MODEL: Float64MultiArray, topics.TRUTH: Float64MultiArray,
-    topics.DIAGNOSTICS: DiagnosticArray,
-}
 
 
 @dataclass
@@ -88,11 +82,14 @@ class RecorderNode(ProcessNode):
         else:
             self.log.info('started: nothing is recorded, as the parameter bag names no folder')
         to = driver_topics(p)
+        arrays = topics.ESTIMATES, topics.SIGNALS, topics.MODEL, topics.TRUTH
+        # y comes last of all: it starts the loop.
         recorded = {
             # A G that was learned before this recorder came belongs into the bag as well.
             topic: self._record(topic, kind, KEPT_QOS if topic == topics.MODEL else RECORDER_DEPTH)
             for topic, kind in {
-                **OF_THE_LOOP, to.reference: to.reference_type, to.applied: to.applied_type,
+                **dict.fromkeys(arrays, Float64MultiArray), topics.DIAGNOSTICS: DiagnosticArray,
+                to.reference: to.reference_type, to.applied: to.applied_type,
                 to.control: to.control_type,
             }.items()
         }

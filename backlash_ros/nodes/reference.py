@@ -31,9 +31,6 @@ from backlash_ros.nodes.runtime.messages import (
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import ProcessNode, emit, run
 
-# The loop runs so long, as the controller tells, before outputs that do not come here are given up.
-UNHEARD_S = 0.5
-
 
 class ReferenceNode(ProcessNode):
     """Publishes y_m for the sample that comes next.
@@ -115,7 +112,7 @@ class ReferenceNode(ProcessNode):
                     serve_polled(diagnostics)
                     # Fast DDS may miss a process of another machine for good that starts at the
                     # same moment.
-                    if now > self._loop_runs_at + UNHEARD_S:
+                    if now > self._loop_runs_at + 0.5:
                         pace.waits = False
                         self.log.warning(
                             f'{self._io.topics.output} is not heard here, but by the controller: '

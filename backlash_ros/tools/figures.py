@@ -29,8 +29,6 @@ HUES = {
     'u': '#000000', 'u_d': '#E69F00', 'v': '#CC79A7', 'y': '#332288', 'y_m': '#777777',
     'e': '#882255', 'true': '#000000',
 }
-CYCLE = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#332288', '#777777', '#000000')
-DASHES = ('-', '--', '-.', ':')
 HATS = {'m': r'\hat{m}', 'c_r': r'\hat{c}_r', 'c_l': r'\hat{c}_l'}
 LINE_STYLES = {'m': '-', 'c_r': '--', 'c_l': '-.'}
 BACKLASH_UNITS = {'m': 'unit of u/v', 'c_r': 'unit of v', 'c_l': 'unit of v'}
@@ -301,11 +299,13 @@ def draw_error_curves(loops: Sequence[figure_data.ErrorCurves], window_s: float)
 
     window_s: over which the RMS was taken [s].
     """
+    colours = ('#0072B2', '#D55E00', '#009E73', '#CC79A7', '#E69F00', '#332288', '#777777',
+               '#000000')
     control, tracking = [], []
     for i, (name, t, of_control, of_tracking) in enumerate(loops):
         # The curve of the loop without backlash comes to lie on that of the one that has learned.
         width = 3.4 if name == 'moving_horizon, tracking' else 1.7
-        look = CYCLE[i % len(CYCLE)], name, DASHES[i % len(DASHES)], width
+        look = colours[i % len(colours)], name, ('-', '--', '-.', ':')[i % 4], width
         control.append(Line(t, of_control, *look))
         if of_tracking is not None:
             tracking.append(Line(t, of_tracking, *look))
