@@ -176,8 +176,8 @@ def _tables(summary: Mapping[str, Any]) -> str:
         ('began with', f'{began}: {escape(first["from"])}' if first['from'] else began),
         ('control error RMS, last second', number(summary['control_error_rms'], 4, '[unit of u]')),
         ('tracking error RMS, last half',
-         'y is not to follow y<sub>m</sub>' if summary['structure'] == 'proportional' else
-         number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)),
+         number(summary['tracking_error_rms'], 3, '% of y<sub>m</sub>', 100.0)
+         + (', which is not its aim' if summary['structure'] == 'proportional' else '')),
         ('latency y → v, median', number(latency['p50'], 3, 'ms')),
         ('latency y → v, 99th percentile', number(latency['p99'], 3, 'ms')),
         ('state at the end', escape(summary['final_status'] or NOTHING)),
