@@ -1,6 +1,5 @@
 """What no loop does, however wrong what it is told of the plant: run away, or break a limit."""
 
-from itertools import islice
 from math import inf
 from typing import Any
 
@@ -13,16 +12,11 @@ from backlash_ros.core.assembly import (
     build_plant,
     build_reference,
 )
-from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.limits import Limits, at_rest, last_commands
-from backlash_ros.core.control.pole_placement import PolePlacement
-from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.protocol import (
     LARGEST_FEEDBACK,
     LARGEST_IN_ACQUISITION,
     ControlInput,
-    Structure,
 )
 from backlash_ros.core.control.tracking.design import Weights, design, feedback_around
 from backlash_ros.core.control.tracking.rest import TOLERANCE
@@ -30,7 +24,6 @@ from backlash_ros.core.control.tracking.tracking import FADING, Tracking
 from backlash_ros.core.estimate import Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.plant.four_blocks import place_poles
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
@@ -55,13 +48,6 @@ class Told:
 MODEL = StateModel(TransferFunction([0.1, 0.05], [1.0, -1.7, 0.72]))
 WEIGHTS = Weights(1e-2, 0.0, 5)
 DESIGN = design(MODEL, WEIGHTS)
-BLOCKS = place_poles(MODEL.transfer_function, np.poly([0.5, 0.5]), 0.2)
-
-
-def structure_named(name: str) -> Structure:
-    if name == 'tracking':
-        return Tracking(DESIGN, WEIGHTS, 1.0, 1e-3)
-    return Proportional() if name == 'proportional' else PolePlacement(BLOCKS)
 
 
 @settings(max_examples=200)
@@ -107,66 +93,6 @@ def test_a_loop_that_nothing_is_asked_of_moves_u_d_no_further_than_its_doubts_al
                 allowed = LARGEST_FEEDBACK * max(allowed / LARGEST_IN_ACQUISITION, called_for)
             assert abs(u_d) <= (allowed + handed_over) * (1.0 + 1e-9)
             handed_over *= FADING
-
-
-numbers = st.floats(-1e6, 1e6)
-events = st.one_of(
-    st.tuples(st.just('sample'), numbers, st.floats(-50.0, 50.0), st.integers(0, 3)),
-    st.tuples(st.just('estimate'), st.floats(0.01, 100.0), st.floats(0.0, 100.0),
-              st.floats(-100.0, 0.0), st.floats(0.0, 2.0), st.sampled_from(Status),
-              st.sampled_from([float('nan'), 0.0, 0.1])),
-    st.tuples(st.just('limits'), st.floats(-30.0, 20.0), st.floats(0.1, 40.0),
-              st.one_of(st.just(inf), st.floats(0.01, 20.0))),
-    st.tuples(st.just('compensating'), st.booleans()),
-    st.tuples(st.just('take_up'), st.one_of(st.just(inf), st.floats(0.01, 20.0))),
-    st.tuples(st.just('renewal'), st.booleans()),
-    st.tuples(st.just('end'), st.sampled_from(['hold', 'zero', 'ramp'])),
-)
-
-
-@settings(max_examples=300)
-@given(
-    name=st.sampled_from(['proportional', 'tracking', 'pole_placement']),
-    sequence=st.lists(events, max_size=40),
-)
-def test_every_command_keeps_the_limits_that_hold_at_that_moment(name, sequence):
-    limits, inverse = Limits(), BacklashInverse()
-    core = AdaptiveController(Told(), structure_named(name), inverse, limits)
-    v = 0.0
-    for what, *values in sequence:
-        sent: list[float] = []
-        if what == 'sample':
-            y, y_m, lost = values
-            sent = [core.step(y, y_m, lost).v]
-            core.refine()
-        elif what == 'estimate':
-            m, c_r, c_l, f, status, std = values
-            core.estimator.estimate = Estimate(m, c_r, c_l, f, std, std, std, status)
-        elif what == 'limits':
-            low, width, move = values
-            limits = core.limits = Limits(low, low + width, move)
-        elif what == 'compensating':
-            core.compensating = values[0]
-        elif what == 'take_up':
-            core.inverse.take_up = values[0]
-        elif what == 'renewal':
-            before = core
-            core = AdaptiveController(Told(), structure_named(name), BacklashInverse(), limits)
-            if values[0]:
-                core.go_on_from(before)
-            core.start_from(v)
-        else:
-            if values[0] == 'ramp' and limits.move == inf:
-                continue  # refused when it is configured
-            sent = list(islice(last_commands(values[0], at_rest(v), lambda held=limits: held), 5))
-            core.start_from(sent[-1] if sent else v)
-        for command in sent:
-            assert abs(command - v) <= limits.move * (1.0 + 1e-9)
-            outside, outside_before = (
-                max(limits.low - x, x - limits.high, 0.0) for x in (command, v)
-            )
-            assert outside <= max(outside_before - limits.move, 0.0) + 1e-9 * (1.0 + abs(v))
-            v = command
 
 
 def test_a_loop_that_was_driven_to_its_bounds_comes_back() -> None:

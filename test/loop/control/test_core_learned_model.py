@@ -91,24 +91,3 @@ def test_wrong_sign_is_told_until_there_is_an_estimate() -> None:
     loop.run(800)
     assert loop.controller.estimator.estimate.learned
     assert not report(loop).wrong_sign
-
-
-@pytest.mark.parametrize('waveform', ['triangle', 'multisine'])
-def test_a_design_may_change_only_while_no_crossing_of_the_gap_is_ahead(waveform: str) -> None:
-    loop = build_closed_loop(MOTOR.replaced({
-        'structure': 'tracking', 'waveform': waveform, 'estimator.law': 'fixed', 'fixed.doubt': 0.0,
-        'plant.uncertainty': 0.0,
-        **{f'estimator.initial.{name}': MOTOR[f'backlash.{name}'] for name in ('m', 'c_r', 'c_l')},
-    }))
-    allowed: set[int] = set()
-
-    def note(k: int) -> None:
-        if loop.controller.structure.may_change:
-            allowed.add(k)
-
-    v = loop.run(1200, note).column('v')
-    jumps = np.flatnonzero(np.abs(np.diff(v, prepend=0.0)) > 0.3)  # the gap is wider
-    ahead = {k - before for k in jumps.tolist() for before in range(5)}
-    assert len(jumps) > 4
-    assert len(allowed) > 20
-    assert not ahead & allowed

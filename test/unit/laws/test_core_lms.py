@@ -11,7 +11,6 @@ from strategies import KnownInput, Play, strokes, usual_plays
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.lms import NormalisedLms
-from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.backlash import Backlash, Region
 
 START = Estimate(0.696, 0.5, -0.5, 0.22)
@@ -132,10 +131,3 @@ def test_a_slope_below_0_is_said_and_not_learned() -> None:
     told = [e for e in estimates if e.status is Status.INCONSISTENT]
     assert estimates.index(told[0]) < 200
     assert {(e.m, e.c_r, e.c_l) for e in told} == {(told[0].m, told[0].c_r, told[0].c_l)}
-
-
-def test_steps_may_change_while_it_learns() -> None:
-    estimator, slower = lms(), lms(step=0.5, step_f=0.01)
-    estimator.retune(Parameters({'lms.step': 0.5, 'lms.step_f': 0.01}))
-    last = [lessons(each, PAPER, ramp(5.0, 9.0), u_d=4.0)[-1].new for each in (estimator, slower)]
-    assert last[0] == last[1]

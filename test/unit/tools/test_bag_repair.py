@@ -7,31 +7,15 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Writer
-from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 
 from backlash_ros.bags.reader import BagError, BagReader
 from backlash_ros.bags.repair import damage, repair, repair_command
 from backlash_ros.bags.writer import STORAGE, Bag
-
-
-class OtherStorage:
-    """Has all that rosbags promises of a storage, and nothing of what it is made of today."""
-
-    def __init__(self, path: Path, compression: Any) -> None:
-        self._hidden = Sqlite3Writer(path, compression)
-        self.path = self._hidden.path
-        self.add_msgtype = self._hidden.add_msgtype
-        self.add_connection = self._hidden.add_connection
-        self.write, self.close = self._hidden.write, self._hidden.close
-        self.abort = self._hidden.abort
-
 
 FLOAT = 'std_msgs/msg/Float64'
 CDR = b'\x00\x01\x00\x00'
@@ -180,17 +164,6 @@ def test_flush_reaches_into_the_installed_rosbags(tmp_path: Path, storage: str) 
     assert [message.data for message in BagReader(bag.path).messages()] == [number_message(7)]
     bag.close()
     assert damage(bag.path) == ''
-
-
-@pytest.mark.parametrize('storage', STORAGE)
-def test_rosbags_made_otherwise_still_records(tmp_path, monkeypatch, storage):
-    monkeypatch.setattr(Writer, 'STORAGE_PLUGINS', {STORAGE[storage]: OtherStorage})
-    bag = Bag(str(tmp_path / 'bag'), storage)
-    assert not bag.survives_a_crash
-    bag.write(bag.add_topic('/number', FLOAT), 1, number_message(7))
-    bag.flush()
-    bag.close()
-    assert (tmp_path / 'bag' / 'metadata.yaml').is_file()
 
 
 def nothing_flushed(bag: Path) -> None:
