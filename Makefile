@@ -18,8 +18,8 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 endif
 
 RUN := .venv/bin/python
-# A worker per processor; tests of one file share what their fixtures have made.
-# Long ones first, in the order of the rooms, so that no worker waits for another at the end.
+# A worker per processor and one more; tests of one file share what their fixtures have made.
+# Those that wait first, in the order of the rooms, so that no worker waits for another at the end.
 WORKERS := -n auto --dist loadfile --no-loadscope-reorder
 # A Python that was not asked for by name leaves an existing .venv of another Python as it is.
 KEEP := $(if $(filter file,$(origin PYTHON)),--keep-python)

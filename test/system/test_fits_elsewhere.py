@@ -11,7 +11,7 @@ from waiting import wait_until
 
 from backlash_ros.core.jobs import worker
 
-KILLED = 5  # times
+KILLED = 3  # times
 UNCERTAIN: dict[str, object] = {'plant.uncertainty': 0.2}
 
 

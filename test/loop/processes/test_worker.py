@@ -24,7 +24,7 @@ from backlash_ros.core.jobs.executor import (
 )
 from backlash_ros.core.jobs.worker import NICENESS, WorkerExecutor
 
-KILLED = 20  # times
+KILLED = 6  # times
 PARENT = f"""
 import sys, time
 sys.path[:0] = [{str(ROOT)!r}, {str(ROOT / 'test')!r}]
