@@ -147,3 +147,17 @@ def test_the_first_command_goes_on_from_what_is_known_of_v(reports, initial):
     world.driver.actuator.v = STANDING
     world.run(100)
     assert np.abs(np.diff([STANDING, *world.sent])).max() <= STEP
+
+
+@pytest.mark.parametrize(('jump_s', 'interruptions', 'lost'), [
+    (0.21, 1, 21), (-0.2, 1, 0), (0.1, 0, 10),
+])
+def test_a_clock_that_is_set_is_an_interruption_or_taken_for_lost_outputs(
+    jump_s: float, interruptions: int, lost: int,
+) -> None:
+    world = SimulatedLoop(**{'estimator.law': 'fixed', 'timeout.plant_output': 0.2})
+    world.run(100)
+    world.driver.offset_ns += round(jump_s * 1e9)
+    world.run(100)
+    statistics = world.loop.statistics
+    assert (statistics.interruptions, statistics.lost) == (interruptions, lost)

@@ -65,10 +65,7 @@ def called(libraries: Path, folder: Path, *arguments: str) -> subprocess.Complet
 
 
 def test_what_needs_no_ros_works_and_the_rest_says_so_in_one_line(libraries, tmp_path):
-    for module in (
-        'nodes.controller', 'nodes.plant', 'nodes.reference', 'nodes.recorder',
-        'nodes.check_driver', 'nodes.monitor', 'nodes.live', 'tools.bringup',
-    ):
+    for module in ('nodes.controller', 'nodes.check_driver', 'nodes.live', 'tools.bringup'):
         done = called(libraries, tmp_path, '-m', f'{PACKAGE}.{module}')
         assert done.returncode == 1
         assert 'rclpy is missing: source ROS 2 Jazzy' in done.stderr

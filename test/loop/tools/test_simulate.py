@@ -14,9 +14,8 @@ from places import ROOT
 from waiting import DEADLINE_S, wait_until
 
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.tools import batch
-from backlash_ros.tools.batch import Outcome, Sweep, statistics
+from backlash_ros.tools.batch import Outcome, statistics
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.simulate import main
 
@@ -111,20 +110,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ('text', 'expected'),
-    [
-        ('seed=1,2', Sweep('seed', (1, 2))),
-        ('estimator.law=lms, printed', Sweep('estimator.law', ('lms', 'printed'))),
-        ('backlash.rate=[0,0,0],[0,0,1]',
-         Sweep('backlash.rate', ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)))),
-        ('control.max=5,.inf', Sweep('control.max', (5.0, inf))),
-    ],
-)
-def test_sweep_lists_values_as_in_yaml(text: str, expected: Sweep) -> None:
-    assert batch.parse_sweep(text) == expected
-
-
 def outcome(error: float, settling: float | None, std: float = nan) -> Outcome:
     return {
         'm': 2.0 + error, 'c_r': 4.0, 'c_l': -4.0, 'true_m': 2.0, 'true_c_r': 4.0, 'true_c_l': -4.0,
@@ -159,11 +144,6 @@ def test_run_that_breaks_off_says_why() -> None:
     broken = batch.run_job(job)
     assert 'must be finite' in str(broken['problem'])
     assert broken['m'] is None
-
-
-def test_bad_combination_is_refused_before_anything_runs() -> None:
-    with pytest.raises(ParameterError, match=r'backlash\.c_l'):
-        batch.make_jobs(Parameters(), [{'seed': 1}, {'backlash.c_l': 5.0}], [1], 1e9)
 
 
 @pytest.mark.parametrize(('address', 'installed', 'cure'), [
