@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED, v_of_intervals
+from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
 from backlash_ros.core.records.rows_to_record import readings, usable
@@ -95,13 +96,26 @@ def from_messages(
     y: NDArray[np.float64] = np.full(int(index[-1]) + 1, np.nan)
     y[index] = values
     v = v_of_intervals(index, stamps, *acted, reported)
-    sent = v_of_intervals(index, stamps, *commands, False) if reported and commands else None
-    missing = f', {len(y) - len(index)} missing' if len(y) > len(index) else ''
     notes: list[str] = []
+    few = {topic for topic in heard if topic != topics.PLANT_OUTPUT
+           and _some_missing(topic, heard[topic][0], step, notes)}
+    sent = v_of_intervals(index, stamps, *commands, False) \
+        if reported and commands and topics.CONTROL not in few else None
+    missing = f', {len(y) - len(index)} missing' if len(y) > len(index) else ''
     step_of_y = quantum(y)
     v, y = readings(step * np.arange(len(y), dtype=float), v, y, said, notes)
     timing = '; '.join([f'{len(index)} messages of y, one every {seconds(step)}{missing}', *said])
     return usable(Record(v, y, step, step_of_y, timing=timing, notes=tuple(notes), commands=sent))
+
+
+def _some_missing(topic: str, stamps: NDArray[np.int64], step: float, notes: list[str]) -> bool:
+    """Whether messages that came once a sample were dropped on their way: said in notes."""
+    lost = round(1e-9 * float(stamps[-1] - stamps[0]) / step) + 1 - len(stamps)
+    # A topic with fewer ones is published on change.
+    if not TROUBLE < lost / (lost + len(stamps)) < 0.5:
+        return False
+    notes.append(f'{lost} messages of {topic} are missing: the one before is taken for them')
+    return True
 
 
 def _by_time(messages: Messages, begin_ns: int, said: list[str]) -> Messages:

@@ -116,6 +116,19 @@ def test_one_bad_stamp_is_dropped_and_counted(tmp_path: Path, stamp: int, row: i
     assert record.v[:-1].tolist() == V[first:len(record.v) + first - 1].tolist()
 
 
+def test_dropped_commands_are_said_and_the_motor_is_not_judged_by_them(tmp_path: Path) -> None:
+    motor = np.append(0.0, V[:-1])
+    record = read_record(bag(tmp_path / 'bag', {
+        f'/{topics.PLANT_OUTPUT}': (NUMBER, STAMPS, Y),
+        f'/{topics.CONTROL}': (NUMBER, np.delete(LATER, range(5, 150, 10)),
+                               np.delete(V, range(5, 150, 10)).tolist()),
+        f'/{topics.APPLIED_CONTROL}': (NUMBER, STAMPS - 100_000, motor),
+    }))
+    assert record.notes == ('15 messages of control are missing: the one before is taken for them',)
+    assert record.commands is None
+    assert record.v[:-1].tolist() == V[:-1].tolist()
+
+
 def test_nothing_that_may_be_v_or_y_is_told(tmp_path: Path) -> None:
     path = bag(tmp_path / 'bag', {'/temperature': (NUMBER, STAMPS, Y)})
     with pytest.raises(InputError, match='temperature'):
