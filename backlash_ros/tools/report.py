@@ -38,8 +38,10 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     """
     summary = summarise(run.record, run.parameters, run.latency_s)
     notes = [*run.notes, *_losses(summary, run.parameters)]
+    # Of a log, which has no estimates, it is what was made of its rows.
+    of_log = np.isnan(run.record.column('m')[-1])
     for note in notes:
-        print(f'report: warning: {note}', file=sys.stderr)
+        print(f'report: {"" if of_log else "warning: "}{note}', file=sys.stderr)
     files.write_run(run.record, out)
     files.write_summary(summary, out / files.SUMMARY_FILE)
     folded = None

@@ -116,7 +116,8 @@ def test_a_good_driver_passes_and_what_cannot_be_driven_is_refused_or_ended(worl
     assert {'sign and units', 'G(z)', 'backlash'} <= subjects(told, '✓')
     with record.open(newline='') as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) > 50
+    # However late they were on a busy machine.
+    assert len(rows) >= DURATION_S / PERIOD_S
     assert max(abs(float(row['v'])) for row in rows) <= LIMITS.high
     code, told = check(world, '--drive', '--output-range', '-0.5', '0.5', '--duration', '30')
     assert code == 1

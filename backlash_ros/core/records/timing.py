@@ -39,6 +39,11 @@ class Rows(NamedTuple):
     commands: Array | None = None
     sent: Array | None = None
 
+    def since(self, begin: float) -> Rows:
+        """The same with times that count from there."""
+        return self._replace(t=self.t - begin, sent=None if self.sent is None else
+                             self.sent - np.array([[begin], [0.0]]))
+
 
 class Numbering(NamedTuple):
     """Of rows (M,), whose stamps lie around begin + period * numbers [s], off (M,) that."""
@@ -75,10 +80,13 @@ def on_grid(rows: Rows, period: float | None = None) -> Record:
                'numbered'
         return _numbered_grid(rows, found.numbers, used, cut + said)
     if period is None and np.abs(found.off).max() <= 0.5 * used:
-        rows = rows._replace(t=rows.t - found.begin)
+        rows = rows.since(found.begin)
     else:
         used = guess
-    said = f'stamps jitter by {percent} around {seconds(used)}: v and y are taken at them'
+    how = f'jitter by {percent} around {seconds(used)}'
+    if jitter <= 1e-3 and period is not None:
+        how = f'come every {seconds(_period(rows.t))}, for samples of {seconds(used)}'
+    said = f'stamps {how}: v and y are taken at them'
     return _true_instants(rows, used, cut + said)
 
 
@@ -106,9 +114,9 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
             'with --from and --to, or give --period'
         )
     commands = None if rows.commands is None else rows.commands[begin:end]
-    sent = None if rows.sent is None else rows.sent - np.array([[t[begin]], [0.0]])
-    kept = Rows(t[begin:end] - t[begin], rows.v[begin:end], rows.y[begin:end], commands, sent)
-    return kept, f'{len(ends) - 2} long gaps: the longest stretch, {end - begin} rows, is used; '
+    kept = Rows(t[begin:end], rows.v[begin:end], rows.y[begin:end], commands, rows.sent)
+    gaps = f'{len(ends) - 2} long gap{"s" * (len(ends) > 3)}'
+    return kept.since(t[begin]), f'{gaps}: the longest stretch, {end - begin} rows, is used; '
 
 
 def _numbering(t: Array, steps: Array, period: float) -> Numbering:
@@ -180,8 +188,7 @@ def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Reco
     commands = None if rows.commands is None else rows.commands[held]
     v = rows.v[held]
     if rows.sent is not None:
-        stamps, sent_ns = ((t * 1e9).astype(np.int64) for t in (rows.t, rows.sent[0]))
-        v = v_of_intervals(index, stamps, sent_ns, rows.sent[1], False)
+        v = v_over(index, rows.t, rows.sent[0], rows.sent[1], period)
     return Record(v, y, period, timing=said + missing, commands=commands)
 
 
@@ -227,6 +234,20 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
     sent = (rows.t, rows.v) if rows.sent is None else rows.sent
     v = averaged(sent[0], sent[1], step, count)
     return Record(v, full, step, timing=said, commands=commands)
+
+
+def v_over(
+    index: Numbers, t: Array, sent_s: Array, v: Array, period: float, reported: bool = False,
+) -> Array:
+    """v (K,), sent or reported at its own times [s], over the intervals after samples at t (M,).
+
+    index (M,): numbers of the samples. What is sent more often than that is averaged.
+    """
+    count = int(index[-1]) + 1
+    if not reported and len(v) > 1.5 * count:
+        return averaged(sent_s - t[0], v, period, count)
+    stamps, sent_ns = ((1e9 * each).astype(np.int64) for each in (t, sent_s))
+    return v_of_intervals(index, stamps, sent_ns, v, reported)
 
 
 def averaged(t: Array, v: Array, step: float, count: int) -> Array:

@@ -115,14 +115,11 @@ def _misfit(asked: QoSProfile) -> str:
 def similar_topics(
     wanted: str, wanted_type: str, seen: Mapping[str, Sequence[str]],
 ) -> list[str]:
-    """Topics that may be the wanted one under another name, most similar first.
-
-    wanted: fully qualified. seen: topics with their types.
-    """
+    """Topics (with their types) that may be the wanted one under another name, likeliest first."""
     def likeness(topic: str) -> float:
         last, other = (name.rsplit('/', 1)[-1] for name in (wanted, topic))
-        alike = difflib.SequenceMatcher(None, last, other).ratio()
-        return alike + (0.1 if wanted_type in seen[topic] else 0.0)
+        return difflib.SequenceMatcher(None, last, other).ratio() - 1e-9 * len(topic) + 0.1 * (
+            wanted_type in seen[topic])
 
-    near = [topic for topic in seen if topic != wanted and likeness(topic) >= 0.6]
-    return sorted(near, key=lambda topic: (-likeness(topic), topic))
+    return sorted((topic for topic in seen if topic != wanted and likeness(topic) >= 0.6),
+                  key=likeness, reverse=True)

@@ -120,7 +120,7 @@ class MotionNode(ProcessNode):
         return not self.stopping
 
     def _follow(self, executor: PromptExecutor) -> None:
-        """Listen for the duration, and drive."""
+        """Listen for the duration; drive for as many samples as it has, late ones as well."""
         settle_s = 1.0  # after which everybody should have found everybody
         self._hear(topics.APPLIED_CONTROL, self.heard.applied.append)
         if self.options.drive:
@@ -133,11 +133,14 @@ class MotionNode(ProcessNode):
             self._hear(topics.CONTROL, self.heard.controls.append)
         self._hear(topics.PLANT_OUTPUT, self._on_output)
         begin = looked = time.monotonic()
-        end = begin + self.options.duration + (settle_s if self.options.drive else 0.0)
         p = self.settings
+        driving = self.options.drive
+        enough = self.options.duration / p.sample_period if driving else inf
+        end = begin + (2.0 * self.options.duration + settle_s if driving else self.options.duration)
         patience = max(p.timeout.plant_output, 10.0 * p.sample_period)
         outputs, newest = 0, inf  # y heard so far, and when that was seen
-        while not (self.stopping or self.ended or self._rivals) and time.monotonic() < end:
+        while not (self.stopping or self.ended or self._rivals) \
+                and len(self.heard.controls) < enough and time.monotonic() < end:
             executor.spin_once(timeout_sec=LOOK_S)
             now = time.monotonic()
             if len(self.heard.outputs) > outputs:

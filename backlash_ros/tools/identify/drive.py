@@ -103,13 +103,12 @@ class _Messages:
 class _Estimate(threading.Thread):
     """What a record says, looked for beside the motion by a thread that gives way to it.
 
-    found: None until it is known. took_s: how long that was looked for.
+    found: None until it is known.
     """
 
     def __init__(self, record: Record, options: argparse.Namespace) -> None:
         super().__init__(daemon=True)
         self.found: Identification | None = None
-        self.took_s = 0.0
         self.given_up = False
         self._work = identifying_record(replace(record, commands=None), options)
         self.start()
@@ -118,12 +117,11 @@ class _Estimate(threading.Thread):
         """Look, until it is known or given up."""
         if sys.platform == 'linux':
             os.nice(5)  # this thread alone gives way to the driver and to what moves it
-        started = time.monotonic()
         while not self.given_up:
             try:
                 next(self._work)
             except StopIteration as done:
-                self.took_s, self.found = time.monotonic() - started, done.value
+                self.found = done.value
                 return
 
 
@@ -132,8 +130,7 @@ def _follow(
     stop: StopRequests,
 ) -> None:
     """Show progress until the motion ends, is precise enough, or is to be stopped."""
-    share_of_time = 0.25  # of the time that estimates may take: the actuator needs the processor
-    next_look, said = 3.0, ''  # [s] of motion before an estimate
+    next_look, growth, said = 3.0, 1.5, ''  # [s] of motion before an estimate, and to the next one
     estimate: _Estimate | None = None
     with tqdm(
         total=options.duration, file=sys.stderr, disable=None, leave=False,
@@ -152,7 +149,7 @@ def _follow(
             if estimate is None or estimate.found is None:
                 continue
             found, said = estimate.found, _said(estimate.found)
-            next_look, estimate = moved + max(estimate.took_s / share_of_time, 1.0), None
+            next_look, estimate = growth * next_look, None
             line = f'{moved:5.1f} s  {said}'
             if bar.disable:
                 print(line, file=sys.stderr, flush=True)

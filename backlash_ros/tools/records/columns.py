@@ -19,19 +19,19 @@ PATTERNS: Mapping[str, Sequence[str]] = {
         r'date|datum',
     ),
     'v': (
-        r'v', r'command|cmd|control|goal|target|set ?point|sp|op|soll(wert)?',
-        r'(.* )?(goal|target|commanded|commands?|cmd|desired|set ?point|set|soll|control)( .*)?',
-        r'.* v',
+        r'v', r'command|cmd|control|goal|target|set ?point|sp|op|soll(wert)?|u|input',
+        r'(.* )?(goal|target|commanded|commands?|cmd|desired|des|set ?point|set|soll\w*|control)'
+        r'( .*)?', r'ref(erence)?( .*)?|.* (ref(erence)?|u|v|input)',
     ),
     'y': (
         r'y', r'position|pos|actual|measured|present|feedback|output|encoder|angle|pv|ist(wert)?',
-        r'(.* )?(actual|present|measured|feedback|ist)( .*)?',
-        r'(.* )?(position|pos|output|encoder|angle)( .*)?', r'.* y',
+        r'(.* )?(actual|present|measured|meas|feedback|ist\w*)( .*)?',
+        r'(.* )?(positions?|pos|output|encoder|angle|theta|q)( .*)?|.* y',
     ),
 }
 # What is neither v nor y, whatever else its name says.
-OTHERS = r'.*\b(speed|velocity|vel|load|current|torque|effort|temp(erature)?|voltage|status|' \
-         r'moving|err(or)?|acceleration|acc|power|rate|direction|duration)\b.*'
+OTHERS = r'.*\b(qd|dq|speed|velocity|vel|load|current|torque|effort|temp(erature)?|voltage|' \
+         r'status|moving|err(or)?|acceleration|acc|power|rate|direction|duration)\b.*'
 UNITS_S = {
     unit: scale for scale, units in {
         1e-9: 'ns nsec nanoseconds', 1e-6: 'us µs μs usec microseconds micros',

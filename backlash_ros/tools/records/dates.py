@@ -10,11 +10,11 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-DATE = r'(?P<a>\d{1,4})(?P<sign>[-/. ])(?P<b>\d{1,2}|[A-Za-z]{3})[a-z]*[-/. ](?P<c>\d{1,4})'
-CLOCK = r'(?:(?P<h>\d{1,4}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,:]\d+)?)'
+# A date, a time of day, or both.
 STAMP = re.compile(
-    rf'(?:{DATE})?[T ,]*(?:{CLOCK}(?: ?(?P<half>[AP])\.?M\.?)?)?', re.IGNORECASE)
-MONTHS = ['jan', 'feb', 'mar', 'apr', 'may', 'jun', 'jul', 'aug', 'sep', 'oct', 'nov', 'dec']
+    r'(?:(?P<a>\d{1,4})(?P<sign>[-/. ])(?P<b>\d{1,2}|[a-z]{3})[a-z]*[-/. ](?P<c>\d{1,4}))?[t ,]*'
+    r'(?:(?:(?P<h>\d{1,4}):)?(?P<m>\d{1,2}):(?P<s>\d{1,2}(?:[.,:]\d+)?)'
+    r'(?: ?(?P<half>[ap])\.?m\.?)?)?', re.IGNORECASE)
 
 
 def times_of(cells: Sequence[str]) -> NDArray[np.float64]:
@@ -51,8 +51,9 @@ def _seconds(cell: str, day_first: bool) -> float:
 
 def _days(a: str, b: str, c: str, day_first: bool) -> float:
     """Days since 1970."""
-    if b in MONTHS:
-        b, day_first = str(MONTHS.index(b) + 1), True
+    months = ['jan', 'feb', 'mar', 'apr', 'may', 'jun', 'jul', 'aug', 'sep', 'oct', 'nov', 'dec']
+    if b in months:
+        b, day_first = str(months.index(b) + 1), True
     year, month, day = (a, b, c) if len(a) == 4 else (c, b, a) if day_first else (c, a, b)
     try:
         return date(int(year) + 2000 * (len(year) < 4), int(month), int(day)).toordinal() - 719163.0

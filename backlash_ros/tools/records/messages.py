@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros import topics
-from backlash_ros.core.loop.command_history import REPORTED, v_of_intervals
+from backlash_ros.core.loop.command_history import REPORTED
 from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError, seconds
 from backlash_ros.core.records.rows_to_record import readings, usable
 from backlash_ros.core.records.stamps import in_order
-from backlash_ros.core.records.timing import MOST_SAMPLES, numbered, rounded
+from backlash_ros.core.records.timing import MOST_SAMPLES, numbered, rounded, v_over
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs.bag import choose_namespace, read_topics
 
@@ -75,10 +75,9 @@ def from_messages(
     heard = {topic: _by_time(messages, begin, said) for topic, messages in heard.items()
              if len(messages[0])}
     stamps, values = heard[topics.PLANT_OUTPUT]
-    commands, reports = heard.get(topics.CONTROL), heard.get(topics.APPLIED_CONTROL)
-    reported = reports is not None and len(reports[0]) >= REPORTED * len(stamps)
-    acted = reports if reported else commands
-    if acted is None:
+    reports = heard.get(topics.APPLIED_CONTROL, (np.empty(0),))[0]
+    reported = len(reports) >= REPORTED * len(stamps)
+    if not reported and topics.CONTROL not in heard:
         raise RecordError(f'holds no {topics.CONTROL}{of_axis}: record it as well')
     times = (stamps - stamps[0]).astype(float) * 1e-9
     step = float(np.median(np.diff(times))) if period is None else period
@@ -95,12 +94,16 @@ def from_messages(
         step = rounded(slope, 2.0**0.5 * late / float(index[-1]))
     y: NDArray[np.float64] = np.full(int(index[-1]) + 1, np.nan)
     y[index] = values
-    v = v_of_intervals(index, stamps, *acted, reported)
+    def over(topic: str, reported: bool) -> NDArray[np.float64]:
+        sent_ns, v = heard[topic]
+        return v_over(index, times, (sent_ns - stamps[0]) * 1e-9, v, step, reported)
+
+    v = over(topics.APPLIED_CONTROL if reported else topics.CONTROL, reported)
     notes: list[str] = []
     few = {topic for topic in heard if topic != topics.PLANT_OUTPUT
            and _some_missing(topic, heard[topic][0], step, notes)}
-    sent = v_of_intervals(index, stamps, *commands, False) \
-        if reported and commands and topics.CONTROL not in few else None
+    sent = over(topics.CONTROL, False) \
+        if reported and topics.CONTROL in heard.keys() - few else None
     missing = f', {len(y) - len(index)} missing' if len(y) > len(index) else ''
     step_of_y = quantum(y)
     v, y = readings(step * np.arange(len(y), dtype=float), v, y, said, notes)

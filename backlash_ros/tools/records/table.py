@@ -8,7 +8,9 @@ package needs. Parquet is left to pyarrow, where it is installed.
 from __future__ import annotations
 
 import csv
+import gzip
 import re
+import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -118,6 +120,11 @@ def read_table(path: Path) -> Table:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f'{path}: cannot be read: {error}') from None
+    if data[:2] == b'\x1f\x8b':
+        try:
+            data = gzip.decompress(data)
+        except (EOFError, OSError, zlib.error) as error:
+            raise InputError(f'{path}: cannot be unpacked: {error}') from None
     if data[:4] == b'PAR1':
         return _from_parquet(path)
     wide = 'utf-16' if data[:2] in (b'\xff\xfe', b'\xfe\xff') else \

@@ -1,5 +1,6 @@
 """Tables as people have them: separators, heads, names of columns, dates, Parquet."""
 
+import gzip
 import sys
 from pathlib import Path
 
@@ -77,6 +78,9 @@ TABLES = {
     'twelve hours': 'time,cmd,pos\n' + rows('03/05/2024 12:00:{s:06.3f} PM,{v:.3f},{y:.3f}'),
     'day first': 'Datum;Soll;Ist\n' + rows('28.02.2024 10:00:{s:06.3f};{v:.3f};{y:.3f}'),
     'names of months': 'time,cmd,pos\n' + rows('05-Mar-2024 10:00:{s:06.3f},{v:.3f},{y:.3f}'),
+    'names of a textbook': 'time,u,theta\n' + rows(),
+    'one word each': 'Zeit;Sollposition;Istposition\n' + rows('{t:.3f};{v:.3f};{y:.3f}'),
+    'desired and measured': 'stamp,q_des,q_meas,qd_meas\n' + rows('{t:.3f},{v:.3f},{y:.3f},0.1'),
     'date and time': 'Date,Time,SP,PV\n' + rows('2024-02-28,10:00:{s:06.3f},{v:.3f},{y:.3f}'),
     'seconds and nanoseconds': 'stamp.sec,stamp.nanosec,v,y\n'
                                + rows('{sec},{nsec},{v:.3f},{y:.3f}'),
@@ -101,7 +105,10 @@ def test_a_table_is_read_as_it_is(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize('encoding', ['utf-16', 'utf-16-le', 'utf-8-sig', 'latin-1'])
 def test_a_text_may_be_encoded_in_other_ways(tmp_path: Path, encoding: str) -> None:
     text = 't [µs],v,y\n' + rows('{ms}000,{v:.3f},{y:.3f}')
-    assert read_record(written(tmp_path / 'a.csv', text, encoding)).y.tolist() == Y.tolist()
+    path = written(tmp_path / 'a.csv', text, encoding)
+    assert read_record(path).y.tolist() == Y.tolist()
+    path.write_bytes(gzip.compress(path.read_bytes()))
+    assert read_record(path).y.tolist() == Y.tolist()
 
 
 @pytest.mark.parametrize('text', [

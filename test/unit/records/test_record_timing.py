@@ -211,6 +211,17 @@ def test_where_moving_y_would_show_the_grid_is_finer() -> None:
     assert np.count_nonzero(np.isfinite(record.y)) > 0.97 * COUNT
 
 
+def test_v_that_is_sent_more_often_than_y_is_read_is_averaged() -> None:
+    t = np.arange(0.0, 6.0, 0.001)
+    y = np.where(np.arange(len(t)) % 10 == 0, position(t), np.nan)
+    v = np.where(np.arange(len(t)) % 10 == 0, np.nan, command(t))
+    record = record_of(t, v, y)
+    assert record.sample_period == pytest.approx(PERIOD_S)
+    middle = PERIOD_S * np.arange(len(record.v)) + 0.0045  # v holds
+    assert record.v[1:-1] == pytest.approx(command(middle)[1:-1], abs=1e-3)
+    assert off(record) < 1e-9
+
+
 @given(st.lists(st.floats(0.3, 2.0), min_size=30, max_size=60), st.integers(0, 10**6))
 def test_averaging_keeps_what_v_sums_up_to_at_every_time(steps: list[float], seed: int) -> None:
     t = np.append(0.0, np.cumsum(steps))
