@@ -61,8 +61,8 @@ def record_of(
     t = spread_evenly(table[0] - table[0, 0], said, *table[1:3])
     v, y = readings(t, _held(table[1]), table[2], said, notes)
     if sent is not None:
-        sent[0] -= table[0, 0]
-    record = on_grid(Rows(t, v, y, None if commands is None else _held(table[3]), sent), period)
+        v = sent - np.array([[table[0, 0]], [0.0]])
+    record = on_grid(Rows(t, v, y, None if commands is None else _held(table[3])), period)
     return usable(replace(
         record, quantum=quantum(y), timing='; '.join([record.timing, *said]), notes=tuple(notes)
     ))

@@ -30,19 +30,26 @@ MOST_SAMPLES = 1_000_000  # of a grid
 
 
 class Rows(NamedTuple):
-    """Rows in order. t (M,): from 0 [s]. y (M,): nan where it is no reading of its own. sent
-    (2, K): times and values of v where it has its own, as in a log of events."""
+    """Rows in order. t (M,): from 0 [s]. y (M,): nan where it is no reading of its own.
+
+    v, commands: one for each row (M,), or times and values of their own (2, K), as in a log of
+    events. reported: whether those of v tell what acted until then.
+    """
 
     t: Array
     v: Array
     y: Array
     commands: Array | None = None
-    sent: Array | None = None
+    reported: bool = False
 
-    def since(self, begin: float) -> Rows:
-        """The same with times that count from there."""
-        return self._replace(t=self.t - begin, sent=None if self.sent is None else
-                             self.sent - np.array([[begin], [0.0]]))
+    def since(self, start: float, begin: int = 0, end: int | None = None) -> Rows:
+        """Some of the rows, with times that count from `start`."""
+        def part(values: Array) -> Array:
+            of_rows = values.ndim == 1
+            return values[begin:end] if of_rows else values - np.array([[start], [0.0]])
+
+        return Rows(self.t[begin:end] - start, part(self.v), self.y[begin:end],
+                    None if self.commands is None else part(self.commands), self.reported)
 
 
 class Numbering(NamedTuple):
@@ -54,14 +61,23 @@ class Numbering(NamedTuple):
     off: Array
 
 
-def on_grid(rows: Rows, period: float | None = None) -> Record:
+def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Record:
     """Rows on a grid. period [s]: of the samples, None tells it from the stamps.
 
-    Raises RecordError where there are too few, or they are spread over too long a time.
+    late: stamps are those of messages, which are late, never early. Raises RecordError where there
+    are too few, or they are spread over too long a time.
     """
     nearly_even = 0.02  # of a period that stamps of even samples may be off
-    guess = period or _period(rows.t)
+    guess = period or (typical_step(rows.t) if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
+    if late:
+        found = _line(numbered(rows.t / guess), rows.t)
+        # All stamps together tell it better than one step does, but for how late the first and the
+        # last one were, independently of each other.
+        deviation = 2.0**0.5 * float(np.std(found.off)) / float(found.numbers[-1])
+        used = period or _rounded(found.period, deviation)
+        said = f'{len(rows.t)} messages of y, one every {seconds(used)}'
+        return _numbered_grid(rows, found.numbers, used, cut + said)
     steps = np.diff(rows.t) / guess
     found = _numbering(rows.t, steps, guess)
     used = period or found.period
@@ -113,10 +129,9 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
             f'spans {span:.3g} periods of {seconds(period)} with {len(t)} rows: cut out one motion '
             'with --from and --to, or give --period'
         )
-    commands = None if rows.commands is None else rows.commands[begin:end]
-    kept = Rows(t[begin:end], rows.v[begin:end], rows.y[begin:end], commands, rows.sent)
     gaps = f'{len(ends) - 2} long gap{"s" * (len(ends) > 3)}'
-    return kept.since(t[begin]), f'{gaps}: the longest stretch, {end - begin} rows, is used; '
+    return rows.since(float(t[begin]), begin, end), \
+        f'{gaps}: the longest stretch, {end - begin} rows, is used; '
 
 
 def _numbering(t: Array, steps: Array, period: float) -> Numbering:
@@ -134,7 +149,7 @@ def _numbering(t: Array, steps: Array, period: float) -> Numbering:
     best = min(found, key=lambda one: round(float(np.std(one.off)) / one.period, 9))
     # With no more digits than the stamps bear.
     deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])
-    return best._replace(period=rounded(best.period, deviation))
+    return best._replace(period=_rounded(best.period, deviation))
 
 
 def _line(numbers: Numbers, t: Array) -> Numbering:
@@ -142,7 +157,7 @@ def _line(numbers: Numbers, t: Array) -> Numbering:
     return Numbering(numbers, period, begin, t - begin - period * numbers)
 
 
-def rounded(period: float, deviation: float) -> float:
+def _rounded(period: float, deviation: float) -> float:
     """The period with the fewest digits that is within its deviation."""
     texts = (float(f'{period:.{digits}g}') for digits in range(1, 9))
     return next((value for value in texts if abs(value - period) <= deviation), period)
@@ -175,7 +190,8 @@ def _are_late(rows: Rows, found: Numbering) -> bool:
     if found.numbers[-1] + 1 > 1.3 * len(rows.t) or np.std(found.off) > found.period:
         return False  # too many are missing, or too late, to be numbered
     even = found.numbers.astype(float)
-    return rougher(rows.t, even, rows.y) + rougher(rows.t, even, rows.v) > 0.05
+    return sum(rougher(rows.t, even, signal)
+               for signal in (rows.y, rows.v) if signal.ndim == 1) > 0.05
 
 
 def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Record:
@@ -185,11 +201,13 @@ def _numbered_grid(rows: Rows, index: Numbers, period: float, said: str) -> Reco
     y = np.full(count, np.nan)
     y[index] = rows.y
     missing = f', {count - len(index)} missing' if count > len(index) else ''
-    commands = None if rows.commands is None else rows.commands[held]
-    v = rows.v[held]
-    if rows.sent is not None:
-        v = v_over(index, rows.t, rows.sent[0], rows.sent[1], period)
-    return Record(v, y, period, timing=said + missing, commands=commands)
+
+    def over(values: Array, reported: bool) -> Array:
+        return values[held] if values.ndim == 1 else v_over(
+            index, rows.t, values, period, reported)
+
+    commands = None if rows.commands is None else over(rows.commands, False)
+    return Record(over(rows.v, rows.reported), y, period, timing=said + missing, commands=commands)
 
 
 def _true_instants(rows: Rows, period: float, said: str) -> Record:
@@ -230,24 +248,24 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
     count = int(max(rows.t[-1] / step + 0.5, index[-1])) + 1
     full = np.full(count, np.nan)
     full[index] = values
-    commands = None if rows.commands is None else averaged(rows.t, rows.commands, step, count)
-    sent = (rows.t, rows.v) if rows.sent is None else rows.sent
-    v = averaged(sent[0], sent[1], step, count)
-    return Record(v, full, step, timing=said, commands=commands)
+    def over(values: Array) -> Array:
+        times, v = (rows.t, values) if values.ndim == 1 else values
+        return averaged(times, v, step, count)
+
+    commands = None if rows.commands is None else over(rows.commands)
+    return Record(over(rows.v), full, step, timing=said, commands=commands)
 
 
-def v_over(
-    index: Numbers, t: Array, sent_s: Array, v: Array, period: float, reported: bool = False,
-) -> Array:
-    """v (K,), sent or reported at its own times [s], over the intervals after samples at t (M,).
+def v_over(index: Numbers, t: Array, sent: Array, period: float, reported: bool) -> Array:
+    """v, at its own times [s] (2, K), over the intervals after samples at t (M,).
 
     index (M,): numbers of the samples. What is sent more often than that is averaged.
     """
     count = int(index[-1]) + 1
-    if not reported and len(v) > 1.5 * count:
-        return averaged(sent_s - t[0], v, period, count)
-    stamps, sent_ns = ((1e9 * each).astype(np.int64) for each in (t, sent_s))
-    return v_of_intervals(index, stamps, sent_ns, v, reported)
+    if not reported and sent.shape[1] > 1.5 * count:
+        return averaged(sent[0] - t[0], sent[1], period, count)
+    stamps, sent_ns = ((1e9 * each).astype(np.int64) for each in (t, sent[0]))
+    return v_of_intervals(index, stamps, sent_ns, sent[1], reported)
 
 
 def averaged(t: Array, v: Array, step: float, count: int) -> Array:

@@ -14,10 +14,10 @@ from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED
 from backlash_ros.core.loop.diagnosis import TROUBLE
 from backlash_ros.core.records.readings import quantum
-from backlash_ros.core.records.record import Record, RecordError, seconds
+from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import readings, usable
-from backlash_ros.core.records.stamps import in_order
-from backlash_ros.core.records.timing import MOST_SAMPLES, numbered, rounded, v_over
+from backlash_ros.core.records.stamps import in_order, typical_step
+from backlash_ros.core.records.timing import Rows, on_grid
 from backlash_ros.tools.cli import InputError
 from backlash_ros.tools.runs.bag import choose_namespace, read_topics
 
@@ -71,63 +71,41 @@ def from_messages(
     to sample, None tells it from the stamps. Raises RecordError.
     """
     said: list[str] = []
-    begin = int(np.median(heard[topics.PLANT_OUTPUT][0]))
-    heard = {topic: _by_time(messages, begin, said) for topic, messages in heard.items()
-             if len(messages[0])}
-    stamps, values = heard[topics.PLANT_OUTPUT]
-    reports = heard.get(topics.APPLIED_CONTROL, (np.empty(0),))[0]
-    reported = len(reports) >= REPORTED * len(stamps)
-    if not reported and topics.CONTROL not in heard:
-        raise RecordError(f'holds no {topics.CONTROL}{of_axis}: record it as well')
-    times = (stamps - stamps[0]).astype(float) * 1e-9
-    step = float(np.median(np.diff(times))) if period is None else period
-    if not step > 0.0:
-        raise RecordError('its stamps do not tell the sample period: give --period S')
-    index = numbered(times / step)
-    if index[-1] >= MOST_SAMPLES:
-        raise RecordError(f'spans {index[-1]:.3g} sample periods of {seconds(step)}: cut it')
-    if period is None:
-        # All stamps together tell it better than one step does, but for how late the ends were:
-        # the first and the last one independently of each other.
-        slope, offset = np.polyfit(index, times, 1).tolist()
-        late = float(np.std(times - slope * index - offset))
-        step = rounded(slope, 2.0**0.5 * late / float(index[-1]))
-    y: NDArray[np.float64] = np.full(int(index[-1]) + 1, np.nan)
-    y[index] = values
-    def over(topic: str, reported: bool) -> NDArray[np.float64]:
-        sent_ns, v = heard[topic]
-        return v_over(index, times, (sent_ns - stamps[0]) * 1e-9, v, step, reported)
-
-    v = over(topics.APPLIED_CONTROL if reported else topics.CONTROL, reported)
     notes: list[str] = []
-    few = {topic for topic in heard if topic != topics.PLANT_OUTPUT
-           and _some_missing(topic, heard[topic][0], step, notes)}
-    sent = over(topics.CONTROL, False) \
-        if reported and topics.CONTROL in heard.keys() - few else None
-    missing = f', {len(y) - len(index)} missing' if len(y) > len(index) else ''
-    step_of_y = quantum(y)
-    v, y = readings(step * np.arange(len(y), dtype=float), v, y, said, notes)
-    timing = '; '.join([f'{len(index)} messages of y, one every {seconds(step)}{missing}', *said])
-    return usable(Record(v, y, step, step_of_y, timing=timing, notes=tuple(notes), commands=sent))
+    begin = int(np.median(heard[topics.PLANT_OUTPUT][0]))
+    sent = {topic: _by_time(messages, begin, said) for topic, messages in heard.items()
+            if len(messages[0])}
+    t, y = sent.pop(topics.PLANT_OUTPUT)
+    commands, v = sent.get(topics.CONTROL), sent.get(topics.APPLIED_CONTROL)
+    reported = v is not None and v.shape[1] >= REPORTED * len(t)
+    if v is None or not reported:
+        v, commands = commands, None
+    if v is None:
+        raise RecordError(f'holds no {topics.CONTROL}{of_axis}: record it as well')
+    rows = Rows(t, v, y, commands, reported).since(t[0])
+    if not typical_step(rows.t) > 0.0:
+        raise RecordError('its stamps do not tell the sample period: give --period S')
+    record = on_grid(rows, period, late=True)
+    step = record.sample_period
+    for topic, (times, _) in sent.items():
+        lost = round((times[-1] - times[0]) / step) + 1 - len(times)
+        # A topic with fewer messages is published on change.
+        if TROUBLE < lost / (lost + len(times)) < 0.5:
+            notes.append(
+                f'{lost} messages of {topic} are missing: the one before is taken for them')
+            record = replace(record, commands=None)
+    v, readings_of_y = readings(
+        step * np.arange(len(record.y), dtype=float), record.v, record.y, said, notes)
+    return usable(replace(record, v=v, y=readings_of_y, quantum=quantum(y), notes=tuple(notes),
+                          timing='; '.join([record.timing, *said])))
 
 
-def _some_missing(topic: str, stamps: NDArray[np.int64], step: float, notes: list[str]) -> bool:
-    """Whether messages that came once a sample were dropped on their way: said in notes."""
-    lost = round(1e-9 * float(stamps[-1] - stamps[0]) / step) + 1 - len(stamps)
-    # A topic with fewer ones is published on change.
-    if not TROUBLE < lost / (lost + len(stamps)) < 0.5:
-        return False
-    notes.append(f'{lost} messages of {topic} are missing: the one before is taken for them')
-    return True
-
-
-def _by_time(messages: Messages, begin_ns: int, said: list[str]) -> Messages:
-    """In the order of their stamps, without those that are none."""
-    stamps, values = messages
-    if len(stamps) < FEWEST_MESSAGES or np.unique(stamps).size < 2:
-        return messages
-    rows = in_order((stamps - begin_ns).astype(float) * 1e-9, said, 'message')
-    return stamps[rows], values[rows]
+def _by_time(messages: Messages, begin_ns: int, said: list[str]) -> NDArray[np.float64]:
+    """Times from begin_ns [s] and values, in their order, without those that are none."""
+    pairs = np.array([(messages[0] - begin_ns) * 1e-9, messages[1]])
+    if len(pairs[0]) < FEWEST_MESSAGES or np.unique(pairs[0]).size < 2:
+        return pairs
+    return np.asarray(pairs[:, in_order(pairs[0], said, 'message')])
 
 
 def _native(signals: Mapping[str, Signal], axis: str) -> tuple[dict[str, Messages], str]:
