@@ -158,17 +158,19 @@ class Problem:
 
     # --- a Gauss-Newton step --------------------------------------------------------------------
 
-    def step(self, f: Fit, most_scale: float = np.inf, held: bool = False) -> Fit:
+    def step(
+        self, f: Fit, most_scale: float = np.inf, held: bool = False, begun: bool = False,
+    ) -> Fit:
         """The values that the linearization around f makes likeliest, with their posterior.
 
-        held: whether the gap stays, so that all else fits it. Raises LinAlgError where the numbers
-        get too large.
+        held: whether the gap stays, so that all else fits it; begun: whether the beginning does.
+        Raises LinAlgError where the numbers get too large.
         """
         weights = self.weights(f)
         _, score, information = self._likelihood(f)
         x = _padded(f.x, len(self._evaluated(f).a) - 1)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
-        beside = np.concatenate(self._beside(replace(f, x=x), len(beta), held))
+        beside = np.concatenate(self._beside(replace(f, x=x), len(beta), held, begun))
         count = len(self.v)
         stack = np.empty((count + len(beside), len(beta) + 1), order='F')
         rows, stack[count:] = stack[:count], beside
@@ -216,8 +218,8 @@ class Problem:
             out[:, at:] = np.tensordot(late, slopes, ((0, 1), (1, 2)))
         return out
 
-    def _beside(self, f: Fit, size: int, held: bool) -> list[Array]:
-        """Rows of what is known beside the samples, and what the gap is held at."""
+    def _beside(self, f: Fit, size: int, held: bool, begun: bool) -> list[Array]:
+        """Rows of what is known beside the samples, and what gap and beginning are held at."""
         vague = 100.0  # prior deviation of the state before a record, over the largest reading
         tight = 1e6  # weight of a beginning that is known
         first = size - 3 - self.family.count  # place of m
@@ -232,7 +234,9 @@ class Problem:
         begin[0, first - 1] = 1.0
         if held:
             wide[0, first + 2], wide[0, -1] = tight, tight * f.gap
-        if self.start is None:  # anywhere within the gap of now
+        if begun:
+            begin[0, first - 1], begin[0, -1] = tight, tight * f.p0
+        elif self.start is None:  # anywhere within the gap of now
             begin[0, -1] = self.v[0] + 0.5 * f.gap
             begin *= sqrt(12.0) / max(f.gap, 1e-9)
         else:
@@ -316,7 +320,6 @@ class Problem:
 
     def fitted(self, f: Fit, steps: int = STEPS) -> Fit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
-        shortest_step = 0.05  # share of a Gauss-Newton step that is tried
         least_move = 0.02  # deviations of the gap that a step may still move it by at the end
         far_steps = 4  # the first of them, over which G is no further off than configured
         for k in range(steps):
@@ -324,20 +327,11 @@ class Problem:
             best = self.log_posterior(f, weights)
             # Far from the optimum the error of the linearization passes for one of G.
             most = 1.0 if k < far_steps < steps else np.inf
-            new = self.kept(self.step(f, most))
-            there = _towards(f, new)
-            value = self.log_posterior(there, weights)
+            new, there, value = self._stepped(f, best, weights, most)
             if not value > best - 0.5:
-                # Beyond a kink of the play, where another side was engaged, it may be better.
-                again = _towards(there, self.kept(self.step(there, most)))
-                of_again = self.log_posterior(again, weights)
-                if of_again > best:
-                    there, value = again, of_again
-            length = 1.0
-            while not value > best - 0.5 and length > shortest_step:
-                length *= 0.3
-                there = _towards(f, new, length)
-                value = self.log_posterior(there, weights)
+                # A kink where the play began bars the way to all else: held there, it does not.
+                other = self._stepped(f, best, weights, most, begun=True)
+                new, there, value = max((new, there, value), other, key=lambda one: one[2])
             if not value > best - 50.0:  # f stands: only its posterior is new, and its noise
                 f = replace(f, cov=new.cov, prior=new.prior, scale=new.scale, volume=new.volume)
                 noise_std = f.noise_std if f.step else self._noise_of(f)
@@ -352,6 +346,27 @@ class Problem:
             if moved < least_move * (1 if steps > FEW_STEPS else 10) and value - best < 1.0:
                 break
         return f
+
+    def _stepped(
+        self, f: Fit, best: float, weights: Array, most_scale: float, begun: bool = False,
+    ) -> tuple[Fit, Fit, float]:
+        """What a step leads to, where it goes as far as that helps, and its log-posterior."""
+        shortest_step = 0.05  # share of a Gauss-Newton step that is tried
+        new = self.kept(self.step(f, most_scale, begun=begun))
+        there = _towards(f, new)
+        value = self.log_posterior(there, weights)
+        if not value > best - 0.5:
+            # Beyond a kink of the play, where another side was engaged, it may be better.
+            again = _towards(there, self.kept(self.step(there, most_scale, begun=begun)))
+            of_again = self.log_posterior(again, weights)
+            if of_again > best:
+                there, value = again, of_again
+        length = 1.0
+        while not value > best - 0.5 and length > shortest_step:
+            length *= 0.3
+            there = _towards(f, new, length)
+            value = self.log_posterior(there, weights)
+        return new, there, value
 
     def kept(self, f: Fit) -> Fit:
         """The same with its gap and its beginning where they can be."""

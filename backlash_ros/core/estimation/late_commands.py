@@ -6,7 +6,9 @@ what G makes of that. With s of that in the residuals r of the fit, the other co
     (s.r - s.s / 2) / sigma^2
 
 more likely, less the log-odds against it; of both r and s, what other unknowns may explain is left
-out. The likeliest is believed first, and the rest compared again, until none is likely.
+out. The likeliest is believed first, and the rest compared again, until none is likely. How often
+commands are late is unknown: with Jeffreys' prior of that share, k of n that were late make the
+odds of one more (k + 1/2) to (n - k - 1/2), so that one alone needs much evidence.
 
 Reference: A. S. Willsky, H. L. Jones, A generalized likelihood ratio approach to the detection and
 estimation of jumps in linear systems, IEEE Trans. Automatic Control 21 (1976) 108-112.
@@ -23,7 +25,6 @@ from backlash_ros.core.estimation.explanations import Record
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import Fit
-from backlash_ros.core.estimation.settings import COMMAND_ODDS
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
@@ -38,6 +39,7 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     """
     own_noise = 0.25  # of correlated residuals: what is noise of readings
     open_ = np.flatnonzero(np.isfinite(record.other))
+    count, late = len(open_), len(record.places(back))
     open_ = open_[open_ >= since - record.first]
     if not len(open_) or fit.m <= 0.0:
         return frozenset()
@@ -55,8 +57,8 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     noise = max(noise, problem.nominal, problem.step_of_readings / sqrt(12.0))
     v, other = record.v.copy(), record.other.copy()
     p = play(v, fit.gap, fit.p0)
-    odds = log(COMMAND_ODDS)
     for _ in range(200):  # swaps of one look
+        more, less = (log(max(count - k, 1) - 0.5) - log(k + 0.5) for k in (late, max(late - 1, 0)))
         rest = residual - q @ (q.T @ residual)
         best, place, change = 0.0, -1, residual[:0]
         for k in open_.tolist():
@@ -69,11 +71,12 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
             explained = q[k:end].T @ seen
             gain = float(seen @ rest[k:end] - 0.5 * (seen @ seen - explained @ explained))
             gain /= noise**2
-            gain -= odds if (record.first + k in back) == (k in chosen) else -odds
+            gain -= more if (record.first + k in back) == (k in chosen) else -less
             if gain > best:
                 best, place, change = gain, k, s
         if place < 0:
             break
+        late += 1 if (record.first + place in back) == (place in chosen) else -1
         v[place], other[place] = other[place], v[place]
         chosen ^= {place}
         end = place + len(change)

@@ -116,17 +116,18 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
 def _with_commands(
     setup: Setup, record: Record, found: Fit, swapped: frozenset[int],
 ) -> tuple[Fit, frozenset[int]]:
-    """The fit and the commands that go with each other, found in turn."""
-    if not np.isfinite(record.other).any():
-        return found, swapped
-    for _ in range(4):
-        part = problem_of(setup, record)
-        record, others = likelier(part, found, record, record.first, swapped)
-        if others == swapped:
+    """The fit and the commands that go with each other, found in turn.
+
+    Commands that leave more than noise explain nothing: those that were sent stay.
+    """
+    fit, others = found, swapped
+    for _ in range(4 * bool(np.isfinite(record.other).any())):
+        before = others
+        record, others = likelier(problem_of(setup, record), fit, record, record.first, before)
+        if others == before:
             break
-        swapped = others
-        found = afresh(setup, record, also=found) or found
-    return found, swapped
+        fit = afresh(setup, record, also=fit) or fit
+    return (found, swapped) if _leaves_more(setup, fit) else (fit, others)
 
 
 def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Status:
@@ -187,11 +188,10 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
         numbers = frozenset((record.first + new + np.flatnonzero(wild)).tolist())
         cleaned = replace(before, rejected=before.rejected | numbers)
         return _known(setup, record.without(numbers), cleaned)
-    if _contradicts(problem, fit, z, new):
+    if _contradicts(problem, held, fit, new):
         fit = problem.fitted(held)  # before anything is blamed
-        z = problem.residual(fit)[new:] / held.noise
     grown = before.on_probation and fit.noise > settings.AS_GOOD * before.adopted_noise
-    if grown or _contradicts(problem, fit, z, new):
+    if grown or _contradicts(problem, held, fit, new):
         beyond = np.nan_to_num((problem.residual(held)[new:] / held.noise) ** 2 - MISFIT)
         change = int(np.argmax(np.cumsum(beyond[::-1])[::-1]))
         return replace(
@@ -232,22 +232,27 @@ def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> 
     return replace(best, spread=spread(problem, best, [fit, other]))
 
 
-def _contradicts(problem: Problem, fit: Fit, z: Array, new: int) -> bool:
-    """Whether the samples from `new` on contradict the fit that has taken them in.
+def _contradicts(problem: Problem, held: Fit, fit: Fit, new: int) -> bool:
+    """Whether the samples from `new` on contradict what was held, and `fit` that takes them in.
 
-    z: their residuals over the noise that was known before.
+    They do as well where it takes them in at the cost of all others.
     """
     from scipy.special import chdtri  # where fits are made: 31 MB
 
     weights = problem.weights(fit)[new:]
-    count = float(weights[np.isfinite(z)].sum())
+    z = problem.residual(fit) / held.noise
+    if float(np.nanmean(z**2)) > settings.AS_GOOD**2:
+        return True
+    z = z[new:]
+    seen = np.isfinite(z)
+    count = float(weights[seen].sum())
     if not count:
         return False
     wild = np.abs(z) > settings.GATE
     mean = float(np.nansum(weights * np.where(wild, 0.0, z**2))) / count
     free = max(count, 1.0)
     limit = max(MISFIT, float(chdtri(free, 1e-5)) / free)  # less probable by chance
-    return mean > limit or float(wild.sum()) > settings.OUTLIER_SHARE * len(z)
+    return mean > limit or float(wild.sum()) > settings.OUTLIER_SHARE * int(seen.sum())
 
 
 # --- DOUBTED ----------------------------------------------------------------------------------

@@ -20,7 +20,10 @@ from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
-GAPS, STARTS = 32, 5  # that are compared, and beginnings within each
+GAPS = 32  # that are compared
+# Beginnings within each: where the record is short, a large part of it is before the first
+# engagement, which a beginning that is a little off puts somewhere else.
+STARTS, SHORT, STARTS_OF_SHORT = 5, 500, 17
 # Gaps of the second look, over the best of the first.
 ZOOM: Array = np.array([0.8 + 0.025 * k for k in range(17)])
 
@@ -51,7 +54,8 @@ def search(
     swing = float(np.ptp(v))
     top = min(swing, widest)
     gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, GAPS))
-    starts: Array = np.arange(STARTS) / (STARTS - 1.0)
+    count = STARTS if len(v) > SHORT else STARTS_OF_SHORT
+    starts: Array = np.arange(count) / (count - 1.0)
     found = [h for h in compared.evidence(gaps, starts) if isfinite(h.evidence)]
     if not found:
         return [], compared.null

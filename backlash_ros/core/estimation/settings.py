@@ -25,7 +25,6 @@ AS_GOOD = 1.5  # ratio of residuals up to which another explanation is as good
 PREDICTED = 30  # samples that an explanation must predict after one that was contradicted
 MOST_PREDICTED = 1000  # as many at most: twice as many as the last one if that did not last
 LASTING = 8.0  # times what it had to predict, over which an explanation holds for long
-COMMAND_ODDS = 20.0  # against a command other than the one that was sent
 
 # --- how much is looked at
 FIRST_FIT = 20  # samples before the first search
