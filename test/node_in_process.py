@@ -85,7 +85,7 @@ def look_for_silence(node: ControllerNode) -> None:
     """Let the node find that nothing was heard for longer than any timeout."""
     untyped: Any = node
     for loop in node.configured:
-        loop.heard_at = -1e9
+        loop.heard.y_at = -1e9
     untyped._look_for_silence()
 
 

@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass, field
 from itertools import cycle
 
 from rclpy.duration import Duration
@@ -23,7 +24,7 @@ from backlash_ros.core.assembly import (
     takes_model_as_exact,
     warnings_of,
 )
-from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
+from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.jobs.worker import WorkerExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
@@ -35,17 +36,33 @@ from backlash_ros.core.loop.sample_counter import (
     kept_outputs,
 )
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.control.joint import Joint
 from backlash_ros.nodes.control.publishing import StepPublisher
 from backlash_ros.nodes.control.rivals import RivalWatch
 from backlash_ros.nodes.control.services import offer_services
-from backlash_ros.nodes.runtime.driver_io import DriverIo
+from backlash_ros.nodes.runtime.driver_io import DriverIo, check_style
 from backlash_ros.nodes.runtime.lifecycle import ManagedNode
 from backlash_ros.nodes.runtime.messages import DEPTH, DIAGNOSTICS_PERIOD_S, KEPT_QOS, stamp_ns_of
 from backlash_ros.nodes.runtime.parameters import let_parameters_change
 from backlash_ros.nodes.runtime.process import emit, run
+
+
+@dataclass
+class Pairs:
+    """Lockstep: ticks of /clock [ns], references and outputs that wait for each other."""
+
+    ticks: deque[int] = field(default_factory=deque)
+    references: deque[float] = field(default_factory=deque)
+    outputs: deque[Output] = field(default_factory=deque)
+
+    def next(self) -> tuple[Output, float] | None:
+        """Output and reference of the next sample; None while something of it is missing."""
+        if not (self.ticks and self.references and self.outputs):
+            return None
+        # A tick is the sample: messages are not told apart by number then.
+        tick, y_m = self.ticks.popleft(), self.references.popleft()
+        return self.outputs.popleft()._replace(stamp_ns=tick, sequence=UNNUMBERED), y_m
 
 
 class ControllerNode(ManagedNode):
@@ -59,7 +76,7 @@ class ControllerNode(ManagedNode):
     def __init__(self) -> None:
         super().__init__(CONTROLLER)
         p = self.settings
-        _check_style(p)
+        check_style(p)
         for joint in p.joint_names:
             # Whatever is wrong with the parameters ends the process before it takes part in
             # anything.
@@ -80,12 +97,7 @@ class ControllerNode(ManagedNode):
         self._counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
         )
-        self._behind = 0  # outputs in a row that were answered after the next one had come
-        self._turn = 0  # of the joint that fits next
-        # In lockstep: ticks of /clock [ns], references and outputs that wait for each other.
-        self._ticks: deque[int] = deque()
-        self._references: deque[float] = deque()
-        self._outputs: deque[Output] = deque()
+        self._pairs = Pairs()
         self._driver: Subscription | None = None  # plant_output, once it may begin
         self._ending: Timer | None = None  # sends the commands of on_timeout
         self.joints: list[Joint] = []
@@ -96,13 +108,10 @@ class ControllerNode(ManagedNode):
         self._steps = StepPublisher(self, p.joint_names)
         # A stalled controller goes on with the newest values; in lockstep none may be skipped.
         # Woken by each y_m, the process would take half as much time again.
-        references_qos = self._io.listen_to_references(
+        self._io.listen_to_references(
             self._on_reference, KEPT_QOS if p.lockstep else 1, polled=not p.lockstep
         )
-        self.joints += [
-            Joint(self, joint, p.of_joint(joint), self._io, references_qos)
-            for joint in p.joint_names
-        ]
+        self.joints += [Joint(self, name, p.of_joint(name), self._io) for name in p.joint_names]
         if p.lockstep:
             self.create_subscription(Clock, topics.CLOCK, self._on_clock, KEPT_QOS)
         offer_services(
@@ -173,7 +182,7 @@ class ControllerNode(ManagedNode):
             # that nobody was listened to is no silence of the driver.
             for loop in self.configured:
                 loop.renew(loop.estimate)
-                loop.heard_at = None
+                loop.heard.y_at = None
         elif self.settings.lockstep:  # simulated time hurts nobody
             self._await_loop()
         else:
@@ -197,7 +206,7 @@ class ControllerNode(ManagedNode):
             return not wanted or (
                 io.listeners >= wanted and self._steps.listeners >= wanted - 1
                 and (self.count_publishers(io.topics.reference) > 0 if lockstep
-                     else all(loop.referred_at is not None for loop in self.configured))
+                     else all(loop.heard.y_m_at is not None for loop in self.configured))
             )
 
         self.call_when(
@@ -276,58 +285,36 @@ class ControllerNode(ManagedNode):
             return
         self.loops.take_references(y_m)
         if self.settings.lockstep:
-            self._references.append(self.loops.by_name[''].y_m)
-            self._pair()
+            self._pairs.references.append(self.loops.by_name[''].heard.y_m)
+            self._answer_pairs()
 
     def _on_clock(self, message: Clock) -> None:
-        self._ticks.append(stamp_ns_of(message))
-        self._pair()
+        self._pairs.ticks.append(stamp_ns_of(message))
+        self._answer_pairs()
 
     def _on_output(self, outputs: Mapping[str, Output]) -> None:
         loops = self.loops
         if loops is None or not self.active:
             return
         if self.settings.lockstep:
-            self._outputs.append(outputs[''])
-            self._pair()
+            self._pairs.outputs.append(outputs[''])
+            self._answer_pairs()
         elif self._knows_rivals() or not any(loop.begins for loop in loops.loops):
             self._io.take_references()
             steps = loops.answer(outputs)
             if steps:
-                self._use_spare_time(loops, next(iter(outputs.values())).received_ns)
+                os.sched_yield()  # to the driver, which the command has woken
+                loops.use_spare_time(next(iter(outputs.values())).received_ns)
                 self._follow_up(loops, steps)
 
-    def _pair(self) -> None:
+    def _answer_pairs(self) -> None:
         """Lockstep: answer as soon as tick, reference and output of a sample are there."""
         loops = self.loops
-        while loops is not None and self.active \
-                and self._ticks and self._references and self._outputs:
-            # A tick is the sample: messages are not told apart by number then.
-            output = self._outputs.popleft()._replace(
-                stamp_ns=self._ticks.popleft(), sequence=UNNUMBERED
-            )
-            steps = loops.answer({'': output}, self._references.popleft())
+        while loops is not None and self.active and (pair := self._pairs.next()):
+            steps = loops.answer({'': pair[0]}, pair[1])
             if steps:
                 loops.by_name[''].core.refine()
                 self._follow_up(loops, steps)
-
-    def _use_spare_time(self, loops: JointLoops, received_ns: int) -> None:
-        """Let the driver go on, which the command has woken, then the next loop take up fits.
-
-        Where the next output is waiting already, there is no time for what may be put off.
-        received_ns: when the output came that was answered.
-        """
-        # samples for which a controller that is behind may leave the search for the gap alone
-        put_off = 5
-        period = self.settings.sample_period
-        if 0 < received_ns < time.time_ns() - period * 1e9:
-            self._behind += 1
-        else:
-            self._behind = 0
-            os.sched_yield()
-        if self._behind % put_off == 0:
-            self._turn = (self._turn + 1) % len(loops.loops)
-            loops.loops[self._turn].core.refine(REFINE_SHARE * period)
 
     def _follow_up(self, loops: JointLoops, steps: Mapping[str, ControlStep]) -> None:
         """Tell of the steps of a sample."""
@@ -398,20 +385,6 @@ class ControllerNode(ManagedNode):
     def _diagnose(self) -> None:
         for joint in self.joints:
             joint.diagnose(self._rivals, self.active)
-
-
-def _check_style(p: Parameters) -> None:
-    """Raise ParameterError where the messages of io.style cannot carry what is asked for."""
-    style = p.io.style
-    if p.lockstep and style != 'native':
-        raise ParameterError('lockstep', True, 'needs io.style: native')
-    if p.joints and style == 'native':
-        raise ParameterError(
-            'io.style', style, 'has messages for one joint only',
-            'set joint_state_topic or ros2_control',
-        )
-    if style == 'joint_state_topic' and not (p.joints or p.io.joint):
-        raise ParameterError('joints', (), 'is empty', f'name them, io.style is {style}')
 
 
 def main(args: list[str] | None = None) -> int:

@@ -53,7 +53,7 @@ class Controller:
             self._configure(None, self.loop.v if self.loop.knows_v else None)
         else:
             self.loop.renew(self.loop.estimate)
-            self.loop.heard_at = None
+            self.loop.heard.y_at = None
         self.active = True
 
     def deactivate(self) -> None:

@@ -9,7 +9,7 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.loop.loop_statistics import Counts
+from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.report_origin import ReportOrigin
 from backlash_ros.core.parameters import Parameters
 
@@ -84,9 +84,9 @@ class CommandHistory:
 
     def __init__(
         self, sample_period_s: float, use: ReportUse = ReportUse.ALWAYS,
-        counts: Counts | None = None,
+        counts: LoopStatistics | None = None,
     ) -> None:
-        self.counts = counts or Counts()
+        self.counts = counts or LoopStatistics()
         self.newest_ns = 0
         self.trust, self.origin = ReportTrust(use), ReportOrigin()
         self._period_ns = sample_period_s * 1e9

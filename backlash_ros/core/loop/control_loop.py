@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from math import isfinite, nan
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ from backlash_ros.core.loop.loop_statistics import LoopStatistics
 from backlash_ros.core.loop.phase import Event, Phase, after
 from backlash_ros.core.loop.sample_counter import NEXT_SAMPLE, Arrival, Output, SampleCounter
 from backlash_ros.core.parameters import NOISE, Parameters
+from backlash_ros.core.plant.transfer_function import TransferFunction
 
 
 class Driver(NamedTuple):
@@ -41,14 +43,27 @@ class Driver(NamedTuple):
     steady_s: Callable[[], float] = time.monotonic
 
 
+@dataclass
+class Heard:
+    """What has come last: y_m; when it and y came, on the steady clock [s], None before.
+
+    unanswered: outputs, as long as nobody knew v. before_reports: estimate at the first report.
+    """
+
+    y_m: float = nan
+    y_m_at: float | None = None
+    y_at: float | None = None
+    unanswered: int = 0
+    before_reports: Estimate | None = None
+
+
 class ControlLoop:
     """Answers outputs with commands, whatever the driver does.
 
     send: takes v to the driver. estimate: to begin with, None for what was known before. counter:
     goes on counting where another loop has ended. v: the command that acts; None, and then taken
-    for 0, as long as nobody knows (knows_v). executor: where fits are made, None for here. y_m: the
-    newest reference. phase: see phase.py. heard_at, referred_at: when the newest y and y_m came, on
-    the steady clock [s].
+    for 0, as long as nobody knows (knows_v). executor: where fits are made, None for here. phase:
+    see phase.py.
     """
 
     def __init__(
@@ -56,25 +71,18 @@ class ControlLoop:
         estimate: Estimate | None, counter: SampleCounter, v: float | None = None,
         executor: Executor | None = None,
     ) -> None:
+        self.counter, self.heard, self.phase = counter, Heard(), Phase.BEGINS
         # Within six deviations of its noise y stands still.
-        self.statistics = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
-        self.counter = counter
-        self.commands = CommandHistory(p.sample_period, report_use(p), self.statistics)
-        self.y_m = nan
-        self.phase = Phase.BEGINS
-        self.heard_at: float | None = None
-        self.referred_at: float | None = None
+        counts = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
+        self.commands = CommandHistory(p.sample_period, report_use(p), counts)
         self.executor = executor or Executor()
         self.core = build_controller(p, estimate, self.executor)
-        self.nominal = build_model(p)  # no parameter of it is live
         self.knows_v = v is not None
         if v is not None:
             self.core.motion = at_rest(v)
         self._p, self._send, self._driver = p, send, driver
         self._gap = NEXT_SAMPLE  # what is missing since the newest output that was used
-        self._unanswered = 0  # outputs, because nobody knew v yet
         self._ending: Iterator[float] = iter(())  # commands that lead v to its end
-        self._before_reports = self.estimate  # before it was learned from any
 
     # --- what it knows ---------------------------------------------------------------------------
 
@@ -89,9 +97,20 @@ class ControlLoop:
         return self.core.motion.v
 
     @property
+    def nominal(self) -> TransferFunction:
+        """G(z) as the parameters have it."""
+        return build_model(self._p)
+
+    @property
+    def statistics(self) -> LoopStatistics:
+        """What was counted."""
+        return self.commands.counts
+
+    @property
     def unreferred_s(self) -> float:
         """Time since the newest reference [s], 0 before the first."""
-        return 0.0 if self.referred_at is None else self._driver.steady_s() - self.referred_at
+        at = self.heard.y_m_at
+        return 0.0 if at is None else self._driver.steady_s() - at
 
     @property
     def begins(self) -> bool:
@@ -113,7 +132,7 @@ class ControlLoop:
     def take_reference(self, y_m: float) -> None:
         """Take in a reference; an absurd one is counted and the last one holds."""
         if plausible(y_m):
-            self.y_m, self.referred_at = y_m, self._driver.steady_s()
+            self.heard.y_m, self.heard.y_m_at = y_m, self._driver.steady_s()
         else:
             self.statistics.bad_references += 1
 
@@ -135,7 +154,7 @@ class ControlLoop:
         if arrival is None:
             arrival = self.counter.count(output.stamp_ns, output.sequence, output.numbered)
         if y_m is None:
-            y_m = self.y_m
+            y_m = self.heard.y_m
         statistics, step = self.statistics, None
         if self._is_usable(output, arrival, y_m):
             step = self._step_core(output.y, y_m, output.stamp_ns)
@@ -176,7 +195,7 @@ class ControlLoop:
         if arrival.missing or arrival.restarted:
             self._note_missing(arrival)
         if plausible(output.y):
-            self.heard_at = self._driver.steady_s()
+            self.heard.y_at = self._driver.steady_s()
             if plausible(y_m):
                 for v, stamp_ns in self._driver.reports():
                     self.take_applied(v, stamp_ns)
@@ -227,8 +246,9 @@ class ControlLoop:
             self._go_on_from(self.core.command_of(reported))
         if self.knows_v:
             return True
-        self._unanswered += 1
-        if driver.may_report() and self._unanswered <= min(20, max(int(0.5 / p.sample_period), 1)):
+        self.heard.unanswered += 1
+        longest = min(20, max(int(0.5 / p.sample_period), 1))
+        if driver.may_report() and self.heard.unanswered <= longest:
             return False
         if p.io.style == 'joint_state_topic':
             # v and y are the same angle but for the gap: the joint holds where it stands.
@@ -262,7 +282,7 @@ class ControlLoop:
         """Begin anew where reports turn out to have another origin than what was learned from."""
         origin = self.commands.origin
         if origin.begins:
-            self._before_reports = self.estimate
+            self.heard.before_reports = self.estimate
         report += origin.value
         if not origin.changed_by(report, command / self.core.command_of(1.0)):
             return False
@@ -270,7 +290,7 @@ class ControlLoop:
             f'{self._driver.applied} is {origin.value:.4g} beyond v: taken for another zero of the '
             'motor encoder, and subtracted'
         )
-        self.renew(self._before_reports)
+        self.renew(self.heard.before_reports)
         return True
 
     # --- the phases ------------------------------------------------------------------------------
@@ -278,8 +298,9 @@ class ControlLoop:
     @property
     def is_overdue(self) -> bool:
         """Whether the driver has been silent for too long, and that is new."""
-        return self.heard_at is not None and self.phase in (Phase.BEGINS, Phase.RUNS) \
-            and 0.0 < self._p.timeout.plant_output < self._driver.steady_s() - self.heard_at
+        at = self.heard.y_at
+        return at is not None and self.phase in (Phase.BEGINS, Phase.RUNS) \
+            and 0.0 < self._p.timeout.plant_output < self._driver.steady_s() - at
 
     def give_up(self) -> None:
         """The driver is silent: whenever it comes back, its state will be unknown."""
@@ -303,7 +324,7 @@ class ControlLoop:
     def resume(self) -> None:
         """Command again, from the newest v that was heard; the state of the plant is unknown."""
         self._happens(Event.RIVAL_GONE)
-        self.heard_at = None
+        self.heard.y_at = None
         self._renew_core(self.estimate)
 
     def end(self, action: str) -> None:
@@ -321,8 +342,8 @@ class ControlLoop:
             self.send(v)
         return v is not None
 
-    def renew(self, estimate: Estimate) -> None:
-        """Go on from the present v with a new core that begins with these estimates.
+    def renew(self, estimate: Estimate | None) -> None:
+        """Go on from the present v with a new core that begins with these estimates, if any.
 
         Nothing is known of the state of the plant then.
         """
@@ -337,7 +358,7 @@ class ControlLoop:
     def _happens(self, event: Event) -> None:
         self.phase = after(self.phase, event)
 
-    def _renew_core(self, estimate: Estimate) -> None:
+    def _renew_core(self, estimate: Estimate | None) -> None:
         before = self.core
         self.core = core = build_controller(self._p, estimate, self.executor)
         core.go_on_from(before)

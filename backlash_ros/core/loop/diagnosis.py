@@ -174,7 +174,7 @@ def figures_of_loop(
         inconsistent_s=statistics.inconsistent * p.sample_period,
         law=law.report, adapting=law.adapting, given=was_given(estimate),
         silent_s=p.timeout.plant_output if loop.silent else 0.0, on_timeout=p.on_timeout,
-        referred=isfinite(loop.y_m),
+        referred=isfinite(loop.heard.y_m),
         reference_silent_s=0.0 if p.lockstep or not 0.0 < timeout < loop.unreferred_s else timeout,
         # In lockstep the outputs come as fast as the machine goes.
         intervals_s=(nan, nan, nan) if p.lockstep else statistics.intervals_s(),

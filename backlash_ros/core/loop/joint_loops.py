@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
+from itertools import cycle
 from math import isfinite
 
-from backlash_ros.core.control.controller import ControlStep
+from backlash_ros.core.control.controller import REFINE_SHARE, ControlStep
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.loop.control_loop import ControlLoop, Driver
@@ -37,6 +39,8 @@ class JointLoops:
             ) for joint in p.joint_names
         }
         self.loops = tuple(self.by_name.values())
+        self._period_s, self._turns = p.sample_period, cycle(self.loops)
+        self._behind = 0  # outputs in a row that were answered after the next one had come
 
     def answer(
         self, outputs: Mapping[str, Output], y_m: float | None = None,
@@ -62,6 +66,18 @@ class JointLoops:
         self._send_waiting()
         self.counter.sender.learn()
         return steps
+
+    def use_spare_time(self, received_ns: int) -> None:
+        """Let the next loop take up and submit fits, once the commands have left.
+
+        Where the next output is waiting already, there is no time for what may be put off.
+        received_ns: when the output came that was answered, by the system clock; 0: not known.
+        """
+        put_off = 5  # samples for which one that is behind may leave it alone
+        is_behind = 0 < received_ns < time.time_ns() - self._period_s * 1e9
+        self._behind = self._behind + 1 if is_behind else 0
+        if self._behind % put_off == 0:
+            next(self._turns).core.refine(REFINE_SHARE * self._period_s)
 
     def take_references(self, y_m: Mapping[str, float]) -> None:
         """Take in references by joint."""

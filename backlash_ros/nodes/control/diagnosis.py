@@ -76,12 +76,11 @@ def _peer(
 
 def figures_of(
     node: Node, io: DriverIo, loop: ControlLoop, p: Parameters, period: Period,
-    counts: Mapping[str, int], rivals: tuple[str, ...], references: QoSProfile,
+    counts: Mapping[str, int], rivals: tuple[str, ...],
 ) -> LoopFigures:
     """What is known of a loop and its neighbours.
 
-    counts: gained lately. period: of the driver. references: with which quality of service the
-    controller listens to them.
+    counts: gained lately. period: of the driver.
     """
     to, figures = io.topics, figures_of_loop(loop, p, period, counts)
     if io.simulated_time:
@@ -93,7 +92,7 @@ def figures_of(
     return replace(
         figures, rivals=rivals, repeats_stamps=io.stamps.repeated,
         output=publishers_of(node, to.output, to.output_type, output_qos(p, DEPTH)),
-        reference=publishers_of(node, to.reference, to.reference_type, references),
+        reference=publishers_of(node, to.reference, to.reference_type, io.reference_qos),
         control=subscribers_of(node, to.control, to.control_type),
     )
 

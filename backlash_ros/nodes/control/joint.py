@@ -7,8 +7,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from math import isfinite
 from pathlib import Path
 
-from rclpy.qos import QoSProfile
-
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.control.controller import ControlStep
 from backlash_ros.core.estimate import Estimate, Status
@@ -42,9 +40,7 @@ class Joint:
     anew.
     """
 
-    def __init__(
-        self, node: ProcessNode, name: str, p: Parameters, io: DriverIo, references: QoSProfile,
-    ) -> None:
+    def __init__(self, node: ProcessNode, name: str, p: Parameters, io: DriverIo) -> None:
         self.name, self.p = name, p
         self.loop: ControlLoop | None = None
         # In lockstep there is the simulated plant alone, which begins at 0.
@@ -52,9 +48,8 @@ class Joint:
         self.v = initial if isfinite(initial) and not p.lockstep else None
         self.model = ModelPublisher(node, name)
         self._node, self._io = node, io
-        self._warned: set[str] = set()  # texts
         self.told: object = None
-        self._references, self._lately = references, Lately()
+        self._lately = Lately()
         self._diagnostics = DiagnosticsPublisher(
             node, p.io.joint or io.publisher.topic_name, part=name
         )
@@ -65,17 +60,17 @@ class Joint:
     @property
     def driver(self) -> Driver:
         """What its loop can ask about the driver; the simulated plant has nothing to be asked."""
-        io = self._io
+        io, warned = self._io, set[str]()
+
+        def warn_once(text: str) -> None:
+            if text not in warned and not io.is_simulated:
+                self._node.log.warning(f'{self.name}: {text}' if self.name else text)
+            warned.add(text)
+
         return Driver(
             io.now_ns, lambda: io.reports_of(self.name),
-            lambda: io.has_reports and not io.is_simulated, io.topics.applied, self._warn_once,
+            lambda: io.has_reports and not io.is_simulated, io.topics.applied, warn_once,
         )
-
-    def _warn_once(self, text: str) -> None:
-        if text not in self._warned:
-            self._warned.add(text)
-            if not self._io.is_simulated:
-                self._node.log.warning(f'{self.name}: {text}' if self.name else text)
 
     def begin(self, loop: ControlLoop, before: Estimate) -> None:
         """Take a new loop."""
@@ -161,7 +156,7 @@ class Joint:
         counts = {**loop.statistics.by_name(), 'dead_workers': loop.executor.restarts}
         figures = figures_of(
             self._node, self._io, loop, p, period, self._lately.gained(counts, time.monotonic()),
-            tuple(rival.name for rival in rivals.found), self._references,
+            tuple(rival.name for rival in rivals.found),
         )
         findings = [*missing_joint(self._io, self.name, p), *findings_of(figures)]
         finding = worst(findings)

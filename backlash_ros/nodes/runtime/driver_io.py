@@ -19,6 +19,7 @@ from backlash_ros import topics
 from backlash_ros.core.loop.command_history import KEPT_COMMANDS
 from backlash_ros.core.loop.sample_counter import Output
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import DEPTH, message_with, number_of
 from backlash_ros.nodes.runtime.process import ProcessNode
@@ -53,6 +54,20 @@ def driver_topics(p: Parameters) -> DriverTopics:
     if style == 'ros2_control':
         return DriverTopics(*reference, to.JOINT_STATES, JointState, *array, *applied)
     return DriverTopics(*reference, to.PLANT_OUTPUT, Float64, to.CONTROL, Float64, *applied)
+
+
+def check_style(p: Parameters) -> None:
+    """Raise ParameterError where the messages of io.style cannot carry what is asked for."""
+    style = p.io.style
+    if p.lockstep and style != 'native':
+        raise ParameterError('lockstep', True, 'needs io.style: native')
+    if p.joints and style == 'native':
+        raise ParameterError(
+            'io.style', style, 'has messages for one joint only',
+            'set joint_state_topic or ros2_control',
+        )
+    if style == 'joint_state_topic' and not (p.joints or p.io.joint):
+        raise ParameterError('joints', (), 'is empty', f'name them, io.style is {style}')
 
 
 def output_qos(p: Parameters, depth: int) -> QoSProfile:
@@ -106,8 +121,7 @@ class DriverIo:
         self._node, self._p = node, p
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointState()  # the newest message of references
-        self._references: Subscription | None = None
-        self._reports: Subscription | None = None
+        self._heard: dict[str, Subscription] = {}  # by what they are about
         self._reported: dict[str, deque[tuple[float, int]]] = {
             joint: deque(maxlen=KEPT_COMMANDS) for joint in p.joint_names
         }
@@ -180,8 +194,8 @@ class DriverIo:
 
     def listen_to_references(
         self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int, polled: bool,
-    ) -> QoSProfile:
-        """Call hear with every y_m; returns with which quality of service. polled: as in listen."""
+    ) -> None:
+        """Call hear with every y_m. polled: when take_references is called."""
         def hear_number(message: bytes, info: dict[str, Any]) -> None:
             hear({'': number_of(message)})
 
@@ -190,16 +204,19 @@ class DriverIo:
             hear(self.values(message))
 
         of_joints = self.topics.reference_type is JointState
-        self._references = self._node.listen(
+        self._heard['references'] = self._node.listen(
             self.topics.reference_type, self.topics.reference,
             hear_joints if of_joints else hear_number, qos, raw=not of_joints, polled=polled,
         )
-        return self._references.qos_profile
+
+    @property
+    def reference_qos(self) -> QoSProfile:
+        """How y_m is listened to."""
+        return self._heard['references'].qos_profile
 
     def take_references(self) -> None:
         """Serve the polled references."""
-        if self._references is not None:
-            serve_polled(self._references)
+        serve_polled(self._heard['references'])
 
     def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
         """Call hear with every v that anybody sends to the driver."""
@@ -262,18 +279,19 @@ class DriverIo:
             for joint, v in self.values(message).items():
                 self._reported[joint].append((v, stamp_ns))
 
-        self._reports = self._node.listen(
+        self._heard['reports'] = self._node.listen(
             self.topics.applied_type, self.topics.applied, hear, KEPT_COMMANDS, polled=True
         )
 
     @property
     def has_reports(self) -> bool:
         """Whether the driver reports what it has applied."""
-        return self._reports is not None and self._reports.get_publisher_count() > 0
+        reports = self._heard.get('reports')
+        return reports is not None and reports.get_publisher_count() > 0
 
     def reports_of(self, joint: str) -> Iterator[tuple[float, int]]:
         """v and stamp [ns] of what the driver has reported of a joint since the last call."""
-        if self._reports is not None:
-            serve_polled(self._reports)
+        if 'reports' in self._heard:
+            serve_polled(self._heard['reports'])
         while self._reported[joint]:
             yield self._reported[joint].popleft()

@@ -58,7 +58,7 @@ class Arm:
         return '' if result.successful else str(result.reason)
 
     def lose(self, joint: str) -> None:
-        self.node.loops.by_name[joint].heard_at = -1e9
+        self.node.loops.by_name[joint].heard.y_at = -1e9
         self.node._look_for_silence()
 
 
