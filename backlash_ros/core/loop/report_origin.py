@@ -6,6 +6,9 @@ from collections import deque
 from math import sqrt
 
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 LOOK_AFTER, KEPT_PAIRS = 20, 200  # intervals between two looks at the newest ones
 LOOKS = 10  # that tell the origin, after which it counts as settled
@@ -71,3 +74,12 @@ class ReportOrigin:
             return False
         self.value, self._looks = found, LOOKS
         return True
+
+
+def without_origin(reports: Array, commands: Array) -> Array:
+    """Reports of a record as they would be from an encoder that was zeroed; nan where none is."""
+    origin = ReportOrigin()
+    for report, command in zip(reports.tolist(), commands.tolist(), strict=True):
+        if report == report and command == command:
+            origin.changed_by(report, command)
+    return reports - origin.value

@@ -18,6 +18,7 @@ from backlash_ros.core.control.controller import LONGEST_GAP
 from backlash_ros.core.control.limits import plausible
 from backlash_ros.core.loop.command_history import ReportTrust, report_use
 from backlash_ros.core.loop.learned_model import learned_model_of
+from backlash_ros.core.loop.report_origin import ReportOrigin
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.simulation.run_record import COLUMNS, RunRecord, row_of
 
@@ -57,7 +58,7 @@ def replay(
     lost = np.maximum(np.round(steps).astype(int) - 1, 0)
     controller = build_controller(p)
     rows = np.full((recorded.samples, len(COLUMNS)), np.nan)
-    trust = ReportTrust(report_use(p))
+    trust, origin, known = ReportTrust(report_use(p)), ReportOrigin(), controller.estimator.estimate
     v_before = v_made = 0.0
     for k, (y_m, y, v) in enumerate(zip(*columns, strict=True)):
         y_m, y, v = float(y_m), float(y), float(v)
@@ -75,7 +76,16 @@ def replay(
             controller.start_from(v_before)
         complete = bool(reports) and len(reports[k]) == missing + 1
         if k and trust.note(complete) and complete:
-            applied = list(reports[k])
+            if origin.begins:
+                known = controller.estimator.estimate
+            if origin.changed_by(reports[k][-1], v_before / controller.command_of(1.0)):
+                # As in the loop: what was learned from them so far goes.
+                before, controller = controller, build_controller(p, known)
+                controller.go_on_from(before)
+                controller.start_from(v_before)
+                missing, commands = 0, []
+            else:
+                applied = [each - origin.value for each in reports[k]]
         step = controller.step(y, y_m, missing, applied, commands=commands)
         controller.refine()
         rows[k] = row_of(t[k], y, v, np.nan, step, controller.estimator)

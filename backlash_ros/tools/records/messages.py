@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from backlash_ros import topics
 from backlash_ros.core.loop.command_history import REPORTED
 from backlash_ros.core.loop.diagnosis import TROUBLE
+from backlash_ros.core.loop.report_origin import without_origin
 from backlash_ros.core.records.readings import quantum
 from backlash_ros.core.records.record import Record, RecordError
 from backlash_ros.core.records.rows_to_record import readings, usable
@@ -87,6 +88,8 @@ def from_messages(
         raise RecordError('its stamps do not tell the sample period: give --period S')
     record = on_grid(rows, period, late=True)
     step = record.sample_period
+    if record.commands is not None:
+        record = replace(record, v=without_origin(record.v, record.commands))
     for topic, (times, _) in sent.items():
         lost = round((times[-1] - times[0]) / step) + 1 - len(times)
         # A topic with fewer messages is published on change.
