@@ -258,8 +258,7 @@ class RunWatch:
         """Check the exit codes of the processes that were asked to end."""
         bad = []
         # A driver may end so of the signal that stops it; a shell adds 128 to its number.
-        stopped = {sign * number + of_shell for sign, of_shell in ((-1, 0), (1, 128))
-                   for number in (signal.SIGINT, signal.SIGTERM)}
+        stopped = -signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM
         for child in self._supervisor.children:
             code = child.process.returncode
             if code == 0 or child.plan.name in self._gone:
