@@ -48,13 +48,6 @@ OUTCOME_COLUMNS = (
 Outcome = Mapping[str, float | str | None]
 
 
-class Sweep(NamedTuple):
-    """A parameter and the values it takes in turn."""
-
-    name: str
-    values: tuple[Value, ...]
-
-
 class Job(NamedTuple):
     """One run: its complete parameters and its length."""
 
@@ -79,8 +72,8 @@ class ParameterStatistics(NamedTuple):
     nees_interval: tuple[float, float]
 
 
-def parse_sweep(text: str) -> Sweep:
-    """Return the sweep of `KEY=v1,v2,...`; the values are written as in a YAML list."""
+def parse_sweep(text: str) -> tuple[str, tuple[Value, ...]]:
+    """Return name and values of `KEY=v1,v2,...`; the values are written as in a YAML list."""
     name, equals, listed = text.partition('=')
     name = name.strip()
     if not equals or not listed.strip():
@@ -92,23 +85,17 @@ def parse_sweep(text: str) -> Sweep:
         raise InputError(f'--sweep {text!r}: the values are no list in YAML') from None
     if isinstance(BY_NAME[name].default, str):
         values = [str(value) for value in values]
-    return Sweep(name, tuple(check_value(BY_NAME[name], value) for value in values))
+    return name, tuple(check_value(BY_NAME[name], value) for value in values)
 
 
-def combinations(sweeps: Sequence[Sweep]) -> list[dict[str, Value]]:
-    """Every combination of the swept values, the last one changing fastest."""
-    names = [sweep.name for sweep in sweeps]
+def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
+    """Every combination of the values of sweeps, the last one changing fastest."""
+    sweeps = [parse_sweep(text) for text in texts]
+    names = [name for name, _ in sweeps]
     if len(set(names)) < len(names):
         raise InputError(f'--sweep names {max(names, key=names.count)} twice')
-    products = itertools.product(*(sweep.values for sweep in sweeps))
+    products = itertools.product(*(values for _, values in sweeps))
     return [dict(zip(names, values, strict=True)) for values in products]
-
-
-def value_text(value: Value) -> str:
-    """A parameter value as short text."""
-    if isinstance(value, tuple):
-        return '[' + ', '.join(f'{element:g}' for element in value) + ']'
-    return f'{value:g}' if isinstance(value, float) else str(value)
 
 
 def make_jobs(

@@ -18,11 +18,12 @@ from backlash_ros.core.estimate import Status
 from backlash_ros.core.loop.command_history import ReportUse, report_use
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.parameters.parameter import as_yaml
 from backlash_ros.core.simulation.replay import parting, replay
 from backlash_ros.core.simulation.run_record import RunRecord
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import cli, figures
-from backlash_ros.tools.batch import combinations, parse_sweep, value_text
+from backlash_ros.tools.batch import combinations
 from backlash_ros.tools.config import parse_setting
 from backlash_ros.tools.records.columns import parse_columns
 from backlash_ros.tools.records.reading import read_run_or_log
@@ -87,7 +88,7 @@ def _replay(args: Sequence[str] | None) -> None:
     parser = make_parser()
     options = parser.parse_args(args)
     span = cli.span_of(parser, options)
-    changes = combinations([parse_sweep(text) for text in options.sweep])
+    changes = combinations(options.sweep)
     sources = [_opened(path, options, span) for path in options.runs]
     if len(sources) * len(changes) == 1:
         _one(sources[0], options.out)
@@ -95,7 +96,7 @@ def _replay(args: Sequence[str] | None) -> None:
     rows = []
     for source in sources:
         for change in changes:
-            words = ' '.join(f'{name}={value_text(value)}' for name, value in change.items())
+            words = ' '.join(f'{name}={as_yaml(value)}' for name, value in change.items())
             run = source.replayed(source.parameters.replaced(change), f'{source.path.name} {words}')
             rows.append(((str(source.path), words), _numbers(run)))
     directory = result_directory(options.out)

@@ -10,6 +10,7 @@ from math import isfinite
 from tqdm import tqdm
 
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.parameter import as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 from backlash_ros.options import OptionParser
 from backlash_ros.tools import batch, cli
@@ -80,11 +81,10 @@ def _refuse_bad_out(options: argparse.Namespace) -> None:
 
 
 def _many(parameters: Parameters, options: argparse.Namespace) -> None:
-    sweeps = [batch.parse_sweep(text) for text in options.sweep]
-    swept = [sweep.name for sweep in sweeps]
+    changes = batch.combinations(options.sweep)
+    swept = list(changes[0])
     if 'seed' in swept and options.seeds is not None:
         raise InputError('--seeds and --sweep seed=... exclude each other')
-    changes = batch.combinations(sweeps)
     first = parameters.seed
     seeds = range(first, first + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
@@ -103,7 +103,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
         size = len(outcomes) // len(changes)
         header = [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %']
         print(format_table(header, [
-            [*map(batch.value_text, change.values()), *_sweep_row(outcomes[i * size:][:size])]
+            [*map(as_yaml, change.values()), *_sweep_row(outcomes[i * size:][:size])]
             for i, change in enumerate(changes)
         ]))
     else:
