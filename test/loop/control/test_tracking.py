@@ -6,7 +6,12 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy import signal
 
-from backlash_ros.core.assembly import build_model
+from backlash_ros.core.assembly import (
+    build_controller,
+    build_model,
+    build_plant,
+    build_reference,
+)
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.tracking.design import Weights, design
 from backlash_ros.core.control.tracking.feedback import shrunk_crossings
@@ -249,3 +254,19 @@ def test_crossings_are_counted_per_reversal_of_the_reference() -> None:
     value = gap_crossings_per_reversal(record(y_m, y_m, chatter))
     assert value is not None
     assert value > 10.0
+
+
+def test_a_loop_that_was_driven_to_its_bounds_comes_back() -> None:
+    # Full feedback between its own bounds would cycle like between those of v.
+    p = Parameters({
+        'structure': 'tracking', 'amplitude': 0.2, 'estimator.law': 'fixed', 'fixed.doubt': 0.1,
+        'estimator.initial.m': 1.3, 'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0,
+    })
+    controller, plant, reference = build_controller(p), build_plant(p), build_reference(p)
+    y = []
+    for k in range(900):
+        y.append(plant.measure())
+        step = controller.step(-y[-1] if 100 <= k < 160 else y[-1], reference(k * 0.01))
+        plant.step(step.v)
+    assert max(map(abs, y)) > 10.0
+    assert max(map(abs, y[600:])) < 0.25

@@ -39,15 +39,6 @@ def test_one_wild_sample_moves_no_estimate_by_more_than_its_deviation() -> None:
     assert record.column('status')[303] == Status.TRACKING
 
 
-def test_broken_sensor_freezes_the_estimates_and_says_so() -> None:
-    record = run(700, lambda k, y: -y if k >= 300 else y)
-    status = record.column('status')
-    assert np.all(status[340:] == Status.INCONSISTENT)
-    for name in NAMES:
-        assert np.ptp(record.column(name)[340:]) == 0.0
-    assert errors(record, -1).max() < 0.01
-
-
 def test_sensor_that_comes_back_ends_the_freeze() -> None:
     record = run(900, lambda k, y: -y if 300 <= k < 500 else y)
     assert record.column('status')[450] == Status.INCONSISTENT

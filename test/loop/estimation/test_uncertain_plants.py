@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from cases.geared_motor import motor, random_backlash
 from places import ROOT
 
 from backlash_ros.core.estimate import Status
@@ -35,18 +34,3 @@ def test_where_the_play_began_does_not_contradict_readings_that_were_rounded() -
     })
     record = build_closed_loop(p).run(900)
     assert (record.column('status')[200:] == Status.TRACKING).all()
-
-
-@pytest.mark.parametrize('seed', [0, 1])
-def test_first_swap_waits_until_the_gap_was_crossed_with_the_first_estimate(seed: int) -> None:
-    loop = build_closed_loop(Parameters({
-        **motor(), **random_backlash(seed), 'seed': seed, 'structure': 'tracking',
-        'truth.scale_frequency': 0.8,
-    }))
-    models: list[object] = []
-    v = loop.run(800, lambda _: models.append(loop.controller.redesign.adopted)).column('v')
-    moves = np.abs(np.diff(v, prepend=0.0))
-    swaps = [k for k in range(1, 800) if models[k] is not models[k - 1]]
-    assert swaps
-    for k in swaps:
-        assert moves[k:k + 5].max() <= moves[k - 200:k].max()

@@ -51,24 +51,6 @@ def loop() -> Iterator[Loop]:
         loop.close()
 
 
-def test_every_message_is_served_in_order_with_its_number_where_that_is_wanted(loop):
-    plain: list[float] = []
-    numbered: list[tuple[float, int]] = []
-
-    def hear_number(message: Float64, info: dict[str, Any]) -> None:
-        numbered.append((message.data, info['publication_sequence_number']))
-
-    loop.node.create_subscription(Float64, 'number', lambda message: plain.append(message.data), 10)
-    untyped: Any = hear_number
-    loop.node.create_subscription(Float64, 'number', untyped, 10)
-    loop.spin_until(lambda: loop.publisher.get_subscription_count() == 2, 'both subscribers')
-    loop.say(*map(float, range(5)))
-    loop.spin_until(lambda: len(plain) == len(numbered) == 5, 'five messages')
-    assert plain == list(range(5))
-    first = numbered[0][1]
-    assert numbered == [(value, first + value) for value in range(5)]
-
-
 def test_messages_of_a_polled_subscription_wait_and_wake_nobody(loop: Loop) -> None:
     taken: list[tuple[float, int]] = []
 

@@ -22,7 +22,7 @@ from backlash_ros.core.jobs.executor import (
     Failure,
     Samples,
 )
-from backlash_ros.core.jobs.worker import NICENESS, WorkerExecutor
+from backlash_ros.core.jobs.worker import WorkerExecutor
 
 KILLED = 6  # times
 PARENT = f"""
@@ -97,13 +97,6 @@ def test_a_worker_imports_neither_ros_nor_the_program_that_started_it(executor):
     assert isinstance(found, list)
     assert {'numpy', 'backlash_ros', 'worker_jobs'} <= set(found)
     assert not {'rclpy', 'pytest', 'matplotlib', 'rosbags', '__mp_main__'} & set(found)
-
-
-def test_the_loop_goes_before_it(executor: WorkerExecutor) -> None:
-    executor.open()
-    assert executor.pid is not None
-    own = os.getpriority(os.PRIO_PROCESS, 0)
-    assert os.getpriority(os.PRIO_PROCESS, executor.pid) == min(own + NICENESS, 19)
 
 
 def test_a_worker_that_stands_still_holds_up_nobody(executor: WorkerExecutor) -> None:
@@ -181,14 +174,3 @@ def test_interrupts_are_for_the_loop_alone(executor: WorkerExecutor) -> None:
     channel.submit(operator.neg, 2)
     assert result_of(channel) == -2
     assert os.getpgid(executor.pid) != os.getpgid(0)  # nor does a terminal send it any
-
-
-def test_nothing_is_left_of_a_closed_executor(tmp_path: Path) -> None:
-    executor = WorkerExecutor()
-    assert executor.pid is None  # nobody needs a worker yet
-    begin(executor.open(), tmp_path / 'begun')
-    pid = executor.pid
-    assert pid is not None
-    executor.close()
-    assert not is_there(pid)
-    assert not executor.alive

@@ -79,24 +79,21 @@ def test_sweep_runs_every_combination_for_every_seed(tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'message'),
-    [
-        (['--set', 'sed=1'], 'did you mean seed?'),
-        (['--config', 'nothing.yaml'], 'nothing.yaml: cannot be read'),
-        (['--duration', '0.015'], 'whole multiple of sample_period=0.01'),
-        (['--duration', '-1'], 'must be finite and > 0'),
-        (['--duration', 'x'], "invalid float value: 'x'"),
-        (['--seeds', '0'], '--seeds=0 must be >= 1'),
-        (['--seed', '-1'], 'seed=-1'),
-        (['--sweep', 'seed=1,2', '--seeds', '2'], 'exclude each other'),
-        (['--sweep', 'seed'], 'must be KEY=v1,v2,...'),
-        (['--sweep', 'seed=1', '--sweep', 'seed=2'], 'names seed twice'),
-        (['--sweep', 'backlash.m=1,-1'], 'backlash.m=-1.0 must be > 0'),
-        (['--cluster', 'tcp://x:1'], 'give --seeds or --sweep as well'),
-        (['--nonsense'], 'unrecognized arguments: --nonsense'),
-    ],
-)
+@pytest.mark.parametrize(('arguments', 'message'), [
+    (['--set', 'sed=1'], 'did you mean seed?'),
+    (['--config', 'nothing.yaml'], 'nothing.yaml: cannot be read'),
+    (['--duration', '0.015'], 'whole multiple of sample_period=0.01'),
+    (['--duration', '-1'], 'must be finite and > 0'),
+    (['--duration', 'x'], "invalid float value: 'x'"),
+    (['--seeds', '0'], '--seeds=0 must be >= 1'),
+    (['--seed', '-1'], 'seed=-1'),
+    (['--sweep', 'seed=1,2', '--seeds', '2'], 'exclude each other'),
+    (['--sweep', 'seed'], 'must be KEY=v1,v2,...'),
+    (['--sweep', 'seed=1', '--sweep', 'seed=2'], 'names seed twice'),
+    (['--sweep', 'backlash.m=1,-1'], 'backlash.m=-1.0 must be > 0'),
+    (['--cluster', 'tcp://x:1'], 'give --seeds or --sweep as well'),
+    (['--nonsense'], 'unrecognized arguments: --nonsense'),
+])
 def test_bad_input_is_one_line_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     arguments: list[str], message: str,

@@ -144,16 +144,13 @@ def test_negative_number_of_lost_samples_is_refused() -> None:
     assert c.lost_samples == 0
 
 
-@pytest.mark.parametrize(
-    ('intervals', 'name'),
-    [
-        (((0.0, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
-        (((1.0, 0.5), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
-        (((nan, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
-        (((0.5, 1.0), (0.0, 1.0), (1.0, 2.0)), 'estimator.bounds.c_l'),
-        (((0.5, 1.0), (0.0, 1.0), (-1.0, nan)), 'estimator.bounds.c_l'),
-    ],
-)
+@pytest.mark.parametrize(('intervals', 'name'), [
+    (((0.0, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
+    (((1.0, 0.5), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
+    (((nan, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
+    (((0.5, 1.0), (0.0, 1.0), (1.0, 2.0)), 'estimator.bounds.c_l'),
+    (((0.5, 1.0), (0.0, 1.0), (-1.0, nan)), 'estimator.bounds.c_l'),
+])
 def test_invalid_bounds_are_refused_and_named(intervals, name):
     with pytest.raises(ParameterError) as refusal:
         Bounds(*intervals)

@@ -65,15 +65,12 @@ def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(play, take_
     assert u == pytest.approx(target, abs=play.rounding(u_d + abs(target)))
 
 
-@pytest.mark.parametrize(
-    ('options', 'name'),
-    [
-        ({'direction_band': -1.0}, 'inverse.direction_band'),
-        ({'direction_band': nan}, 'inverse.direction_band'),
-        ({'take_up': 0.0}, 'inverse.take_up_rate'),
-        ({'take_up': nan}, 'inverse.take_up_rate'),
-    ],
-)
+@pytest.mark.parametrize(('options', 'name'), [
+    ({'direction_band': -1.0}, 'inverse.direction_band'),
+    ({'direction_band': nan}, 'inverse.direction_band'),
+    ({'take_up': 0.0}, 'inverse.take_up_rate'),
+    ({'take_up': nan}, 'inverse.take_up_rate'),
+])
 def test_invalid_options_are_refused_and_named(options: dict[str, float], name: str) -> None:
     with pytest.raises(ParameterError) as refusal:
         BacklashInverse(**options)

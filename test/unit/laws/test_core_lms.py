@@ -18,7 +18,6 @@ START = Estimate(0.696, 0.5, -0.5, 0.22)
 WIDE = Bounds((0.01, 1e6), (0.0, 1e9), (-1e9, 0.0))
 F_BOUNDS = (-0.5, 0.5)
 LAG = 20
-PAPER = Play(1.3, 3.0, -3.0)
 
 
 def lms(step: float = 1.0, bounds: Bounds = WIDE, step_f: float = 0.0,
@@ -56,10 +55,6 @@ def lessons(
         if estimator.estimate is not old:
             result.append(Lesson(*past[-LAG], old, estimator.estimate))
     return result
-
-
-def ramp(start: float, end: float, samples: int = 100) -> list[float]:
-    return np.linspace(start, end, samples).tolist()
 
 
 def products(m: float, c_r: float, c_l: float) -> np.ndarray:
@@ -106,18 +101,6 @@ def test_estimates_stay_within_bounds_that_the_truth_violates(play, signal, step
         assert 0.5 <= e.c_r <= 1.5
         assert -1.5 <= e.c_l <= -0.5
         assert F_BOUNDS[0] <= e.f <= F_BOUNDS[1]
-
-
-def test_status_says_whether_anything_was_learned() -> None:
-    estimator = lms()
-    lessons(estimator, PAPER, ramp(0.0, 2.9))
-    assert estimator.estimate.status == Status.ACQUIRING
-    # A step of 1 explains every sample, but c_l has not shown.
-    lessons(estimator, PAPER, ramp(3.0, 9.0, 400))
-    assert estimator.estimate.status == Status.ACQUIRING
-    estimator = lms()
-    lessons(estimator, PAPER, [20.0 * float(np.sin(0.126 * k)) for k in range(1, 600)])
-    assert estimator.estimate.status == Status.TRACKING
 
 
 def test_a_slope_below_0_is_said_and_not_learned() -> None:

@@ -50,15 +50,12 @@ def test_nothing_is_loaded_unless_asked_or_before_it_was_saved(tmp_path: Path) -
         load_estimate(Parameters({'estimates.load': True}))
 
 
-@pytest.mark.parametrize(
-    ('name', 'value'),
-    [
-        ('sample_period', 0.02),
-        ('plant.numerator', [1e-5, 4e-5, 2e-5]),
-        ('control.delay_samples', 1),
-        ('estimator.law', 'lms'),
-    ],
-)
+@pytest.mark.parametrize(('name', 'value'), [
+    ('sample_period', 0.02),
+    ('plant.numerator', [1e-5, 4e-5, 2e-5]),
+    ('control.delay_samples', 1),
+    ('estimator.law', 'lms'),
+])
 def test_estimates_of_another_plant_or_law_are_refused(tmp_path, name, value):
     file = tmp_path / 'estimates.json'
     save_estimate(file, LEARNED, parameters(file))

@@ -39,17 +39,14 @@ def test_clamp_equals_the_three_printed_cases(m, c_l, gap, u, signal):
         assert backlash.region == region
 
 
-@pytest.mark.parametrize(
-    ('values', 'name'),
-    [
-        ((-1.0, 3.0, -3.0, 0.0), 'backlash.m'),
-        ((nan, 3.0, -3.0, 0.0), 'backlash.m'),
-        ((1.0, inf, -3.0, 0.0), 'backlash.c_r'),
-        ((1.0, 3.0, -inf, 0.0), 'backlash.c_l'),
-        ((1.0, -3.0, 3.0, 0.0), 'backlash.c_l'),
-        ((1.0, 3.0, -3.0, nan), 'backlash.initial_u'),
-    ],
-)
+@pytest.mark.parametrize(('values', 'name'), [
+    ((-1.0, 3.0, -3.0, 0.0), 'backlash.m'),
+    ((nan, 3.0, -3.0, 0.0), 'backlash.m'),
+    ((1.0, inf, -3.0, 0.0), 'backlash.c_r'),
+    ((1.0, 3.0, -inf, 0.0), 'backlash.c_l'),
+    ((1.0, -3.0, 3.0, 0.0), 'backlash.c_l'),
+    ((1.0, 3.0, -3.0, nan), 'backlash.initial_u'),
+])
 def test_invalid_backlash_is_refused_and_named(values, name):
     with pytest.raises(ParameterError) as refusal:
         Backlash(*values)

@@ -11,28 +11,22 @@ def plant(numerator: list[float], denominator: list[float], **more: object) -> P
     return Parameters({'plant.numerator': numerator, 'plant.denominator': denominator, **more})
 
 
-@pytest.mark.parametrize(
-    ('numerator', 'denominator', 'reason'),
-    [
-        ([1.0], [1.0, -1.2], 'unstable pole 1.2'),
-        ([1.0, -1.0], [1.0, -0.5, 0.06], 'zero at z = 1'),
-        ([1.0, -1.0], [1.0, -1.5, 0.5], 'cancels the pole 1'),
-    ],
-)
+@pytest.mark.parametrize(('numerator', 'denominator', 'reason'), [
+    ([1.0], [1.0, -1.2], 'unstable pole 1.2'),
+    ([1.0, -1.0], [1.0, -0.5, 0.06], 'zero at z = 1'),
+    ([1.0, -1.0], [1.0, -1.5, 0.5], 'cancels the pole 1'),
+])
 def test_plant_through_which_nothing_can_be_learned_is_refused(numerator, denominator, reason):
     with pytest.raises(ParameterError, match=reason):
         build_controller(plant(numerator, denominator))
 
 
-@pytest.mark.parametrize(
-    ('parameters', 'reason'),
-    [
-        (plant([1.0], [1.0, -0.99999]), 'slower than'),
-        (plant([1.0], [1.0, -2.0, 1.0]), 'integrates more than once'),
-        (plant([1.0, 1.0], [1.0, -0.5, 0.06]), 'on the unit circle'),
-        (Parameters({'frequency': 300.0}), 'samples per period'),
-    ],
-)
+@pytest.mark.parametrize(('parameters', 'reason'), [
+    (plant([1.0], [1.0, -0.99999]), 'slower than'),
+    (plant([1.0], [1.0, -2.0, 1.0]), 'integrates more than once'),
+    (plant([1.0, 1.0], [1.0, -0.5, 0.06]), 'on the unit circle'),
+    (Parameters({'frequency': 300.0}), 'samples per period'),
+])
 def test_plant_that_makes_it_hard_is_warned_of(parameters: Parameters, reason: str) -> None:
     assert any(reason in warning for warning in warnings_of(parameters))
 

@@ -53,10 +53,6 @@ def test_default_obeys_its_own_rules(parameter: Parameter) -> None:
     assert type(value) is type(parameter.default)
 
 
-def test_names_are_unique() -> None:
-    assert len(BY_NAME) == len(PARAMETERS)
-
-
 @pytest.mark.parametrize(('misspelt', 'meant'), [
     ('plant.numerater', 'plant.numerator'), ('estimator.intial.m', 'estimator.initial.m'),
     ('backlash.cr', 'backlash.c_r'), ('Structure', 'structure'),
@@ -164,10 +160,6 @@ def test_word_outside_the_choices_is_refused_and_they_are_listed(parameter: Para
         assert Parameters({parameter.name: word})[parameter.name] == stands_for
 
 
-def test_former_name_of_the_default_law_is_accepted() -> None:
-    assert Parameters({'estimator.law': 'kalman'}).estimator.law == 'moving_horizon'
-
-
 @named([p for p in PARAMETERS if isinstance(p.default, str)])
 def test_word_must_be_a_text(parameter: Parameter) -> None:
     assert 'must be a text' in refusal_of(parameter.name, 1.0)
@@ -183,33 +175,24 @@ def test_true_and_false_are_read_as_yaml_and_ros_write_them(parameter: Parameter
         refusal_of(parameter.name, wrong)
 
 
-def test_message_names_parameter_value_rule_and_unit() -> None:
-    with pytest.raises(ParameterError) as refusal:
-        Parameters({'sample_period': -0.01})
-    assert str(refusal.value) == 'sample_period=-0.01 must be > 0 [s]'
-
-
-@pytest.mark.parametrize(
-    ('changes', 'name'),
-    [
-        ({'control.min': 2.0, 'control.max': 1.0}, 'control.min'),
-        ({'control.min': 2.0, 'control.max': 2.0}, 'control.min'),
-        ({'estimator.bounds.m': [2.0, 1.0]}, 'estimator.bounds.m'),
-        ({'estimator.bounds.c_r': [2.0, 2.0]}, 'estimator.bounds.c_r'),
-        ({'estimator.bounds.c_l': [-1.0, -2.0]}, 'estimator.bounds.c_l'),
-        ({'estimator.initial.c_l': 1.0}, 'estimator.initial.c_l'),
-        ({'proportional.bounds': [0.5, -0.5]}, 'proportional.bounds'),
-        ({'estimator.initial.m': 3.0, 'estimator.bounds.m': [0.1, 2.0]}, 'estimator.initial.m'),
-        ({'estimator.initial.c_r': 6.0, 'estimator.bounds.c_r': [0.0, 5.0]},
-         'estimator.initial.c_r'),
-        ({'estimator.initial.c_l': -0.1, 'estimator.bounds.c_l': [-5.0, -0.5]},
-         'estimator.initial.c_l'),
-        ({'backlash.c_r': -4.0}, 'backlash.c_l'),
-        ({'plant.numerator': [1.0] * 4}, 'plant.numerator'),
-        ({'plant.denominator': [0.0, 1.0]}, 'plant.denominator'),
-        ({'waveform': 'file'}, 'file'),
-    ],
-)
+@pytest.mark.parametrize(('changes', 'name'), [
+    ({'control.min': 2.0, 'control.max': 1.0}, 'control.min'),
+    ({'control.min': 2.0, 'control.max': 2.0}, 'control.min'),
+    ({'estimator.bounds.m': [2.0, 1.0]}, 'estimator.bounds.m'),
+    ({'estimator.bounds.c_r': [2.0, 2.0]}, 'estimator.bounds.c_r'),
+    ({'estimator.bounds.c_l': [-1.0, -2.0]}, 'estimator.bounds.c_l'),
+    ({'estimator.initial.c_l': 1.0}, 'estimator.initial.c_l'),
+    ({'proportional.bounds': [0.5, -0.5]}, 'proportional.bounds'),
+    ({'estimator.initial.m': 3.0, 'estimator.bounds.m': [0.1, 2.0]}, 'estimator.initial.m'),
+    ({'estimator.initial.c_r': 6.0, 'estimator.bounds.c_r': [0.0, 5.0]},
+     'estimator.initial.c_r'),
+    ({'estimator.initial.c_l': -0.1, 'estimator.bounds.c_l': [-5.0, -0.5]},
+     'estimator.initial.c_l'),
+    ({'backlash.c_r': -4.0}, 'backlash.c_l'),
+    ({'plant.numerator': [1.0] * 4}, 'plant.numerator'),
+    ({'plant.denominator': [0.0, 1.0]}, 'plant.denominator'),
+    ({'waveform': 'file'}, 'file'),
+])
 @pytest.mark.parametrize('law', ['lms', 'printed'])
 def test_values_that_contradict_each_other_are_refused_before_anything_runs(changes, name, law):
     with pytest.raises(ParameterError) as refusal:

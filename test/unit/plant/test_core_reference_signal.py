@@ -30,16 +30,13 @@ def test_every_waveform_stays_within_amplitude_around_bias(t, amplitude, bias, w
     assert abs(y_m - bias) <= amplitude + 1e-9
 
 
-@pytest.mark.parametrize(
-    ('waveform', 't', 'value'),
-    [
-        ('sine', 0.0, 1.0), ('sine', 0.25, 3.0), ('sine', 0.75, -1.0),
-        ('step', 0.0, 1.0), ('step', 0.49, 1.0), ('step', 0.51, 3.0), ('step', 7.0, 3.0),
-        ('square', 0.1, 3.0), ('square', 0.6, -1.0), ('square', 1.1, 3.0),
-        ('triangle', 0.0, 1.0), ('triangle', 0.125, 2.0), ('triangle', 0.25, 3.0),
-        ('triangle', 0.375, 2.0), ('triangle', 0.75, -1.0),
-    ],
-)
+@pytest.mark.parametrize(('waveform', 't', 'value'), [
+    ('sine', 0.0, 1.0), ('sine', 0.25, 3.0), ('sine', 0.75, -1.0),
+    ('step', 0.0, 1.0), ('step', 0.49, 1.0), ('step', 0.51, 3.0), ('step', 7.0, 3.0),
+    ('square', 0.1, 3.0), ('square', 0.6, -1.0), ('square', 1.1, 3.0),
+    ('triangle', 0.0, 1.0), ('triangle', 0.125, 2.0), ('triangle', 0.25, 3.0),
+    ('triangle', 0.375, 2.0), ('triangle', 0.75, -1.0),
+])
 def test_shape_of(waveform: str, t: float, value: float) -> None:
     assert signal(waveform, amplitude=2.0, bias=1.0)(t) == pytest.approx(value)
 
@@ -68,16 +65,13 @@ def test_unknown_waveform_is_refused() -> None:
         signal('sin')
 
 
-@pytest.mark.parametrize(
-    ('text', 'complaint'),
-    [
-        ('', 'header t,y_m'),
-        ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
-        ('t,y_m\n0,1\n0.02,2\n', 'line 3 must hold t=0.01'),
-        ('t,y_m\n0,nan\n', 'finite y_m'),
-        ('t,y_m\n', 'at least one sample'),
-    ],
-)
+@pytest.mark.parametrize(('text', 'complaint'), [
+    ('', 'header t,y_m'),
+    ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),
+    ('t,y_m\n0,1\n0.02,2\n', 'line 3 must hold t=0.01'),
+    ('t,y_m\n0,nan\n', 'finite y_m'),
+    ('t,y_m\n', 'at least one sample'),
+])
 def test_a_reference_file_is_refused_with_its_line(tmp_path, text, complaint):
     file = tmp_path / 'reference.csv'
     file.write_text(text)

@@ -33,18 +33,15 @@ def test_frequency_response_agrees_with_scipy(model: TransferFunction) -> None:
     np.testing.assert_allclose(model.response(np.exp(1j * w)), expected, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ('numerator', 'denominator', 'name'),
-    [
-        ([1.0, 0.0], [1.0, 0.5], 'plant.numerator'),
-        ([0.0, 0.0], [1.0, 0.5], 'plant.numerator'),
-        ([], [1.0, 0.5], 'plant.numerator'),
-        ([nan], [1.0, 0.5], 'plant.numerator'),
-        ([1.0], [0.0, 1.0, 0.5], 'plant.denominator'),
-        ([1.0], [1.0, inf], 'plant.denominator'),
-        ([1.0], [], 'plant.denominator'),
-    ],
-)
+@pytest.mark.parametrize(('numerator', 'denominator', 'name'), [
+    ([1.0, 0.0], [1.0, 0.5], 'plant.numerator'),
+    ([0.0, 0.0], [1.0, 0.5], 'plant.numerator'),
+    ([], [1.0, 0.5], 'plant.numerator'),
+    ([nan], [1.0, 0.5], 'plant.numerator'),
+    ([1.0], [0.0, 1.0, 0.5], 'plant.denominator'),
+    ([1.0], [1.0, inf], 'plant.denominator'),
+    ([1.0], [], 'plant.denominator'),
+])
 def test_invalid_polynomials_are_refused_and_named(numerator, denominator, name):
     with pytest.raises(ParameterError) as refusal:
         TransferFunction(numerator, denominator)

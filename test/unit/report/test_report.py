@@ -128,17 +128,14 @@ def other_bag(path: Path, run: RunRecord) -> None:
         writer.add_connection('/chatter', 'std_msgs/msg/String', typestore=TYPES)
 
 
-@pytest.mark.parametrize(
-    ('make', 'message'),
-    [
-        (None, 'does not exist'),
-        (broken_bag, 'is damaged, and nothing of it can be read'),
-        (other_bag, 'holds no message of controller/signals; its topics are /chatter'),
-        (lambda path, run: write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
-         'holds no message of controller/signals'),
-        (lambda path, run: path.mkdir(), 'holds no bag, no record.npz and no samples.csv'),
-    ],
-)
+@pytest.mark.parametrize(('make', 'message'), [
+    (None, 'does not exist'),
+    (broken_bag, 'is damaged, and nothing of it can be read'),
+    (other_bag, 'holds no message of controller/signals; its topics are /chatter'),
+    (lambda path, run: write_bag(path, RunRecord(run.rows[:0], run.sample_period)),
+     'holds no message of controller/signals'),
+    (lambda path, run: path.mkdir(), 'holds no bag, no record.npz and no samples.csv'),
+])
 def test_unusable_input_is_one_line_and_leaves_nothing(
     run: RunRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str], make: object, message: str,

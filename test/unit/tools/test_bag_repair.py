@@ -175,16 +175,13 @@ def file_gone(bag: Path) -> None:
     message_file(bag).unlink()
 
 
-@pytest.mark.parametrize(
-    ('spoil', 'code', 'words'),
-    [
-        (shutil.rmtree, 2, 'does not exist'),
-        (lambda bag: (shutil.rmtree(bag), bag.touch()), 2, 'is a file: give the folder'),
-        (lambda bag: (shutil.rmtree(bag), bag.mkdir()), 2, 'holds no .mcap and no .db3 file'),
-                (nothing_flushed, 1, 'holds no message that could be saved'),
-        (file_gone, 2, 'holds no .mcap and no .db3 file'),
-    ],
-)
+@pytest.mark.parametrize(('spoil', 'code', 'words'), [
+    (shutil.rmtree, 2, 'does not exist'),
+    (lambda bag: (shutil.rmtree(bag), bag.touch()), 2, 'is a file: give the folder'),
+    (lambda bag: (shutil.rmtree(bag), bag.mkdir()), 2, 'holds no .mcap and no .db3 file'),
+            (nothing_flushed, 1, 'holds no message that could be saved'),
+    (file_gone, 2, 'holds no .mcap and no .db3 file'),
+])
 def test_what_cannot_be_repaired_is_refused_in_one_line_and_left_as_it_is(
     tmp_path: Path, finished: dict[str, Finished], capsys: pytest.CaptureFixture[str],
     spoil: Callable[[Path], object], code: int, words: str,

@@ -95,11 +95,6 @@ def test_latency_is_given_in_milliseconds_without_the_unknown(run: RunRecord) ->
     assert summarise(run, None, np.full(3, nan))['loop_latency_ms'] is None
 
 
-def test_run_without_samples_is_refused() -> None:
-    with pytest.raises(InputError, match='no sample'):
-        summarise(RunRecord(np.empty((0, len(COLUMNS))), 0.01), None)
-
-
 def test_latest_points_at_the_newest_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folders = [results.result_directory(None) for _ in range(3)]
@@ -122,18 +117,15 @@ def test_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ['folder', 'text']
 
 
-@pytest.mark.parametrize(
-    ('text', 'message'),
-    [
-        ('', 'line 1: must be the header'),
-        ('a,b\n1,2\n', 'line 1: must be the header'),
-        (f'{OLD_HEADER}\n', 'holds no sample'),
-        (f'{OLD_HEADER}\n0,1\n', 'line 2: must hold 10 numbers'),
-        (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', 'line 2: must hold 10 numbers'),
-        (f'{OLD_HEADER}\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
-        (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
-    ],
-)
+@pytest.mark.parametrize(('text', 'message'), [
+    ('', 'line 1: must be the header'),
+    ('a,b\n1,2\n', 'line 1: must be the header'),
+    (f'{OLD_HEADER}\n', 'holds no sample'),
+    (f'{OLD_HEADER}\n0,1\n', 'line 2: must hold 10 numbers'),
+    (f'{OLD_HEADER}\n0,1,1,1,1,x,1,1,1,1\n', 'line 2: must hold 10 numbers'),
+    (f'{OLD_HEADER}\n' + '0,1,1,1,1,1,1,1,1,1\n' * 2, 'line 3: t must rise'),
+    (f'{OLD_HEADER}\n0,1,1,1,1,1,1,1,1,1\n', 'needs two samples'),
+])
 def test_mistake_in_samples_names_the_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / 'samples.csv'
     path.write_text(text)
