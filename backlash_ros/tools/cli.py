@@ -6,6 +6,7 @@ import argparse
 import atexit
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from math import inf
 from pathlib import Path
@@ -156,11 +157,16 @@ def number(value: float | None, digits: int = 4, unit: str = '', scale: float = 
 
 
 class StopRequests:
-    """Counts SIGINT, SIGTERM and SIGHUP as long as the context lasts, instead of dying of them."""
+    """Counts SIGINT, SIGTERM and SIGHUP as long as the context lasts, instead of dying of them.
+
+    One Ctrl-C may come twice, from the terminal and from whoever started the process: what follows
+    within 0.2 s does not count.
+    """
 
     def __init__(self) -> None:
         self.count = 0
         self.last = ''
+        self._came_at_s = -inf
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopRequests:
@@ -175,5 +181,6 @@ class StopRequests:
             signal.signal(caught, handler)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self.count += 1
+        self.count += time.monotonic() > self._came_at_s + 0.2
+        self._came_at_s = time.monotonic()
         self.last = signal.Signals(number).name

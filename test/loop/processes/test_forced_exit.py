@@ -1,9 +1,13 @@
 """Processes that do not end by themselves."""
 
+import os
+import signal
 import subprocess
 import sys
 
 from waiting import DEADLINE_S
+
+from backlash_ros.tools.cli import StopRequests
 
 # Calls of a PyDLL keep the interpreter locked, as Fast DDS does when it hangs.
 LEAVE = """
@@ -33,3 +37,10 @@ def test_a_signal_while_bringup_is_loaded_ends_it_in_one_line() -> None:
     )
     done = subprocess.run((sys.executable, '-c', program), capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (1, 'bringup: interrupted\n')
+
+
+def test_a_ctrl_c_that_comes_twice_at_once_counts_once() -> None:
+    with StopRequests() as requests:
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGINT)
+        assert (requests.count, requests.last) == (1, 'SIGINT')
