@@ -13,11 +13,11 @@ from backlash_ros.tools.cli import StopRequests
 LEAVE = """
 import ctypes, sys, time
 from backlash_ros.nodes.runtime.process import exit_at_the_latest
-with exit_at_the_latest(0.1, 9):
+with exit_at_the_latest(0.5, 9):
     pass
-time.sleep(0.3)
+time.sleep(0.7)
 print('all that was to be said')
-with exit_at_the_latest(1.2, 3):
+with exit_at_the_latest(0.5, 3):
     ctypes.PyDLL(None).pause()
 """
 
