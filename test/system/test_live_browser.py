@@ -5,7 +5,7 @@ import os
 import shutil
 import signal
 import subprocess
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -111,9 +111,7 @@ async def look(session: Session, profile: Path) -> None:
         assert tab.errors == []
 
 
-def test_numbers_and_curves_move_until_ctrl_c(
-    start: Callable[..., Session], tmp_path: Path,
-) -> None:
+def test_numbers_and_curves_move_until_ctrl_c(start, tmp_path):
     session = start(*WHOLE_RUN)
     asyncio.run(asyncio.wait_for(look(session, tmp_path / 'profile'), 2.0 * DEADLINE_S))
     assert session.wait() == 0, session.stderr

@@ -1,6 +1,5 @@
 """Whoever takes over v in `tracking`, and whatever with: v goes on without a jump."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -59,9 +58,7 @@ def after_a_rival(core: AdaptiveController) -> AdaptiveController:
     restarted, with_other_weights, with_other_gains, with_another_estimate, after_a_rival,
 ])
 @pytest.mark.parametrize('at', [430, 505, 590])
-def test_v_goes_on_as_it_moved(
-    take_over: Callable[[AdaptiveController], AdaptiveController], at: int,
-) -> None:
+def test_v_goes_on_as_it_moved(take_over, at):
     loop, v = build_closed_loop(PARAMETERS), [0.0]
     for k in range(at + 20):
         if k == at:

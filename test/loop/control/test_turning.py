@@ -55,9 +55,7 @@ def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band
 
 @pytest.mark.parametrize('noise', [1.1e-3, 0.1 * GAP * KNOWN['m']])
 @pytest.mark.parametrize('rests_from', [12.0, 9.0])
-def test_noise_of_y_larger_than_configured_does_not_make_v_cross_the_gap(
-    noise: float, rests_from: float,
-) -> None:
+def test_noise_of_y_larger_than_configured_does_not_make_v_cross_the_gap(noise, rests_from):
     asked = 0.5 * np.sin(1.5 * np.minimum(np.arange(0.0, 12.0, PERIOD), rests_from))
     v, error = moved(asked, output_noise_std=noise, fixed__doubt=0.1)
     assert turns(v, 0.5 * GAP) <= turns(asked, 0.1) + 3
