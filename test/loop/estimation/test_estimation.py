@@ -63,18 +63,15 @@ def test_wear_and_a_step_of_a_crossing_are_followed(seed: int) -> None:
 
 @pytest.mark.parametrize('known', [False, True])
 def test_crossings_walk_with_a_disturbance_of_u(known: bool) -> None:
-    jobs = [job for job in changes_jobs(0.2) if job.group == 'walk']
-    runs = []
-    for job in jobs:
-        std = job.changes['truth.walk_std'] if known else 0.0
-        changes = {**job.changes, 'estimator.input_noise_std': std}
-        run = run_job(replace(job, changes=changes, seconds=7.0)).judged
-        assert run is not None
-        runs.append(run)
-    assert np.mean([run.tracking.mean() for run in runs]) > 0.5
-    assert np.mean([run.wrong for run in runs]) < 0.02
+    (job,) = (job for job in changes_jobs(0.1) if job.group == 'walk')
+    std = job.changes['truth.walk_std'] if known else 0.0
+    changes = {**job.changes, 'estimator.input_noise_std': std}
+    run = run_job(replace(job, changes=changes, seconds=7.0)).judged
+    assert run is not None
+    assert run.tracking.mean() > 0.5
+    assert run.wrong < 0.02
     # Off by what the disturbance moves between two fits: 0.02 of the gap in a second.
-    assert np.median([run.error[run.tracking].mean() for run in runs]) < 0.02
+    assert run.error[run.tracking].mean() < 0.02
 
 
 @pytest.mark.parametrize('what', ['never excited', 'v is limited', 'at rest'])

@@ -19,16 +19,13 @@ class Loop:
         self.plant, self._reference = build_plant(p), build_reference(p)
         self._period = p.sample_period
 
-    def run(
-        self, controller: AdaptiveController, samples: int, deaf: int = 0,
-    ) -> list[Estimate]:
-        """deaf: samples during which no v reaches the plant."""
+    def run(self, controller: AdaptiveController, samples: int) -> list[Estimate]:
         estimates = []
-        for k in range(samples):
+        for _ in range(samples):
             y_m = self._reference(self.plant.sample * self._period)
             step = controller.step(self.plant.measure(), y_m)
             controller.refine()
-            self.plant.step(step.v if k >= deaf else 0.0)
+            self.plant.step(step.v)
             estimates.append(step.estimate)
         return estimates
 
@@ -76,16 +73,3 @@ def test_held_estimates_do_not_move_and_learning_can_go_on(law: str) -> None:
     assert len(moving) > 1 or law == 'moving_horizon'
     if law in ('moving_horizon', 'lms'):
         assert errors([controller.estimator.estimate])[0] < 0.05
-
-
-@pytest.mark.parametrize('structure', ['proportional', 'tracking'])
-@pytest.mark.parametrize('deaf', [5, 25, 150])
-def test_driver_that_does_not_hear_v_at_first_spoils_nothing(structure: str, deaf: int) -> None:
-    p = Parameters({**EXACT, 'structure': structure, 'output_noise_std': 1e-3})
-    learned = Loop(p).run(build_controller(p), 400)[-1]
-    loop = Loop(p.replaced({'seed': 3, 'backlash.initial_u': 1.0}))
-    controller = build_controller(p, learned)
-    after = loop.run(controller, 500, deaf)
-    assert errors(after).max() < 0.06
-    assert after[-1].status == Status.TRACKING
-    assert errors(after[-1:])[0] < 0.01

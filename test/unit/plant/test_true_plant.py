@@ -67,12 +67,6 @@ def test_plant_that_no_continuous_one_has_is_refused_with_its_pole() -> None:
     assert altered_plant(ringing, lag=2.0).delay == 3
 
 
-def test_taps_of_a_delay_by_part_of_a_sample_are_refused() -> None:
-    taps = TransferFunction([0.07, 0.03], [1.0, -0.9, 0.0])
-    with pytest.raises(ParameterError, match='1 poles at 0 that are no delay by whole samples'):
-        altered_plant(taps, frequency=1.2)
-
-
 def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() -> None:
     known = Parameters({'control.delay_samples': 1})
     p = known.replaced({
