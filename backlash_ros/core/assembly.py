@@ -10,9 +10,9 @@ import numpy as np
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
-from backlash_ros.core.control.pole_placement import PolePlacement
+from backlash_ros.core.control.pole_placement import FourBlocks, PolePlacement, place_poles
 from backlash_ros.core.control.proportional import Proportional
-from backlash_ros.core.control.protocol import Structure
+from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
 from backlash_ros.core.control.tracking.design import (
     Weights,
@@ -35,7 +35,6 @@ from backlash_ros.core.laws.printed_law import PrintedLaw
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import BY_NAME, PlantModel
-from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles
 from backlash_ros.core.plant.model_check import check_model, model_warnings
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -135,7 +134,7 @@ def build_law(p: Parameters, initial: Estimate, executor: Executor) -> Law:
     )
 
 
-def build_structure(p: Parameters) -> Structure:
+def build_structure(p: Parameters) -> ControlStructure:
     """The linear part alone."""
     if p.structure == 'proportional':
         return Proportional()

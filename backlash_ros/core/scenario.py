@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.actuator import Actuator
-from backlash_ros.core.plant.simulated_plant import SimulatedPlant
+from backlash_ros.core.plant.simulated_plant import SimulatedPlant, altered_plant, delayed
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.plant.true_plant import altered_plant, delayed
 from backlash_ros.core.reference.signal import ReferenceSignal
 
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import LARGEST_SIGNAL, Limits, at_rest, plausible
-from backlash_ros.core.control.protocol import ControlInput, Structure
+from backlash_ros.core.control.protocol import ControlInput, ControlStructure
 from backlash_ros.core.control.redesign import Redesign
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.estimate import Estimate
@@ -44,7 +44,7 @@ class AdaptiveController:
     """
 
     def __init__(
-        self, estimator: Law, structure: Structure, inverse: BacklashInverse,
+        self, estimator: Law, structure: ControlStructure, inverse: BacklashInverse,
         limits: Limits, redesign: bool = False, serial: SerialPlant | None = None,
         executor: Executor | None = None,
     ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import hypot, inf
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.protocol import Command, ControlInput, Structure
+from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.plant.backlash import Region
 
@@ -13,7 +13,7 @@ from backlash_ros.core.plant.backlash import Region
 LARGEST_F_OVER_M = 0.8
 
 
-class Proportional(Structure):
+class Proportional(ControlStructure):
     """u_d = y_m + f v (3.2) with v = BI(u_d) (2.3): each needs the other.
 
     On the branch with crossing c the loop has one solution, u_d = m (y_m + f c) / (m - f).
@@ -24,7 +24,7 @@ class Proportional(Structure):
     def __init__(self) -> None:
         self._estimate: Estimate | None = None  # that v was made with
 
-    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+    def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
         """Take over what the present v was made with."""
         if isinstance(other, Proportional):
             self._estimate = other._estimate

@@ -58,7 +58,7 @@ def dot(a: Sequence[float], b: Sequence[float]) -> float:
     return product
 
 
-class Structure:
+class ControlStructure:
     """Makes u_d from the reference and drives the inverse with it.
 
     Structures inherit from here what a better G does not change. delay: samples by which y is
@@ -87,7 +87,7 @@ class Structure:
     def adopt(self, gains: object, source: StateSource) -> None:
         """Use such gains from the next sample on, without a jump of v; source: of their x_hat."""
 
-    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+    def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
         """Take over from a structure that has made v until now, so that v does not jump.
 
         state_known: whether x_hat still says where the plant is.

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from backlash_ros.core.control.protocol import Structure
+from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.serial_plant import SerialPlant
 from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure
 from backlash_ros.core.plant.state_model import StateModel
@@ -53,7 +53,7 @@ class Redesign:
             self._channel.close()
 
     def due(
-        self, proposal: StateModel | None, structure: Structure, serial: SerialPlant | None,
+        self, proposal: StateModel | None, structure: ControlStructure, serial: SerialPlant | None,
     ) -> Design | None:
         """The design that takes over now; None for none.
 

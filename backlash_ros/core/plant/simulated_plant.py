@@ -1,15 +1,33 @@
-"""The plant the controller does not know in full: backlash, then G(z), then a sensor (3.1)."""
+"""The plant the controller does not know in full: backlash, then G(z), then a sensor (3.1).
+
+Its G(z) may differ from the known one as real plants do: in resonance, damping, dead time.
+With the zero-order hold, G(z) without its delay is the sampled response of one G(s),
+x' = A x + b u:
+
+    exp [A b; 0 0] = [A_z b_z; 0 1]     z = 1 stays an integrator, z = 0 stays a delay
+    frequency    G(s / f) / f^k with k integrators: gain at rest, or of the velocity, is kept
+    damping      s^2 + 2 d w s + w^2 with kappa d for d, d >= 1 makes two real poles; the numerator
+                 of G(s), and with it the gain at rest, is kept
+    dead time    of u, in front of G: exact for a u that is held over each sample
+
+so that the zeros are those of the altered G(s), sampled.
+"""
 
 from __future__ import annotations
 
 from math import sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 
 from backlash_ros.core.parameters import Parameters
+from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.actuator import Actuator, Motor
 from backlash_ros.core.plant.backlash import Backlash, check_backlash
 from backlash_ros.core.plant.transfer_function import TransferFunction
+
+Array = NDArray[np.float64]
+Roots = NDArray[np.complex128]
 
 
 class SimulatedPlant:
@@ -79,3 +97,102 @@ class SimulatedPlant:
         )
         check_backlash(m, c_r, c_l)
         self.backlash.m, self.backlash.c_r, self.backlash.c_l = m, c_r, c_l
+
+
+def delayed(model: TransferFunction, samples: int) -> TransferFunction:
+    """z^-samples G(z), the delay as poles at 0."""
+    denominator = np.append(model.denominator, np.zeros(samples))
+    return TransferFunction(model.numerator.tolist(), denominator.tolist())
+
+
+def altered_plant(
+    model: TransferFunction, frequency: float = 1.0, damping: float = 1.0, lag: float = 0.0,
+) -> TransferFunction:
+    """The altered G(z); the same numbers where nothing but a whole delay is asked for.
+
+    frequency: factor on the natural frequency of every pole, > 0. damping: factor on the damping
+    ratio of every complex pair of poles, > 0. lag: dead time of u [samples], >= 0. Raises
+    ParameterError for a pole on the negative real axis, which no G(s) of this order has, and for a
+    numerator that is not that of a delay by whole samples.
+    """
+    whole = int(lag + 1e-9)
+    part = max(lag - whole, 0.0)
+    if frequency == 1.0 and damping == 1.0 and part <= 1e-9:
+        return delayed(model, whole)
+    from scipy.linalg import expm, logm  # takes long to load, and few plants need it
+
+    inner, delay = _without_delay(model)
+    poles = _continuous_poles(inner)
+    n = len(poles)
+    sampled = _block(*inner.state_space()[:2])
+    sampled[n, n] = 1.0
+    block = np.real(logm(sampled))
+    numerator = _numerator(block[:n, :n], block[:n, n], np.real(np.poly(poles)))
+    poles = _damped(poles, damping) * frequency
+    numerator *= frequency**(np.arange(1, n + 1) - np.count_nonzero(poles == 0.0))
+    altered = TransferFunction(numerator.tolist(), np.real(np.poly(poles)).tolist())
+    a, b = altered.state_space()[:2]
+    over, over_part = expm(_block(a, b) * (1.0 - part)), expm(_block(a, b) * part)
+    transition = over[:n, :n] @ over_part[:n, :n]
+    denominator = np.real(np.poly(np.exp(poles)))
+    b_z = np.append(_numerator(transition, over[:n, n], denominator), 0.0)
+    # What was commanded a sample before acts for the first part of this one.
+    b_z[1:] += _numerator(transition, over[:n, :n] @ over_part[:n, n], denominator)
+    return delayed(
+        TransferFunction(b_z.tolist(), [*denominator, 0.0]) if part > 1e-9
+        else TransferFunction(b_z[:n].tolist(), denominator.tolist()), delay + whole,
+    )
+
+
+def _block(a: Array, b: Array) -> Array:
+    """[a b; 0 0], whose exponential gives the response to a u that is held."""
+    return np.vstack([np.column_stack([a, b]), np.zeros(len(a) + 1)])
+
+
+def _numerator(a: Array, b: Array, denominator: Array) -> Array:
+    """Numerator (n,) of C (z I - A)^-1 b with C = (1, 0, ...), of s as of z.
+
+    The Markov parameters C A^i b times the denominator.
+    """
+    markov = [b]
+    for _ in range(len(a) - 1):
+        markov.append(a @ markov[-1])
+    product = np.convolve(denominator, [float(x[0]) for x in markov])
+    return np.asarray(product[:len(a)], np.float64)
+
+
+def _without_delay(model: TransferFunction) -> tuple[TransferFunction, int]:
+    """G(z) without its poles at 0, and their number."""
+    denominator = np.trim_zeros(model.denominator, 'b')
+    delay = len(model.denominator) - len(denominator)
+    numerator = model.numerator[model.delay:]
+    if len(numerator) >= len(denominator):
+        raise ParameterError(
+            'plant.denominator', model.denominator.tolist(),
+            f'has {delay} poles at 0 that are no delay by whole samples, which truth.scale_* and '
+            'truth.extra_lag cannot alter', 'give truth.numerator and truth.denominator instead',
+        )
+    return TransferFunction(numerator.tolist(), denominator.tolist()), delay
+
+
+def _continuous_poles(model: TransferFunction) -> Roots:
+    poles = model.poles
+    negative = (poles.real < 0.0) & (np.abs(poles.imag) <= 1e-6 * np.abs(poles))
+    if negative.any():
+        raise ParameterError(
+            'plant.denominator', model.denominator.tolist(),
+            f'has the pole {float(poles[negative][0].real):.6g}: no continuous plant has poles on '
+            'the negative real axis, so that truth.scale_* and truth.extra_lag cannot alter it',
+            'give truth.numerator and truth.denominator instead',
+        )
+    # Rounding moves a double pole by 1e-8.
+    return np.where(np.abs(poles - 1.0) < 1e-6, 0.0, np.log(poles))
+
+
+def _damped(poles: Roots, factor: float) -> Roots:
+    altered = list(poles[poles.imag == 0.0])
+    for pole in poles[poles.imag > 0.0]:
+        ratio = -factor * pole.real / abs(pole)
+        root = np.sqrt(complex(ratio**2 - 1.0))
+        altered += [abs(pole) * (-ratio + root), abs(pole) * (-ratio - root)]
+    return np.array(altered, dtype=np.complex128)

@@ -13,8 +13,8 @@ from strategies import plants
 from backlash_ros.core.assembly import build_model, build_plant, build_true_model
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.plant.true_plant import altered_plant
 
 PERIOD = 0.005
 

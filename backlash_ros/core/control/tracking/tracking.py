@@ -9,7 +9,7 @@ from functools import partial
 from itertools import pairwise
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.protocol import Command, ControlInput, Structure
+from backlash_ros.core.control.protocol import Command, ControlInput, ControlStructure
 from backlash_ros.core.control.tracking.design import (
     TrackingDesign,
     Weights,
@@ -59,7 +59,7 @@ class HandOver:
         return added
 
 
-class Tracking(Structure):
+class Tracking(ControlStructure):
     """u_d = u* - K (x - x*) - K_q (q - q*) around the ideal trajectory u*, x*, q* of G alone.
 
     The trajectory is what the LQ preview controller does without backlash, for the reference r,
@@ -98,7 +98,7 @@ class Tracking(Structure):
 
     # --- taking over ----------------------------------------------------------------------------
 
-    def go_on_from(self, other: Structure, state_known: bool = True) -> None:
+    def go_on_from(self, other: ControlStructure, state_known: bool = True) -> None:
         """Take over the trajectory, and the model of G that it is one of."""
         if not isinstance(other, Tracking) or other.delay != self.delay:
             return
