@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,32 +17,47 @@ Array = NDArray[np.float64]
 PARABOLA, NO_PARABOLA = 1.8, 3.0
 
 
-@lru_cache(maxsize=16)
-def parabolas(preview: int) -> tuple[Array, ...]:
-    """For each width w, what a parabola takes from 2 w + 1 references: (2 w + 1, 2 w + 1).
+class Parabolas(NamedTuple):
+    """What parabolas take from 2 H + 1 references, for several widths w <= H to either side.
 
-    No width is more than a third of the preview. The fit is weighted by a Hann window. The middle
-    row says what an average changes.
+    fits: for each width, one below the other, what is left of the middle 2 w + 1 references beside
+    a parabola through them, shape (sum (2 w + 1), 2 H + 1). first: row of each width. degrees: of
+    freedom of its rest. middle: rest of the middle reference, as a row of all.
     """
-    found = []
-    for w in (3, 8, 20):  # samples to either side, of the averages to choose from
-        if 3 * w <= preview:
-            powers = np.arange(-w, w + 1.0)[:, None] ** np.arange(3)
-            weighted = powers * np.hanning(2 * w + 3)[1:-1, None]
-            fit = powers @ np.linalg.solve(weighted.T @ powers, weighted.T)
-            found.append(np.eye(2 * w + 1) - fit)
-    return tuple(found)
+
+    fits: Array
+    first: list[int]
+    degrees: list[int]
+    middle: list[int]
+
+    @property
+    def half(self) -> int:
+        """H."""
+        return self.fits.shape[1] // 2
+
+
+@lru_cache(maxsize=16)
+def parabolas(preview: int) -> Parabolas:
+    """No width is more than a third of the preview. The fit is weighted by a Hann window."""
+    widths = [w for w in (3, 8, 20) if 3 * w <= preview]
+    half, sizes = max(widths, default=0), [2 * w + 1 for w in widths]
+    first = [sum(sizes[:i]) for i in range(len(sizes))]
+    fits = np.zeros((sum(sizes), 2 * half + 1))
+    for w, row in zip(widths, first, strict=True):
+        powers = np.arange(-w, w + 1.0)[:, None] ** np.arange(3)
+        weighted = powers * np.hanning(2 * w + 3)[1:-1, None]
+        fit = powers @ np.linalg.solve(weighted.T @ powers, weighted.T)
+        fits[row:row + 2 * w + 1, half - w:half + w + 1] = np.eye(2 * w + 1) - fit
+    return Parabolas(fits, first, [2 * w - 2 for w in widths],
+                     [row + w for w, row in zip(widths, first, strict=True)])
 
 
 def averages(preview: int) -> Array:
     """Weights of no average and of that of each width, shape (widths + 1, 2 H + 1)."""
     fits = parabolas(preview)
-    half = len(fits[-1]) // 2 if fits else 0
-    kernels = np.zeros((len(fits) + 1, 2 * half + 1))
-    kernels[:, half] = 1.0
-    for kernel, fit in zip(kernels[1:], fits, strict=True):
-        w = len(fit) // 2
-        kernel[half - w:half + w + 1] -= fit[w]
+    kernels = np.zeros((len(fits.first) + 1, 2 * fits.half + 1))
+    kernels[:, fits.half] = 1.0
+    kernels[1:] -= fits.fits[fits.middle]
     return kernels
 
 
@@ -59,6 +75,7 @@ class ReferenceWindow:
     def __init__(self, preview: int, history: int, noise_gains: Array) -> None:
         self.history, self.noise_gains = history, noise_gains
         self._preview, self._kept = preview, history + preview + 1
+        self._parabolas = parabolas(preview)
         # As they came, as they are used, and what u* makes of noise of 1 in them. Written from the
         # left to the right; when they are full their end moves to the front.
         self._rows: Array = np.zeros((3, 2 * self._kept))
@@ -106,30 +123,33 @@ class ReferenceWindow:
         self._rows[2, end] = self.noise_gains[0]
         self._end = end + 1
         self._noise.take(value)
-        fits = parabolas(self._preview)
-        if fits and self._noise.std > 0.0 and end - self._start >= len(fits[-1]) - 1:
-            self._average(end - len(fits[-1]) // 2, fits)
+        half = self._parabolas.half
+        if half and self._noise.std > 0.0 and end - self._start >= 2 * half:
+            self._average(end - half)
         return self.window
 
     @property
     def u_noise_std(self) -> float:
         """Standard deviation of what is left of the noise in u*, at most within the window."""
-        fits, first = parabolas(self._preview), self._end - self._preview - 1
-        half = len(fits[-1]) // 2 if fits else 0
-        return self._noise.std * float(
-            self._rows[2, first:max(self._end - half, first + 1)].max())
+        std = self._noise.std
+        if std == 0.0:
+            return 0.0
+        first = self._end - self._preview - 1
+        last = max(self._end - self._parabolas.half, first + 1)
+        return std * float(np.maximum.reduce(self._rows[2, first:last]))
 
-    def _average(self, at: int, fits: tuple[Array, ...]) -> None:
+    def _average(self, at: int) -> None:
         """Average one reference, now that as many after it are known."""
-        came, noise = self._rows[0], self._noise.std
-        value, gain = came.item(at), float(self.noise_gains[0])
-        for fit, averaged_gain in zip(fits, self.noise_gains[1:], strict=True):
-            w = len(fit) // 2
-            rest = fit @ came[at - w:at + w + 1]
-            of_noise = rest / noise  # its square may be too small for a number
-            mean_square = float(of_noise @ of_noise) / (2 * w - 2)
-            share = min((NO_PARABOLA - mean_square) / (NO_PARABOLA - PARABOLA), 1.0)
+        fits, first, degrees, middle = self._parabolas
+        half, came, noise = self._parabolas.half, self._rows[0], self._noise.std
+        rest = fits @ came[at - half:at + half + 1]
+        of_noise = rest / noise  # its square may be too small for a number
+        squares = np.add.reduceat(of_noise * of_noise, first).tolist()
+        reference = value = came.item(at)
+        gain = float(self.noise_gains[0])
+        for i, square in enumerate(squares):
+            share = min((NO_PARABOLA - square / degrees[i]) / (NO_PARABOLA - PARABOLA), 1.0)
             if share > 0.0:
-                value += share * (came.item(at) - rest.item(w) - value)
-                gain += share * (float(averaged_gain) - gain)
+                value += share * (reference - rest.item(middle[i]) - value)
+                gain += share * (self.noise_gains.item(i + 1) - gain)
         self._rows[1, at], self._rows[2, at] = value, gain
