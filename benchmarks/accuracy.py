@@ -30,6 +30,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 import faults
 import ordinary_motions
+from contract import crossing_rows as crossing
 from contract import following_rows as following
 from contract import learning_rows as learning
 from contract import situation_rows as situation
@@ -74,6 +75,8 @@ ROWS: dict[str, Measured] = {
     'changes': Measured(learning.changes_jobs, learning.run_job, learning.changes_figures),
     'following': Measured(
         following.following_jobs, following.run_following, following.following_figures),
+    'crossings': Measured(
+        crossing.crossing_jobs, crossing.run_crossing, crossing.crossing_figures),
     'late': Measured(situation.late_jobs, situation.run_late, situation.late_figures),
     'faults': Measured(situation.faults_jobs, faults.play, situation.faults_figures),
     'identification': Measured(

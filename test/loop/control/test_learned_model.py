@@ -12,7 +12,7 @@ from scipy.signal import cont2discrete
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits
-from backlash_ros.core.control.protocol import Structure
+from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.redesign import LONGEST_WAIT
 from backlash_ros.core.control.tracking.design import (
     TrackingDesign,
@@ -94,7 +94,7 @@ class Run:
     y: Array
     v: Array
     learner: Learner
-    structure: Structure
+    structure: ControlStructure
 
     def error(self, since: int) -> float:
         delay = self.structure.delay
@@ -167,7 +167,7 @@ def test_no_move_at_a_swap_is_larger_than_the_largest_of_the_second_before(name,
 
 def test_a_loop_that_the_told_model_makes_unstable_is_rescued() -> None:
     swapped = run(motor(), TRUE['late'], 300, 1200)
-    assert np.abs(swapped.v[200:300]).max() > 1e3
+    assert np.abs(swapped.v[200:300]).max() > 100.0
     assert np.abs(swapped.v[1000:]).max() < 20.0
 
 

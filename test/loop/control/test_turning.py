@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from backlash_ros.core.assembly import build_model
+from backlash_ros.core.control.tracking.tracking import Tracking
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.reference.signal import ReferenceSignal
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -62,17 +63,42 @@ def test_noise_of_y_larger_than_configured_does_not_make_v_cross_the_gap(noise, 
     assert error < 0.25 * noise
 
 
-def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
-    rng = np.random.default_rng(3)
+def moves_with_rests(seed: int, count: int, rest: int) -> Array:
+    rng = np.random.default_rng(seed)
     asked = [np.zeros(200)]
-    for _ in range(9):
+    for _ in range(count):
         begin, end = float(asked[-1][-1]), float(rng.uniform(-0.5, 0.5))
         s = np.linspace(0.0, 1.0, int(rng.integers(60, 200)))
-        asked += [begin + (end - begin) * s * s * (3.0 - 2.0 * s), np.full(400, end)]
-    reference = np.concatenate(asked)
+        asked += [begin + (end - begin) * s * s * (3.0 - 2.0 * s), np.full(rest, end)]
+    return np.concatenate(asked)
+
+
+def test_moves_with_rests_cross_the_gap_where_they_turn() -> None:
+    reference = moves_with_rests(3, 9, 400)
     v, error = moved(reference)
     assert turns(v, 0.5 * GAP) <= turns(reference, 1e-3) + 3
     assert error < 1e-4
+
+
+@pytest.mark.parametrize('noise', [0.0, 0.03])
+def test_feedback_is_as_hard_as_its_noise_beside_the_gap_allows(noise: float) -> None:
+    # Full feedback around three slow poles makes many gaps of this noise, and v turns for it.
+    told = max(noise, 1e-9)
+    p = Parameters({
+        'structure': 'tracking', 'estimator.law': 'fixed', 'estimator.initial.m': 1.3,
+        'estimator.initial.c_r': 3.0, 'estimator.initial.c_l': -3.0, 'output_noise_std': noise,
+        'estimator.output_noise_std': told,
+    })
+    asked = 2.0 * moves_with_rests(2, 4, 200)
+    loop = build_closed_loop(p)
+    loop.reference = ReferenceSignal(
+        Parameters({'waveform': 'file', 'amplitude': 1.0}), tuple(asked.tolist()))
+    run, structure = loop.run(len(asked)), loop.controller.structure
+    assert isinstance(structure, Tracking)
+    assert 0.0 < structure.feedback.noise <= 0.1 * 1.3 * 6.0
+    hardest = structure.feedback.noise == structure.feedback._noise_of(0)
+    assert hardest is (noise == 0.0)
+    assert noise == 0.0 or turns(run.column('v'), 3.0) < 80
 
 
 @pytest.mark.parametrize('take_up', [20.0, 100.0])

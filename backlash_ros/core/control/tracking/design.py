@@ -18,9 +18,10 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 Array = NDArray[np.float64]
 Gain = list[float]
 
-# Times the input weight of the feedback while v meets its limits or the estimate is new; the last
-# one while the backlash is unknown.
-SCHEDULE = (1e1, 1e2, 1e3, 1e4)
+# Times the input weight of feedback: the softer gains are for noise, and up to SOFTEST for the time
+# while v meets its limits or the estimate is new; that one while the backlash is unknown.
+SCHEDULE: tuple[float, ...] = tuple((10.0 ** (0.5 * np.arange(13))).tolist())
+SOFTEST = 8
 # Times the input weight with which feedback around a better G is tried in turn, until its loop is
 # as safe as the one it replaces. The trajectory keeps the weight that was asked for.
 SAFER = (1.0, *np.geomspace(1.1, 100.0, 60).tolist())
@@ -50,8 +51,8 @@ class TrackingDesign:
     """Gains of one model of G.
 
     gains: of the ideal trajectory. feedback: of the deviations from it. schedule: gains (n,), that
-    of full feedback first, each with less than the one before, for the time while v meets its
-    limits, where full feedback would cycle between them, and while the estimate is new.
+    of full feedback first, each with less than the one before: see SCHEDULE; where v meets its
+    limits full feedback would cycle between them.
     acquisition: gain (n,) while the backlash is unknown; None where no feedback is better.
     gentle: gain (n,) that leads y back while the reference rests. push: |x| after HORIZON
     samples of u = 1; push_ahead: |y| after LOOK_AHEAD. plan_states (L, n + 1), plan_references
@@ -101,14 +102,15 @@ def design(model: StateModel, weights: Weights, weight_factor: float = 1.0) -> T
     gains = lq_gains(model, rho, weights.integral_weight, weights.preview)
     feedback = feedback_around(model, weights, weight_factor)
     schedule = [feedback.gain.tolist(), *(
-        lq_gains(model, max(more, weight_factor) * rho).state.tolist() for more in SCHEDULE
+        lq_gains(model, max(more, weight_factor) * rho).state.tolist() for more in SCHEDULE[1:]
     )]
     # With |G|^2 at a frequency as weight of u^2, feedback acts up to about that frequency.
     gentle = lq_gains(model, power_gain(model.transfer_function, rest_bandwidth)).state
     ahead, later = (powers(model.a, model.b, k).sum(axis=0) for k in (LOOK_AHEAD, HORIZON))
     return TrackingDesign(
         model, gains, feedback, tuple(schedule),
-        schedule[-1] if _bears_wrong_slope(model, SCHEDULE[-1] * rho) else None, gentle.tolist(),
+        schedule[SOFTEST] if _bears_wrong_slope(model, SCHEDULE[SOFTEST] * rho) else None,
+        gentle.tolist(),
         float(np.linalg.norm(later)), model.c * abs(float(ahead[0])),
         *_plan(model, gains), _noise_gains(model, gains),
     )

@@ -9,21 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import hypot, isnan, nan, sqrt
+from math import hypot, inf, isnan, nan, sqrt
 from operator import sub
 
 import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION, dot
-from backlash_ros.core.control.tracking.design import Gain, TrackingDesign
+from backlash_ros.core.control.tracking.design import SOFTEST, Gain, TrackingDesign
 from backlash_ros.core.control.tracking.rest import TOLERANCE
 from backlash_ros.core.estimate import Estimate, Status
-from backlash_ros.core.plant.noise_level import NoiseLevel
 
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
+# Standard deviation of what feedback makes of noise, in units of the u that the gap takes, up to
+# which it is as hard as it may be. The band around it within which v does not turn lets a hard loop
+# cycle, and that often; a softer one makes less of the same noise, and cycles slower or not at all.
+NOISE_IN_GAP = 0.1
 
 
 @dataclass
@@ -89,9 +92,12 @@ class StateFeedback:
     def use(self, design: TrackingDesign) -> None:
         """Use these gains."""
         self._design = design
-        self._level = NoiseLevel()  # of feedback itself
         self._x_cov: NDArray[np.float64] | None = None
-        self.x_std = self._u_std = 0.0  # deviations of x_hat and of K x_hat
+        # Of every gain: as a matrix, its size, and the deviation of K x_hat.
+        self._gains = np.array(design.schedule)
+        self._sizes = [hypot(*gain) for gain in design.schedule]
+        self._u_std, self._quiet = [0.0] * len(self._sizes), 0
+        self.x_std = 0.0  # deviation of x_hat
 
     def go_on_from(self, other: StateFeedback, state_known: bool) -> None:
         """Go on where another one is; from the softest, where x_hat begins anew and full of noise.
@@ -128,6 +134,8 @@ class StateFeedback:
         trust, gap = self.trust, estimate.c_r - estimate.c_l
         self.state.asked = max(self.state.asked, abs(ideal))
         self._scale = max(self.state.asked, estimate.m * gap)
+        allowed, last = NOISE_IN_GAP * estimate.m * gap if gap else inf, len(self._sizes) - 1
+        self._quiet = next((i for i in range(last) if self._noise_of(i) <= allowed), last)
         if not (trust.known and estimate.learned):
             # Without deviations nobody knows how far it may be relied on.
             trust.held_for = trust.in_use_for = 0
@@ -147,10 +155,11 @@ class StateFeedback:
     ) -> list[float]:
         """x_hat - x*; 0 while x_hat cannot be known. x_cov: of x_hat, None where it is unknown."""
         if x_cov is not self._x_cov:
-            self._x_cov, gain = x_cov, self._design.schedule[0]
-            rows: list[list[float]] = [] if x_cov is None else x_cov.tolist()
-            self._u_std = sqrt(max(dot(gain, [dot(row, gain) for row in rows]), 0.0))
-            self.x_std = sqrt(max(sum(row[i] for i, row in enumerate(rows)), 0.0))
+            self._x_cov = x_cov
+            if x_cov is not None:
+                variances = ((self._gains @ x_cov) * self._gains).sum(axis=1)
+                self._u_std = np.sqrt(np.maximum(variances, 0.0)).tolist()
+                self.x_std = sqrt(max(float(x_cov.trace()), 0.0))
         if self.state.blind_for:
             self.state.blind_for -= 1
             return [0.0] * len(x)
@@ -165,7 +174,6 @@ class StateFeedback:
         state, most = self.state, self.most
         if self.trust.begun:
             feedback = dot(self._gain(held_back or state.bounded), deviation)
-            self._level.take(feedback)
         else:
             feedback = dot(self._design.acquisition or (), deviation)
             if not -most < feedback < most:
@@ -188,12 +196,14 @@ class StateFeedback:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of what full feedback makes of noise.
+        """Standard deviation of what feedback makes of noise."""
+        return self._noise_of(self._quiet)
 
-        As the covariance of x_hat says; as feedback itself shows, where the noise of y is told
-        wrongly; and at least for errors of y of half its noise.
+    def _noise_of(self, level: int) -> float:
+        """With a gain of the schedule: by the covariance of x_hat, and at least for errors of y of
+        half its noise.
         """
-        return max(self._u_std, self._level.std, 0.5 * self._noise_std * self._size)
+        return max(self._u_std[level], 0.5 * self._noise_std * self._sizes[level])
 
     @property
     def most(self) -> float:
@@ -215,7 +225,7 @@ class StateFeedback:
     @property
     def _size(self) -> float:
         """|K|: what full feedback makes of an error of y."""
-        return hypot(*self._design.schedule[0])
+        return self._sizes[0]
 
     def _gain(self, held_back: bool) -> Gain:
         """K, or the less of it the longer v does not follow, and the newer the estimate."""
@@ -223,11 +233,11 @@ class StateFeedback:
         state, schedule = self.state, self._design.schedule
         state.free = 0 if held_back else state.free + 1
         if held_back:
-            state.level = min(state.level + 1, len(schedule) - 1)
+            state.level = min(state.level + 2, SOFTEST)
         elif state.level > 0 and state.free % stiffen_after == 0:
-            state.level -= 1
-        unproven = len(schedule) - 1 - self.trust.held_for * len(schedule) // TRUSTED_AFTER
-        return schedule[max(state.level, unproven)]
+            state.level -= 2
+        unproven = 2 * (SOFTEST // 2 - self.trust.held_for * (SOFTEST // 2 + 1) // TRUSTED_AFTER)
+        return schedule[max(state.level, unproven, self._quiet)]
 
 
 def shrunk_crossings(estimate: Estimate, deviations: float, known: bool) -> tuple[float, float]:

@@ -1,0 +1,164 @@
+"""Row of `structure: tracking`: how often v crosses the gap beside turns of the ideal trajectory.
+
+A crossing costs wear and noise. Allowed are one for each turn of u* in a loop without backlash and
+noise, one at the start, and one more in 10 s. Random cases: geared motor and the paper's plant at
+50 to 1,000 Hz; sine, triangle, steps, and moves with rests; noise on y up to a tenth of the gap,
+known or ten times what was told; noise on y_m; constants exact, 3 % off, or learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import pi
+from typing import Any, NamedTuple
+
+import numpy as np
+from cases.geared_motor import motor
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter, sawtooth
+
+from backlash_ros.core import Parameters, Status, build_closed_loop
+from backlash_ros.core.plant.simulated_plant import altered_plant
+from backlash_ros.core.plant.transfer_function import TransferFunction
+from backlash_ros.core.reference.signal import ReferenceSignal
+from backlash_ros.core.simulation.metrics import turns
+from backlash_ros.core.simulation.run_record import RunRecord
+from contract.figures import Figure, by_group, figure, rms, share, upper
+
+Array = NDArray[np.float64]
+
+CORNER, DAMPING = 2.0 * pi * 20.0, 0.5  # of the load in config/geared_motor.yaml [rad/s]
+LONGEST_S, MOST_SAMPLES = 40.0, 5000
+LEAST_TURN = 0.01  # share of m gap by which u* turns at least
+MOTIONS = ('sine', 'triangle', 'steps', 'moves')
+CONSTANTS = ('exact', '3 % off', 'learned')
+
+
+class Crossing(NamedTuple):
+    """One loop. crossings, allowed: of the gap by v. error: RMS of y - y_m over that of a loop
+    without backlash in the same noise.
+    """
+
+    group: str
+    crossings: int
+    allowed: float
+    error: float
+    gapless: float
+    case: dict[str, Any]
+
+
+def crossing_jobs(scale: float, first_seed: int = 0) -> list[int]:
+    """Seeds of the cases."""
+    return list(range(first_seed, first_seed + max(round(48 * scale), 24)))
+
+
+def moves_with_rests(
+    rng: np.random.Generator, period_s: float, omega: float, end_s: float,
+) -> Array:
+    """Smooth moves of about half a period at omega [rad/s], between places within +-1."""
+    places = [np.zeros(round(0.5 / period_s))]
+    while sum(map(len, places)) * period_s < end_s:
+        at, to = float(places[-1][-1]), float(rng.uniform(-1.0, 1.0))
+        s = np.linspace(0.0, 1.0, max(round(rng.uniform(0.5, 1.5) * pi / omega / period_s), 8))
+        rest_s = rng.uniform(0.3, 4.0)
+        places += [at + (to - at) * s * s * (3.0 - 2.0 * s), np.full(round(rest_s / period_s), to)]
+    return np.concatenate(places)
+
+
+def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, dict[str, Any]]:
+    """Parameters, the reference, as it is heard, and what was drawn."""
+    rng = np.random.default_rng([seed, 37])
+    plant, motion = ('motor', 'paper')[seed % 2], MOTIONS[seed // 2 % 4]
+    constants = CONSTANTS[seed // 8 % 3]
+    period_s = float(1.0 / np.exp(rng.uniform(np.log(50.0), np.log(1000.0))))
+    omega = float(np.exp(rng.uniform(np.log(0.4), np.log(10.0))))
+    if plant == 'motor':
+        values = {**motor()}
+        b, a, _ = cont2discrete(
+            ([CORNER**2], [1.0, 2.0 * DAMPING * CORNER, CORNER**2]), period_s)
+        model = TransferFunction(np.trim_zeros(b[0], 'f').tolist(), a.tolist())
+    else:
+        values = {}
+        paper = Parameters({}).plant
+        model = altered_plant(
+            TransferFunction(paper.numerator, paper.denominator), period_s / 0.01)
+    values |= {'sample_period': period_s, 'plant.numerator': model.numerator.tolist()[1:],
+               'plant.denominator': model.denominator.tolist(), 'structure': 'tracking',
+               'seed': seed, 'output_quantum': values.get('output_quantum', 0.0)}
+    hidden = Parameters(values).backlash
+    gain = float(abs(model.response(np.array([np.exp(1j * omega * period_s)]))[0]))
+    of_gap = gain * hidden.m * (hidden.c_r - hidden.c_l)
+    amplitude = of_gap * float(np.exp(rng.uniform(np.log(0.7), np.log(8.0))))
+    if plant == 'motor':
+        amplitude = min(amplitude, 0.7)
+    noise = (0.0, 1e-3, 1e-2, 0.1)[int(rng.integers(4))] * float(rng.uniform(0.5, 1.0)) * of_gap
+    wrongly_told = bool(rng.random() < 0.25)
+    heard_noise = (0.0, 2e-4)[int(rng.integers(2))] * amplitude
+    told = max(noise / (10.0 if wrongly_told else 1.0), 1e-4 * of_gap)
+    values |= {'output_noise_std': noise, 'estimator.output_noise_std': told}
+    if constants != 'learned':
+        off = 1.03 if constants == '3 % off' else 1.0
+        values |= {'estimator.law': 'fixed', 'estimator.initial.m': hidden.m / off,
+                   'estimator.initial.c_r': off * hidden.c_r,
+                   'estimator.initial.c_l': off * hidden.c_l}
+    count = round(min(LONGEST_S, max(12.0, 5.3 * 2.0 * pi / omega)) / period_s)
+    t = period_s * np.arange(min(count, MOST_SAMPLES))
+    if motion == 'moves':
+        shape = moves_with_rests(rng, period_s, omega, float(t[-1]) + period_s)[:len(t)]
+    else:
+        shape = {'sine': np.sin, 'steps': lambda phase: np.sign(np.sin(phase + 1e-9)),
+                 'triangle': lambda phase: sawtooth(phase + 0.5 * pi, 0.5)}[motion](omega * t)
+    wanted = amplitude * np.asarray(shape)
+    heard = wanted + heard_noise * rng.standard_normal(len(t))
+    drawn = {'plant': plant, 'motion': motion, 'constants': constants, 'rate': 1.0 / period_s,
+             'omega': omega, 'amplitude': amplitude / of_gap, 'noise': noise / of_gap,
+             'wrongly_told': wrongly_told, 'heard': heard_noise / amplitude}
+    return values, wanted, heard, drawn
+
+
+def run_loop(values: dict[str, Any], y_m: Array) -> tuple[RunRecord, Array, int]:
+    """The run, y before the sensor and the delay."""
+    p = Parameters(values)
+    loop = build_closed_loop(p)
+    signal = Parameters({**values, 'waveform': 'file', 'amplitude': 1.0, 'bias': 0.0})
+    loop.reference = ReferenceSignal(signal, tuple(y_m.tolist()))
+    run = loop.run(len(y_m))
+    b, a = np.array(p.plant.numerator), np.array(p.plant.denominator)
+    y = lfilter(np.append(np.zeros(len(a) - len(b)), b), a, run.column('u'))
+    return run, np.asarray(y), loop.controller.structure.delay
+
+
+def run_crossing(seed: int) -> Crossing:
+    """The loop, and those without backlash."""
+    values, wanted, heard, drawn = case_of(seed)
+    gapless = {**values, 'estimator.law': 'fixed', 'fixed.doubt': 0.0,
+               'estimator.initial.m': Parameters(values).backlash.m,
+               'estimator.initial.c_r': 0.0, 'estimator.initial.c_l': 0.0,
+               'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9, 'backlash.initial_u': 0.0}
+    ideal = run_loop(
+        {**gapless, 'output_noise_std': 0.0, 'output_quantum': 0.0}, wanted)[0].column('u_d')
+    (run, y, delay), (_, y_gapless, _) = run_loop(values, heard), run_loop(gapless, heard)
+    begin = delay
+    if drawn['constants'] == 'learned':
+        known = np.flatnonzero(run.column('status') == int(Status.TRACKING))
+        begin += (known[0] if len(known) else len(y) // 2) + 100
+    begin = min(begin, 3 * len(y) // 4)
+    gap = float(run.column('true_c_r')[0] - run.column('true_c_l')[0])
+    due = wanted[begin - delay:len(y) - delay]
+    allowed = (turns(ideal[begin:], LEAST_TURN * Parameters(values).backlash.m * gap) + 1.0
+               + (len(y) - begin) * run.sample_period / 10.0)
+    return Crossing(
+        drawn['motion'], turns(run.column('v')[begin:], 0.5 * gap), allowed,
+        rms(y[begin:] - due) / rms(due), rms(y_gapless[begin:] - due) / rms(due),
+        drawn,
+    )
+
+
+def crossing_figures(found: Sequence[Crossing]) -> dict[str, Figure]:
+    """Figures of every motion."""
+    return by_group(found, lambda of: {
+        'more crossings than allowed': share([one.crossings > one.allowed for one in of]),
+        'crossings / allowed, median': figure([one.crossings / one.allowed for one in of]),
+        'crossings / allowed, 90 %': figure([one.crossings / one.allowed for one in of], upper),
+        'error / without backlash, median': figure([one.error / one.gapless for one in of]),
+    })
