@@ -6,8 +6,8 @@ from scipy.optimize import least_squares
 from scipy.signal import cont2discrete
 
 from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.plant.simulated_plant import altered_plant
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.plant.true_plant import altered_plant
 
 PLANTS = {
     'one pole': ([0.3], [1.0, -0.7]), 'integrator': ([0.1], [1.0, -1.7, 0.7]),
