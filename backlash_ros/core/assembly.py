@@ -10,7 +10,7 @@ import numpy as np
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
-from backlash_ros.core.control.pole_placement import FourBlocks, PolePlacement, place_poles
+from backlash_ros.core.control.pole_placement import PolePlacement
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
@@ -35,6 +35,7 @@ from backlash_ros.core.laws.printed_law import PrintedLaw
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.table import BY_NAME, PlantModel
+from backlash_ros.core.plant.four_blocks import FourBlocks, place_poles
 from backlash_ros.core.plant.model_check import check_model, model_warnings
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction

@@ -30,10 +30,10 @@ from math import nan
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.control.pole_placement import FourBlocks
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.law import Interval, Law
 from backlash_ros.core.laws.agreement import LEAST_SQUARE, MEMORY, Agreement
+from backlash_ros.core.plant.four_blocks import FourBlocks
 
 Array = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ import pytest
 from scipy import signal
 from strategies import PAPER_DENOMINATOR, PAPER_NUMERATOR
 
-from backlash_ros.core.control.pole_placement import place_poles
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
+from backlash_ros.core.plant.four_blocks import place_poles
 from backlash_ros.core.plant.transfer_function import TransferFunction
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
 
