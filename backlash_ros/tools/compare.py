@@ -32,26 +32,15 @@ COMPARISON_WINDOW_S = 0.5  # over which the error of a curve is averaged
 GAPLESS = {'backlash.c_r': 1e-9, 'backlash.c_l': -1e-9}
 
 
-class Contender(NamedTuple):
-    """A loop of the comparison: its name and what sets it apart.
-
-    follows: whether y is meant to follow y_m; otherwise y_m sets u_d.
-    """
-
-    name: str
-    changes: Mapping[str, object]
-    follows: bool = True
-
-
 class Result(NamedTuple):
-    """What became of a contender.
+    """What became of a loop.
 
     merits: what stands in the table behind the name, None where it does not apply: control error
     [unit of u], relative tracking error, the part of it that the backlash costs, way of v [unit of
     v], crossings of the gap per reversal. note: why the run broke off.
     """
 
-    contender: Contender
+    name: str
     merits: tuple[float | None, ...] = ()
     curves: ErrorCurves | None = None
     note: str = ''
@@ -60,34 +49,29 @@ class Result(NamedTuple):
     def row(self) -> tuple[str, ...]:
         """The line of the table."""
         if self.note:
-            return (self.contender.name, 'broke off', *[NOTHING] * (len(COMPARISON_HEADER) - 2))
-        return (self.contender.name, *(number(merit, 3) for merit in self.merits))
+            return (self.name, 'broke off', *[NOTHING] * (len(COMPARISON_HEADER) - 2))
+        return (self.name, *(number(merit, 3) for merit in self.merits))
 
 
-def contenders(scenario: Parameters) -> list[Contender]:
-    """The loops to compare, from the paper's to the one without a backlash."""
+def contenders(scenario: Parameters) -> dict[str, dict[str, object]]:
+    """What sets the loops apart, by name, from the paper's to the one without a backlash."""
     m, c_r, c_l = (getattr(scenario.backlash, name) for name in ('m', 'c_r', 'c_l'))
     tracks = {'structure': 'tracking', 'fixed.doubt': 0.5}
-    return [
-        *(
-            Contender(f'{law}, u_d = y_m + f v',
-                      {'structure': 'proportional', 'estimator.law': law}, follows=False)
+    return {
+        **{
+            f'{law}, u_d = y_m + f v': {'structure': 'proportional', 'estimator.law': law}
             for law in ('printed', 'lms', 'moving_horizon')
-        ),
-        Contender('gradient, four blocks', {
+        },
+        'gradient, four blocks': {
             'structure': 'pole_placement', 'estimator.law': 'gradient',
             # With less, y, which they feed back unfiltered, has to be less noisy.
             'tracking.input_weight': 1.0,
-        }),
-        Contender('moving_horizon, tracking', {
-            'structure': 'tracking', 'estimator.law': 'moving_horizon',
-        }),
-        Contender('wrong constants, tracking', {**tracks, **_fixed(m, 1.3 * c_r, 1.3 * c_l)}),
-        Contender('no compensation, tracking', {**tracks, **_fixed(m, 0.0, 0.0)}),
-        Contender('no backlash, tracking', {
-            'structure': 'tracking', **_fixed(m, 0.0, 0.0), **GAPLESS,
-        }),
-    ]
+        },
+        'moving_horizon, tracking': {'structure': 'tracking', 'estimator.law': 'moving_horizon'},
+        'wrong constants, tracking': {**tracks, **_fixed(m, 1.3 * c_r, 1.3 * c_l)},
+        'no compensation, tracking': {**tracks, **_fixed(m, 0.0, 0.0)},
+        'no backlash, tracking': {'structure': 'tracking', **_fixed(m, 0.0, 0.0), **GAPLESS},
+    }
 
 
 def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
@@ -98,20 +82,23 @@ def _fixed(m: float, c_r: float, c_l: float) -> dict[str, object]:
 
 
 def compare(scenario: Parameters, samples: int) -> list[Result]:
-    """Run every contender and return its figures of merit.
+    """Run every loop and return its figures of merit.
 
     Where y follows y_m, y_m is scaled by |G| at its frequency, so that every loop asks about the
     same motion of G.
     """
-    bar = tqdm(contenders(scenario), desc='compare', unit='loop', disable=None)
-    return [_measure(contender, scenario, samples) for contender in bar]
+    bar = tqdm(contenders(scenario).items(), desc='compare', unit='loop', disable=None)
+    return [_measure(name, scenario, changes, samples) for name, changes in bar]
 
 
-def _measure(contender: Contender, scenario: Parameters, samples: int) -> Result:
-    p = scenario.replaced(contender.changes)
+def _measure(
+    name: str, scenario: Parameters, changes: Mapping[str, object], samples: int,
+) -> Result:
+    p = scenario.replaced(changes)
     if p.estimator.law != scenario.estimator.law:
         p = p.replaced({'estimates.load': False})  # they belong to another law
-    if contender.follows:
+    follows = p.structure != 'proportional'  # else y_m sets u_d
+    if follows:
         z = np.exp(1j * scenario.frequency * scenario.sample_period)
         gain = abs(complex(build_model(scenario).response(np.array([z]))[0]))
         p = p.replaced({'amplitude': gain * scenario.amplitude, 'bias': gain * scenario.bias})
@@ -120,11 +107,11 @@ def _measure(contender: Contender, scenario: Parameters, samples: int) -> Result
     try:
         run = run_loop(loop, samples)
     except BrokenOffError as broken:
-        return Result(contender, note=str(broken))
+        return Result(name, note=str(broken))
     t, since = run.column('t'), 0.2 * run.samples * run.sample_period
     window = max(round(COMPARISON_WINDOW_S / run.sample_period), 1)
     error = penalty = tracking = None
-    if contender.follows:
+    if follows:
         tracking = moving_rms(run.column('y') - metrics.delayed_reference(run, delay), window)
         gapless = run_loop(build_closed_loop(p.replaced({
             **GAPLESS, **_fixed(p.backlash.m, 0.0, 0.0), 'fixed.doubt': 0.0,
@@ -133,11 +120,11 @@ def _measure(contender: Contender, scenario: Parameters, samples: int) -> Result
             metrics.delayed_tracking_error_rms(each, delay, since) for each in (run, gapless)
         )
         penalty = None if error is None or best is None else error - best
-    return Result(contender, (
+    return Result(name, (
         metrics.control_error_rms(run), error, penalty,
         metrics.total_variation(run.column('v')[t >= since]),
         metrics.gap_crossings_per_reversal(run, since),
-    ), ErrorCurves(contender.name, t, moving_rms(control_error(run), window), tracking))
+    ), ErrorCurves(name, t, moving_rms(control_error(run), window), tracking))
 
 
 def comparison_document(scenario: Parameters, results: Sequence[Result], figure: str) -> str:
@@ -148,7 +135,7 @@ def comparison_document(scenario: Parameters, results: Sequence[Result], figure:
         f'![Control error and tracking error of every loop over time]({figure})', '',
         '| ' + ' | '.join(COMPARISON_HEADER) + ' |', '|---' * len(COMPARISON_HEADER) + '|',
         *('| ' + ' | '.join(result.row) + ' |' for result in results), '',
-        *(f'- {result.contender.name}: {result.note}.' for result in results if result.note),
+        *(f'- {result.name}: {result.note}.' for result in results if result.note),
         f'Scenario: the plant of the configuration, m = {backlash.m:g}, c_r = {backlash.c_r:g}, '
         f'c_l = {backlash.c_l:g}, {scenario.waveform} at {scenario.frequency:g} rad/s, noise on y '
         f'with standard deviation {scenario.output_noise_std:g}. Written by `compare --out '

@@ -13,9 +13,9 @@ def test_document_and_figure_come_from_one_command(tmp_path, capsys):
     assert (tmp_path / 'images' / 'comparison.png').read_bytes().startswith(b'\x89PNG')
     assert '](images/comparison.png)' in page
     printed = capsys.readouterr().out
-    for contender in contenders(Parameters()):
-        assert f'| {contender.name} |' in page
-        assert contender.name in printed
+    for name in contenders(Parameters()):
+        assert f'| {name} |' in page
+        assert name in printed
 
 
 def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> None:
@@ -25,7 +25,7 @@ def test_bad_input_ends_with_one_line(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_learned_backlash_costs_less_than_an_uncompensated_one() -> None:
     merits = {
-        result.contender.name: dict(zip(COMPARISON_HEADER[1:], result.merits, strict=True))
+        result.name: dict(zip(COMPARISON_HEADER[1:], result.merits, strict=True))
         for result in compare(Parameters(), 400)
     }
     learned, plain = merits['moving_horizon, tracking'], merits['no compensation, tracking']
