@@ -207,7 +207,6 @@ def shortened(setup: Setup, record: Record, belief: Belief, cut: int) -> Belief:
             break
     return replace(
         belief, fit=shorter, first=rest.first, older=beside[0], start=beside[1],
-        thorough_at=len(rest.v),
         rejected=frozenset(k for k in belief.rejected if k >= rest.first),
         swapped=frozenset(k for k in belief.swapped if k >= rest.first),
     )

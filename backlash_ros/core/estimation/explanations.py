@@ -14,13 +14,12 @@ from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.play import engaged, play, reversals
 from backlash_ros.core.estimation.posterior import Fit, Prior, Start
 from backlash_ros.core.estimation.search import search
 
 Array = NDArray[np.float64]
 
-CANDIDATES, APART = 3, 0.1  # best gaps of a search that are fitted, and their relative distance
-WALKS = (0.005, 0.02, 0.08)  # of u over the whole record, over m times the gap, that are compared
 FAR_BEHIND = 30.0  # log-likelihood by which a candidate, or no walk of u, is given up
 BY_CHANCE = 3.0  # standard deviations by which an estimate may lie beyond a bound
 SMALLEST_NOISE = 1e-12  # of y, that a setup may have
@@ -112,17 +111,20 @@ def afresh(
     # The noise of a first step is at least a twentieth of the motion of y.
     noise = max(setup.noise_std, 0.05 * float(np.nanstd(record.y)))
     xi = np.zeros(family.count) if like is None else like.theta[3:]
+    candidates, apart = 3, 0.1  # gaps of a search that are fitted, and their relative distance
+    hopeless = not may_be_known(setup, record.v)  # whatever is found: to be named, not to be used
     fits: list[Fit] = []
     # Once more around G as the best of the first gaps has it.
-    for _ in range(2 if family.count and like is None else 1):
-        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi)
+    rounds = 2 if family.count and like is None and not hopeless else 1
+    for last in (False, True)[2 - rounds:]:
+        found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi, last)
         if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break
         gaps: list[float] = []
         for _, gap, p0, m in found:
-            if len(gaps) == CANDIDATES:
+            if len(gaps) == (1 if hopeless else candidates):
                 break
-            if m * found[0].m > 0.0 and all(abs(gap - other) > APART * other for other in gaps):
+            if m * found[0].m > 0.0 and all(abs(gap - other) > apart * other for other in gaps):
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
                 start = p.step(Fit(np.zeros(1), p0, theta, noise), 1.0, held=True)
@@ -133,20 +135,59 @@ def afresh(
     if also is not None and also.m > 0.0:
         begins = replace(also.without_intervals, x=np.zeros(1))
         fits.append(p.finished(p.fitted(begins, FIRST_STEPS)))
-    fits = [f for f in fits if np.isfinite(f.evidence)]
+    fits = _different([f for f in fits if np.isfinite(f.evidence)])
     if not fits:
         return None
-    fits = p.comparable(fits)
     top = max(f.evidence for f in fits)
     fits = [p.finished(p.fitted(f)) if f.evidence > top - FAR_BEHIND else f for f in fits]
-    fits = p.comparable(fits)
     best = max(fits, key=lambda f: f.evidence)
-    if best.m < 0.0:
+    if best.m < 0.0 or hopeless:
         return best
     best = _begun_elsewhere(p, best)
-    best = p.with_intervals(best)
+    best = with_intervals(p, best)
     best = replace(best, spread=spread(p, best, fits))
     return with_walk(setup, p, best) if walks else best
+
+
+def _different(fits: list[Fit]) -> list[Fit]:
+    """Fits without those that have come to the same gap as a likelier one."""
+    out: list[Fit] = []
+    for f in sorted(fits, key=lambda f: -f.evidence):
+        same = (abs(f.gap - g.gap) < 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in out)
+        if not any(same):
+            out.append(f)
+    return out
+
+
+def with_intervals(p: Problem, f: Fit) -> Fit:
+    """The finished fit, by intervals where readings have a step that the noise does not hide.
+
+    The noise beside the rounding is the likeliest of a grid, but as large as leaves three
+    readings near an edge of their interval for every unknown: fewer are no normal posterior.
+    """
+    step, unknowns = p.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
+    largest = 0.25 * step
+    edges = 3.0 * unknowns / max(float(p.weights(f).sum()), 1.0)
+    least = min(step * max(1.0 / 64.0, edges), largest)
+    if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
+        return p.finished(f)
+
+    def at(level: float, begin: Fit) -> Fit:
+        return p.finished(p.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
+
+    first = max(min(f.noise_std if f.step else largest, largest), least)
+    best = at(first, f)
+    for factor in (0.5, 2.0):
+        if best.noise_std < first:
+            break
+        while least <= factor * best.noise_std <= largest:
+            other = at(factor * best.noise_std, best)
+            if other.evidence <= best.evidence:
+                break
+            best = other
+    if best.rms < 1.5 * f.noise:
+        return best
+    return p.finished(p.fitted(f.without_intervals))
 
 
 def with_walk(setup: Setup, p: Problem, f: Fit) -> Fit:
@@ -155,21 +196,21 @@ def with_walk(setup: Setup, p: Problem, f: Fit) -> Fit:
     One that walks already is compared with one that does not in the same way; a walk that is
     configured is the least.
     """
+    shares = (0.005, 0.02, 0.08)  # of m times the gap, by which u may walk over the record
     best, least = f, setup.walk_std
     if f.walk_std > least:
         still = p.walking(least)
-        best = still.with_intervals(still.fitted(f.without_intervals))
+        best = with_intervals(still, still.fitted(f.without_intervals))
     if not best.valid or not best.systematic:
         return best
-    for share in WALKS:
+    for share in shares:
         walk_std = share * f.m * f.gap / sqrt(len(p.v))
         if walk_std <= least:
             continue
         walking = p.walking(walk_std)
         begin = replace(f.without_intervals, knots=np.zeros(0))
-        g = walking.with_intervals(walking.fitted(begin, FIRST_STEPS))
-        of_best, of_g = (each.evidence for each in walking.comparable([best, g]))
-        if g.valid and of_g > of_best + (0.0 if best.walk_std > least else FAR_BEHIND):
+        g = with_intervals(walking, walking.fitted(begin, FIRST_STEPS))
+        if g.valid and g.evidence > best.evidence + (0.0 if best.walk_std > least else FAR_BEHIND):
             best = g
     return best
 
@@ -238,6 +279,16 @@ def of_xi(f: Fit) -> Prior | None:
 # --- judgement ----------------------------------------------------------------------------------
 
 
+def may_be_known(setup: Setup, v: Array) -> bool:
+    """Whether v (N,) has turned often enough for any gap to be known."""
+    gap = 0.01 * float(np.ptp(v))
+    return len(reversals(engaged(v, play(v, gap, float(v[0])), gap))) >= _turns_needed(setup)
+
+
+def _turns_needed(setup: Setup) -> int:
+    return settings.REVERSALS if setup.family.count else 1
+
+
 def is_known(setup: Setup, f: Fit, turns: int) -> bool:
     """Whether m and the gap are known well enough to be published.
 
@@ -245,7 +296,7 @@ def is_known(setup: Setup, f: Fit, turns: int) -> bool:
     deviations must be smaller: what causes that does not average out. A gap is also known where
     its upper end is small beside the first guess: there is none.
     """
-    if not f.valid or turns < (settings.REVERSALS if setup.family.count else 1):
+    if not f.valid or turns < _turns_needed(setup):
         return False
     if any(outside_bounds(setup.bounds, f)) or moves_unexplained(setup, f):
         return False

@@ -16,25 +16,38 @@ from __future__ import annotations
 from copy import copy
 from dataclasses import dataclass, field, replace
 from math import inf, isfinite, log, sqrt
-from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, play, reversals
-from backlash_ros.core.estimation.posterior import Fit, Prior, Start
+from backlash_ros.core.estimation.plant_family import (
+    PlantFamily,
+    filtered,
+    padded,
+    state_columns,
+)
+from backlash_ros.core.estimation.play import (
+    LEFT,
+    NEITHER,
+    engaged,
+    hats,
+    play,
+    reversals,
+    walk,
+)
+from backlash_ros.core.estimation.posterior import (
+    LEAST_SCALE,
+    Fit,
+    Prior,
+    Start,
+    error_of_plant,
+)
 from backlash_ros.core.estimation.reading import Likelihood, independence, likelihood, step_of
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
-SCALES: Array = np.append(0.0, np.geomspace(1e-3, 10.0, 13))  # of the error of G that are weighed
-LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
-KNOTS, KNOT_SAMPLES = 36, 8  # of a walk over a record at most, and samples between them at least
 STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
-LONGEST_STEP = 2.0  # prior deviations by which G moves at once
-NEAR_EDGE = 3.0  # readings near an edge of their interval, for every unknown
 
 
 @dataclass
@@ -47,7 +60,7 @@ class _Evaluated:
     p: Array
     u: Array
     y: Array
-    weights: Array | None = None
+    independent: tuple[Array, NDArray[np.intp]] | None = None
     likelihoods: dict[tuple[float, float], Likelihood] = field(default_factory=dict)
 
 
@@ -80,7 +93,7 @@ class Problem:
 
     def _walk_by(self, walk_std: float) -> None:
         count, self.walk_std = len(self.v), walk_std
-        self._hats = _hats(count) if walk_std else np.zeros((0, count))
+        self._hats = hats(count) if walk_std else np.zeros((0, count))
 
     @property
     def _knot_std(self) -> float:
@@ -117,10 +130,13 @@ class Problem:
 
     def weights(self, f: Fit) -> Array:
         """How much of an independent reading each one is where y is as f has it (N,)."""
+        return self._independent(f)[0]
+
+    def _independent(self, f: Fit) -> tuple[Array, NDArray[np.intp]]:
         one = self._evaluated(f)
-        if one.weights is None:
-            one.weights = independence(self.y, self.known, one.y, self.step_of_readings)
-        return one.weights
+        if one.independent is None:
+            one.independent = independence(self.y, self.known, one.y, self.step_of_readings)
+        return one.independent
 
     def _likelihood(self, f: Fit) -> Likelihood:
         one, how = self._evaluated(f), (f.noise_std, f.step)
@@ -168,7 +184,7 @@ class Problem:
         """
         weights = self.weights(f)
         _, score, information = self._likelihood(f)
-        x = _padded(f.x, len(self._evaluated(f).a) - 1)
+        x = padded(f.x, len(self._evaluated(f).a) - 1)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
         beside = np.concatenate(self._beside(replace(f, x=x), len(beta), held, begun))
         count = len(self.v)
@@ -180,7 +196,9 @@ class Problem:
         scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
         scale[-1] = 1.0
         stack /= scale
-        r = _lapack().dgeqrf(stack, overwrite_a=1)[0][:len(beta) + 1]
+        from scipy.linalg.lapack import dgeqrf  # where fits are made: 31 MB
+
+        r = dgeqrf(stack, overwrite_a=1)[0][:len(beta) + 1]
         return self._solved(
             f, np.triu(r) * scale, len(x), float(weights.sum()),
             min(most_scale, self.most_scale)
@@ -262,13 +280,14 @@ class Problem:
         if not np.isfinite(r).all():
             raise np.linalg.LinAlgError('the samples leave no finite posterior')
         regular = diagonal.min() > 0.0
-        inverse = _lapack().dtrtri(r[:n, :n])[0] if regular else np.linalg.pinv(r[:n, :n])
+        from scipy.linalg.lapack import dtrtri  # as above
+
+        inverse = dtrtri(r[:n, :n])[0] if regular else np.linalg.pinv(r[:n, :n])
         by = inverse @ r[:n, n:]
         freedom = max(count - n, 0.0) + 1.0
         squares = float(r[size, size]) ** 2 + (self.nominal / f.noise_std) ** 2
-        xi, cov_xi, scale, volume, noise = self._error_of_plant(
-            f, r[n:, n:], squares, freedom, most_scale
-        )
+        xi, cov_xi, scale, volume, noise = error_of_plant(
+            f, r[n:, n:], squares, freedom, most_scale)
         cov = np.empty((size, size))
         cov[:n, :n] = noise * inverse @ inverse.T + by[:, :-1] @ cov_xi @ by[:, :-1].T
         cov[:n, n:] = -by[:, :-1] @ cov_xi
@@ -282,39 +301,6 @@ class Problem:
             p0=float(beta[at - 1]), theta=beta[at:], scale=scale, cov=cov[at:, at:], volume=volume,
             prior=Prior(r[at:size, at:size], r[at:size, size]),
         )
-
-    def _error_of_plant(
-        self, f: Fit, r: Array, squares: float, freedom: float, most_scale: float,
-    ) -> tuple[Array, Array, float, float, float]:
-        """xi (K,), its covariance, its scale, what it adds to the evidence, variance of the noise.
-
-        r: triangle of xi (K + 1, K + 1). The variance is over that of f; with intervals it is 1.
-        """
-        k = len(r) - 1
-        if not k:
-            return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, 1.0 if f.step else squares / freedom
-        u, singular, vt = np.linalg.svd(r[:k, :k])
-        z = u.T @ r[:k, k]
-        scales = SCALES[most_scale >= SCALES][:, None]
-        noise = np.full((len(scales), 1), 1.0 if f.step else squares / freedom)
-        for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
-            shrink = 1.0 / (1.0 + (scales * singular) ** 2 / noise)
-            left = squares + (shrink * z**2).sum(axis=1, keepdims=True)
-            noise = noise if f.step else left / freedom
-        fits = -0.5 * left[:, 0] if f.step else -0.5 * freedom * np.log(left[:, 0])
-        of_scale = 0.5 * np.log(np.maximum(scales[:, 0], LEAST_SCALE)) ** 2
-        each = fits + 0.5 * np.log(shrink).sum(axis=1) - of_scale
-        share = np.exp(each - each.max())
-        share[1:] *= 0.3  # what a place of the grid stands for beside none at all
-        share /= share.sum()
-        means = scales**2 / noise * singular * shrink * z
-        mean = share @ means
-        spread = np.diag(share @ (scales**2 * shrink))
-        spread += (means - mean).T @ ((means - mean) * share[:, None])
-        best = int(each.argmax())
-        volume = 0.5 * float(np.log(shrink[best]).sum()) - float(of_scale[best])
-        return (vt.T @ mean, vt.T @ spread @ vt, float(scales[best, 0]), volume,
-                float(share @ noise[:, 0]))
 
     # --- the fit --------------------------------------------------------------------------------
 
@@ -383,24 +369,15 @@ class Problem:
         free = max(float(w.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
         return sqrt((float((w * r) @ r) + self.nominal**2) / (free + 1.0))
 
-    def comparable(self, fits: list[Fit]) -> list[Fit]:
-        """The same with evidence that counts each reading alike: as the closest fit has it."""
-        closest = min(fits, key=lambda f: f.rms)
-        w = self.weights(closest)
-        return [f if f is closest else self.finished(f, w) for f in fits]
-
-    def finished(self, f: Fit, w: Array | None = None) -> Fit:
-        """The same with its evidence and the correlation of what is left.
-
-        w: weights of the readings (N,), None: those of f.
-        """
-        r = np.where(self.known, self.y - self.output(f), 0.0)
-        w = self.weights(f) if w is None else w
-        log_density, score, information = self._likelihood(f)
+    def finished(self, f: Fit) -> Fit:
+        """The same with its evidence and the correlation of what is left."""
         known = self.known
-        count = float(w.sum())
+        r = np.where(known, self.y - self.output(f), 0.0)
+        w, begins = self._independent(f)
+        log_density, score, information = self._likelihood(f)
+        count = float(len(begins))
         whole = score / sqrt(float(information[known].mean())) if f.step else r / f.noise_std
-        e = whole * np.sqrt(w)
+        e = np.add.reduceat((whole * w)[known], begins)  # of what counts as one reading
         squares = max(float(e @ e), 1e-300)
         lags = (1, 2, 4, 8) if f.step else (1,)
         rho = max(float(e[lag:] @ e[:-lag]) / squares for lag in lags if lag < len(e))
@@ -413,38 +390,6 @@ class Problem:
             turns=len(reversals(engaged(self.v, self.input(f)[0], max(f.gap, 0.0)))),
         )
 
-    def with_intervals(self, f: Fit) -> Fit:
-        """The finished fit, by intervals where readings have a step that the noise does not hide.
-
-        The noise beside the rounding is the likeliest of a grid, but as large as leaves a few
-        readings near an edge of their interval for every unknown: fewer are no normal posterior.
-        """
-        step, unknowns = self.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
-        largest = 0.25 * step
-        edges = NEAR_EDGE * unknowns / max(float(self.weights(f).sum()), 1.0)
-        least = step * max(1.0 / 64.0, edges)
-        hidden = not f.step and f.noise_std > 0.75 * step
-        if not step or f.m <= 0.0 or least > largest or hidden:
-            return self.finished(self.fitted(f.without_intervals) if f.step else f)
-
-        def at(level: float, begin: Fit) -> Fit:
-            return self.finished(
-                self.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
-
-        first = max(min(f.noise_std if f.step else largest, largest), least)
-        best = at(first, f)
-        for factor in (0.5, 2.0):
-            while best.noise_std == first or (best.noise_std < first) is (factor < 1.0):
-                if not least <= factor * best.noise_std <= largest:
-                    break
-                other = at(factor * best.noise_std, best)
-                if other.evidence <= best.evidence:
-                    break
-                best = other
-        if best.rms < 1.5 * f.noise:
-            return best
-        return self.finished(self.fitted(f.without_intervals))
-
     def state(self, f: Fit) -> Array:
         """The state before the record that explains it best, everything else held."""
         b, a = self.family.at(f.xi)
@@ -454,58 +399,15 @@ class Problem:
         return np.asarray(np.linalg.lstsq(columns, r, rcond=1e-12)[0])
 
 
-def filtered(b: list[float], a: list[float], u: Array, x: Array) -> Array:
-    """Output of the filter b / a from the state x before u (N,)."""
-    return lfilter(b, a, u, _padded(x, len(a) - 1))
-
-
-def _padded(x: Array, length: int) -> Array:
-    out = np.zeros(length)
-    out[:min(length, len(x))] = x[:length]
-    return out
-
-
-def state_columns(a: list[float], count: int) -> Array:
-    """How outputs depend on the state before them, shape (count, order)."""
-    impulse = np.zeros(count)
-    impulse[0] = 1.0
-    once = lfilter([1.0], a, impulse)
-    return np.column_stack([
-        np.concatenate([np.zeros(i), once[:count - i]]) for i in range(len(a) - 1)
-    ])
-
-
-def walk(knots: Array, count: int) -> Array:
-    """d (count,) of these knots (W,): straight from one to the next, and to 0 at the end."""
-    at = np.linspace(0.0, count - 1.0, len(knots) + 1)
-    return np.asarray(np.interp(np.arange(count), at, np.append(knots, 0.0)))
-
-
-def _hats(count: int) -> Array:
-    """How d depends on its knots, shape (W, count)."""
-    knots = min(max(count // KNOT_SAMPLES, 1), KNOTS)
-    return np.array([walk(row, count) for row in np.eye(knots)])
-
-
 def _towards(f: Fit, new: Fit, share: float = 1.0) -> Fit:
-    """The values this share of the way from f to new, with the posterior of new.
-
-    G moves by no more than LONGEST_STEP at once.
-    """
+    """The values this share of the way from f to new, with the posterior of new."""
+    longest = 2.0  # prior deviations by which G moves at once
     furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))
-    length = share * (min(LONGEST_STEP / furthest, 1.0) if furthest else 1.0)
+    length = share * (min(longest / furthest, 1.0) if furthest else 1.0)
     order = max(len(f.x), len(new.x))
-    old, x = _padded(f.x, order), _padded(new.x, order)
+    old, x = padded(f.x, order), padded(new.x, order)
     knots = f.knots if len(f.knots) == len(new.knots) else np.zeros(len(new.knots))
     return replace(
         new, x=old + length * (x - old), knots=knots + length * (new.knots - knots),
         p0=f.p0 + length * (new.p0 - f.p0), theta=f.theta + length * (new.theta - f.theta),
     )
-
-
-def _lapack() -> ModuleType:
-    """LAPACK, loaded where fits are made: it takes 31 MB, which a controller can do without."""
-    from scipy.linalg import lapack
-
-    module: ModuleType = lapack
-    return module

@@ -38,6 +38,7 @@ from backlash_ros.core.estimation.explanations import (
     outliers,
     problem_of,
     spread,
+    with_intervals,
     with_walk,
 )
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
@@ -78,9 +79,13 @@ def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
 
 def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
     shortest = 50  # samples of a part of a record that is searched alone
-    count = len(record.v)
-    after = replace(before, end=record.end,
-                    next_at=record.end + max(int(count * (GROWTH - 1.0)), FEWEST))
+    count, tried = len(record.v), before.tried
+    soon = record.end + max(count // settings.BLOCKS, FEWEST)
+    search_at = record.end + max(int(count * (GROWTH - 1.0)), FEWEST)
+    after = replace(before, end=record.end, next_at=search_at, thorough_at=search_at)
+    if tried is not None and before.candidate is None and record.end < before.thorough_at \
+            and not is_known(setup, tried, _turns(record, max(tried.gap, 0.0), tried.p0)):
+        return replace(after, next_at=soon, thorough_at=before.thorough_at)
     found = afresh(setup, record, also=before.candidate or before.tried, walks=True)
     part = shorter = record
     why = _why(setup, found, record, before)
@@ -101,11 +106,12 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
         reason=Status.INCONSISTENT if runs_on else why,
     )
     if not is_known(setup, found, found.turns):
+        if is_known(setup, found, settings.REVERSALS):  # but for a reversal, which may come soon
+            after = replace(after, next_at=soon)
         return replace(after, candidate=None)
     if before.candidate is None or not alike(before.candidate, found):
         # A first estimate has to be found twice: some samples alone may mislead.
-        later = max(count // settings.BLOCKS, FEWEST)
-        return replace(after, candidate=found, next_at=record.end + later)
+        return replace(after, candidate=found, next_at=soon)
     # What leaves more than noise must predict a quarter as many samples before it is believed.
     more = found.systematic or noisier(setup, found)
     must = max(before.must_predict, len(part.v) // 4 if more else 0)
@@ -140,12 +146,16 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
         return Status.INCONSISTENT if crosses else Status.NOT_EXCITED
     # Until v has swung past the gap a fit may have none: the gap of the first guess counts then.
     gap = max(found.gap, setup.guess)
-    turns = len(reversals(engaged(record.v, play(record.v, gap, float(record.v[0])), gap)))
+    turns = _turns(record, gap, float(record.v[0]))
     large = found.unexplained * found.gap > settings.UNEXPLAINED * gap \
         or turns >= settings.HELD_REVERSALS
     wrong = found.m < 0.0 or (large and _leaves_more(setup, found))
     contradicts = known is not None and is_known(setup, found, found.turns)
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
+
+
+def _turns(record: Record, gap: float, p0: float) -> int:
+    return len(reversals(engaged(record.v, play(record.v, gap, p0), gap)))
 
 
 def _leaves_more(setup: Setup, found: Fit) -> bool:
@@ -163,7 +173,7 @@ def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
         before, state=State.KNOWN, must_predict=must, fit=fit, first=record.first, end=record.end,
         candidate=None, tried=None, doubt_from=None,
         next_at=record.end + max(count // settings.BLOCKS, FEWEST),
-        thorough_at=int(GROWTH * count), predicted=0, adopted_noise=fit.noise,
+        thorough_at=record.end + count // 4, predicted=0, adopted_noise=fit.noise,
     ))
 
 
@@ -204,11 +214,12 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
         before, end=record.end, next_at=record.end + max(count // settings.BLOCKS, FEWEST),
         predicted=before.predicted + count - new,
     )
-    if count >= before.thorough_at:
-        after = replace(after, thorough_at=int(1.4 * count))
+    if record.end >= before.thorough_at:
+        after = replace(after, thorough_at=record.end + 2 * count // 5)
         short = count <= SHORT_SEARCH and before.older is None
-        fit = problem.with_intervals(fit)
-        fit = replace(fit, spread=spread(problem, fit))
+        fit = with_intervals(problem, fit)
+        if fit.spread.any():  # else it has been normal for long
+            fit = replace(fit, spread=spread(problem, fit))
         fit = _beside_others(setup, record, problem, fit) if short else fit
         fit = with_walk(setup, problem, fit)
     else:
@@ -227,7 +238,6 @@ def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> 
     other = afresh(setup, record)
     if other is None or not is_known(setup, other, settings.REVERSALS):
         return fit
-    fit, other = problem.comparable([fit, other])
     best = other if other.evidence > fit.evidence + 3.0 else fit
     return replace(best, spread=spread(problem, best, [fit, other]))
 

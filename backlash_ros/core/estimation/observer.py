@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.estimation.explanations import Record
-from backlash_ros.core.estimation.fit import walk
-from backlash_ros.core.estimation.play import play
+from backlash_ros.core.estimation.play import play, walk
 from backlash_ros.core.estimation.posterior import Fit
 from backlash_ros.core.estimation.settings import GATE, OUTLIERS
 from backlash_ros.core.law import Interval

@@ -20,6 +20,7 @@ from math import cos, cosh, exp, floor, inf, log, sin, sinh, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.plant.filtering import lfilter
 from backlash_ros.core.plant.model_check import ON_CIRCLE
 from backlash_ros.core.plant.state_model import memory_of
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -185,6 +186,27 @@ class PlantFamily:
             pole = exp(-exp(value))
             out.append(([1.0, -pole], [[0.0, exp(value) * pole]]))
         return out
+
+
+def filtered(b: list[float], a: list[float], u: Array, x: Array) -> Array:
+    """Output of the filter b / a from the state x before u (N,)."""
+    return lfilter(b, a, u, padded(x, len(a) - 1))
+
+
+def padded(x: Array, length: int) -> Array:
+    out = np.zeros(length)
+    out[:min(length, len(x))] = x[:length]
+    return out
+
+
+def state_columns(a: list[float], count: int) -> Array:
+    """How outputs depend on the state before them, shape (count, order)."""
+    impulse = np.zeros(count)
+    impulse[0] = 1.0
+    once = lfilter([1.0], a, impulse)
+    return np.column_stack([
+        np.concatenate([np.zeros(i), once[:count - i]]) for i in range(len(a) - 1)
+    ])
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:

@@ -1,7 +1,7 @@
 """The play operator over a record: p(k) = min(max(p(k-1), v(k)), v(k) + gap).
 
 u = m (p - c_r) is the output of the backlash (2.1) with the gap c_r - c_l; p rests on v while the
-right side is engaged, and on v + gap while the left one is.
+right side is engaged, and on v + gap while the left one is. Beside it, a disturbance of u may walk.
 """
 
 from __future__ import annotations
@@ -65,3 +65,15 @@ def reversals(sides: Sides) -> NDArray[np.intp]:
     """Samples (R,) at which the other side engages."""
     seen = np.flatnonzero(sides != NEITHER)
     return np.asarray(seen[1:][np.diff(sides[seen]) != 0])
+
+
+def walk(knots: Array, count: int) -> Array:
+    """d (count,) of these knots (W,): straight from one to the next, and to 0 at the end."""
+    at = np.linspace(0.0, count - 1.0, len(knots) + 1)
+    return np.asarray(np.interp(np.arange(count), at, np.append(knots, 0.0)))
+
+
+def hats(count: int) -> Array:
+    """How d depends on its knots, shape (W, count)."""
+    knots = min(max(count // 8, 1), 36)  # so many samples apart at least, so many at most
+    return np.array([walk(row, count) for row in np.eye(knots)])

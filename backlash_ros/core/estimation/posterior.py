@@ -1,7 +1,7 @@
 """What a fit found: the values of all unknowns with their posterior.
 
 Residuals that are correlated do not average out: with rho of theirs, N count as
-N / (1 - rho + N rho) independent ones.
+N / (1 - rho + N rho) independent ones. The scale of the error of G is integrated out on a grid.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+
+SCALES: Array = np.append(0.0, np.geomspace(1e-3, 10.0, 13))  # of the error of G that are weighed
+LEAST_SCALE = 3e-4  # as which a scale of 0 counts in its prior
 
 
 class Prior(NamedTuple):
@@ -124,8 +127,9 @@ class Fit:
 
     @property
     def systematic(self) -> bool:
-        """Whether residuals are correlated beyond chance: they do not average out."""
-        return self.count * self.correlation > 1.0
+        """Whether residuals are correlated beyond chance, and larger than rounding alone is."""
+        rounding = 1.1 * self.step / sqrt(12.0)
+        return self.count * self.correlation > 1.0 and self.rms > rounding
 
     @property
     def without_intervals(self) -> Fit:
@@ -136,3 +140,37 @@ class Fit:
     def valid(self) -> bool:
         """Whether it is a backlash with finite deviations."""
         return self.m > 0.0 and self.cov.size > 0 and bool(np.isfinite(self.cov).all())
+
+
+def error_of_plant(
+    f: Fit, r: Array, squares: float, freedom: float, most_scale: float,
+) -> tuple[Array, Array, float, float, float]:
+    """xi (K,), its covariance, its scale, what it adds to the evidence, variance of the noise.
+
+    r: triangle of xi (K + 1, K + 1). The variance is over that of f; with intervals it is 1.
+    """
+    k = len(r) - 1
+    if not k:
+        return np.zeros(0), np.zeros((0, 0)), f.scale, 0.0, 1.0 if f.step else squares / freedom
+    u, singular, vt = np.linalg.svd(r[:k, :k])
+    z = u.T @ r[:k, k]
+    scales = SCALES[most_scale >= SCALES][:, None]
+    noise = np.full((len(scales), 1), 1.0 if f.step else squares / freedom)
+    for _ in range(1 if f.step else 4):  # noise and shrinkage depend on each other
+        shrink = 1.0 / (1.0 + (scales * singular) ** 2 / noise)
+        left = squares + (shrink * z**2).sum(axis=1, keepdims=True)
+        noise = noise if f.step else left / freedom
+    fits = -0.5 * left[:, 0] if f.step else -0.5 * freedom * np.log(left[:, 0])
+    of_scale = 0.5 * np.log(np.maximum(scales[:, 0], LEAST_SCALE)) ** 2
+    each = fits + 0.5 * np.log(shrink).sum(axis=1) - of_scale
+    share = np.exp(each - each.max())
+    share[1:] *= 0.3  # what a place of the grid stands for beside none at all
+    share /= share.sum()
+    means = scales**2 / noise * singular * shrink * z
+    mean = share @ means
+    spread = np.diag(share @ (scales**2 * shrink))
+    spread += (means - mean).T @ ((means - mean) * share[:, None])
+    best = int(each.argmax())
+    volume = 0.5 * float(np.log(shrink[best]).sum()) - float(of_scale[best])
+    return (vt.T @ mean, vt.T @ spread @ vt, float(scales[best, 0]), volume,
+            float(share @ noise[:, 0]))

@@ -91,20 +91,23 @@ def mean_information(ratio: float) -> float:
     return float(each.sum(axis=1).mean())
 
 
-def independence(y: Array, known: Flags, output: Array, step: float) -> Array:
+def independence(
+    y: Array, known: Flags, output: Array, step: float,
+) -> tuple[Array, NDArray[np.intp]]:
     """Share (N,) of an independent reading that each reading is; 0 where there is none.
 
     Equal readings, one after the other, count as one while the output (N,), as the fit has it,
-    stays within a small part of the step.
+    stays within a small part of the step. Also where each of these begins among those that are
+    known.
     """
     same_place = 16  # parts of a step within which an output counts as standing still
     weights = known.astype(np.float64)
     where = np.flatnonzero(known)
     if not step or not len(where):
-        return weights
+        return weights, np.arange(len(where))
     seen, place = y[where], np.floor(output[where] * (same_place / step))
     changes = (np.diff(seen) != 0.0) | (np.diff(place) != 0.0)
     begins = np.flatnonzero(np.append(True, changes))
     lengths = np.diff(np.append(begins, len(where)))
     weights[where] = np.repeat(1.0 / lengths, lengths)
-    return weights
+    return weights, begins

@@ -12,20 +12,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.fit import state_columns
-from backlash_ros.core.estimation.plant_family import PlantFamily
+from backlash_ros.core.estimation.plant_family import PlantFamily, state_columns
 from backlash_ros.core.estimation.play import plays
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
-
-GAPS = 32  # that are compared
-# Beginnings within each: where the record is short, a large part of it is before the first
-# engagement, which a beginning that is a little off puts somewhere else.
-STARTS, SHORT, STARTS_OF_SHORT = 5, 500, 17
-# Gaps of the second look, over the best of the first.
-ZOOM: Array = np.array([0.8 + 0.025 * k for k in range(17)])
 
 
 class Hypothesis(NamedTuple):
@@ -39,13 +31,14 @@ class Hypothesis(NamedTuple):
 
 def search(
     family: PlantFamily, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
+    closely: bool,
 ) -> tuple[list[Hypothesis], float]:
     """Hypotheses, and the evidence of a u that never moves.
 
     The likeliest one and those of other gaps that are likelier than their neighbours come first.
 
     v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
-    G is linearized.
+    G is linearized. closely: whether to look once more around the best gap.
     """
     none = 1e-9  # gap that counts as none, over the swing of v
     smallest = 0.01  # gap that is compared, over the swing of v
@@ -53,14 +46,18 @@ def search(
     compared = _Comparison(family, v, y, noise_std, xi.tolist())
     swing = float(np.ptp(v))
     top = min(swing, widest)
-    gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, GAPS))
-    count = STARTS if len(v) > SHORT else STARTS_OF_SHORT
-    starts: Array = np.arange(count) / (count - 1.0)
+    gaps: Array = np.append(none * swing, np.geomspace(smallest * min(swing, top), top, 32))
+    # Within each gap. Where a record is short, a large part of it is before the first engagement,
+    # which a beginning that is a little off puts somewhere else.
+    most = 16 if closely and len(v) <= 500 else 4
+    starts: Array = np.arange(most + 1) / most
     found = [h for h in compared.evidence(gaps, starts) if isfinite(h.evidence)]
     if not found:
         return [], compared.null
-    between = 0.5 * (starts[1:] + starts[:-1])
-    closer = compared.evidence(max(found).gap * ZOOM, np.append(starts, between))
+    between, closer = 0.5 * (starts[1:] + starts[:-1]), []
+    if closely:
+        near = [max(found).gap * (0.8 + 0.025 * k) for k in range(17)]
+        closer = compared.evidence(np.array(near), np.append(starts, between))
     first = sorted({max([*closer, max(found)]), *_peaks(found)}, reverse=True)[:peaks]
     return [*first, *sorted({*closer, *found} - {*first}, reverse=True)], compared.null
 

@@ -17,6 +17,7 @@ import sys
 import traceback
 from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from queue import SimpleQueue
 from struct import Struct
@@ -27,9 +28,22 @@ from backlash_ros.core.jobs.executor import LOST, Channel, Executor, Failure, Sa
 
 NICENESS = 5  # beyond that of the loop
 LENGTH = Struct('<Q')  # of an answer, in bytes, before it
-# Wait before a worker is replaced [s] that died at a job or before its first, as the one before it
-# did: the first, and the longest, by doubling.
+# Wait before a worker is replaced [s] that died without an answer, as the one before it did: the
+# first, and the longest, by doubling.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 10.0
+
+
+@dataclass
+class _Worker:
+    """A process, what it has yet to be written, what has come of an answer.
+
+    sent: jobs without a result that it has, the last of which may be written in part.
+    """
+
+    process: subprocess.Popen[bytes]
+    unwritten: bytearray = field(default_factory=bytearray)
+    received: bytearray = field(default_factory=bytearray)
+    sent: int = 0
 
 
 class WorkerExecutor(Executor):
@@ -44,27 +58,24 @@ class WorkerExecutor(Executor):
         self._channels: dict[int, Channel] = {}
         self._opened = 0  # channels so far
         self._submitted: deque[Channel] = deque()  # of each job without a result, in order
-        self._sent = 0  # of them, the last of which may be written in part
-        self._unwritten, self._received = bytearray(), bytearray()
-        self._answered = False  # whether this worker has
-        self._deaths = 0  # in a row at a job, or before the first
+        self._deaths = 0  # in a row without an answer
         self._closed = Event()
         self._starting: Thread | None = None
         self._started: SimpleQueue[subprocess.Popen[bytes]] = SimpleQueue()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._worker: _Worker | None = None
 
     @property
     def alive(self) -> bool:
-        return self._process is not None
+        return self._worker is not None
 
     @property
     def pid(self) -> int | None:
         """Process id of the worker; None while there is none."""
-        return None if self._process is None else self._process.pid
+        return None if self._worker is None else self._worker.process.pid
 
     def open(self, quantities: int = 0, capacity: int = 0) -> Channel:
         if self._opened == 0:
-            self._process = _start(self._preload)
+            self._worker = _Worker(_start(self._preload))
         self._opened += 1
         channel = self._channels[self._opened] = Channel(self, self._opened, quantities, capacity)
         return channel
@@ -75,9 +86,9 @@ class WorkerExecutor(Executor):
             self._starting.join()
         while not self._started.empty():
             _end(self._started.get())
-        if self._process is not None:
-            _end(self._process)
-            self._process = None
+        if self._worker is not None:
+            _end(self._worker.process)
+            self._worker = None
 
     # --- for its channels -----------------------------------------------------------------------
 
@@ -91,55 +102,52 @@ class WorkerExecutor(Executor):
 
     def tend(self) -> None:
         # Write what the pipe takes, read what has come, replace a worker that died.
-        if self._process is None and not self._started.empty():
+        if self._worker is None and not self._started.empty():
             self._take_over(self._started.get())
-        process = self._process
-        if process is None or process.stdin is None or process.stdout is None:
+        worker = self._worker
+        if worker is None or worker.process.stdin is None or worker.process.stdout is None:
             return
         try:
-            self._write_to(process.stdin.fileno())
-            received = os.read(process.stdout.fileno(), 65536)  # at once, at most
+            self._write_to(worker, worker.process.stdin.fileno())
+            received = os.read(worker.process.stdout.fileno(), 65536)  # at once, at most
         except BlockingIOError:  # nothing has come
             return
         except BrokenPipeError:
             received = b''
         if not received:
-            self._replace(process)
+            self._replace(worker)
             return
-        self._received += received
-        for number, body in _answers_in(self._received):
-            self._answered, self._deaths = True, 0
+        worker.received += received
+        for number, body in _answers_in(worker.received):
+            self._deaths = 0
             self._submitted.popleft()
-            self._sent -= 1
+            worker.sent -= 1
             if number in self._channels:
                 self._channels[number].result = pickle.loads(body)
 
-    def _write_to(self, pipe: int) -> None:
-        while self._unwritten or self._sent < len(self._submitted):
-            if not self._unwritten:
-                self._unwritten += _request(self._submitted[self._sent], [*self._channels])
-                self._sent += 1
+    def _write_to(self, worker: _Worker, pipe: int) -> None:
+        while worker.unwritten or worker.sent < len(self._submitted):
+            if not worker.unwritten:
+                worker.unwritten += _request(self._submitted[worker.sent], [*self._channels])
+                worker.sent += 1
             try:
-                del self._unwritten[:os.write(pipe, self._unwritten)]
+                del worker.unwritten[:os.write(pipe, worker.unwritten)]
             except BlockingIOError:  # the pipe is full
                 return
 
-    def _replace(self, dead: subprocess.Popen[bytes]) -> None:
+    def _replace(self, dead: _Worker) -> None:
         """Start another worker in the background; the job that was under way is lost."""
-        self._process = None
+        self._worker = None
         self.restarts += 1
-        at_work = self._sent > bool(self._unwritten)
-        self._deaths = self._deaths + 1 if at_work or not self._answered else 0
-        if at_work:
-            failure = Failure(LOST, f'the worker (process {dead.pid}) died')
+        self._deaths += 1
+        if dead.sent > bool(dead.unwritten):
+            failure = Failure(LOST, f'the worker (process {dead.process.pid}) died')
             self._submitted.popleft().result = failure
-        self._unwritten.clear()
-        self._received.clear()
-        self._sent, self._answered = 0, False
         wait_s = 0.0
         if self._deaths > 1:
             wait_s = min(FIRST_WAIT_S * 2.0 ** min(self._deaths - 2, 10), LONGEST_WAIT_S)
-        self._starting = Thread(target=self._start_another, args=(dead, wait_s), daemon=True)
+        self._starting = Thread(
+            target=self._start_another, args=(dead.process, wait_s), daemon=True)
         self._starting.start()
 
     def _start_another(self, dead: subprocess.Popen[bytes], wait_s: float) -> None:
@@ -154,7 +162,7 @@ class WorkerExecutor(Executor):
 
     def _take_over(self, process: subprocess.Popen[bytes]) -> None:
         """Have a new worker told all that the dead one knew."""
-        self._process = process
+        self._worker = _Worker(process)
         for channel in self._channels.values():
             channel.sent = 0
         # Those that were closed meanwhile have nobody who waits for a result.
