@@ -39,7 +39,8 @@ class LawReport:
     unexplained: motion of u that no backlash and no G explains, over m times the gap. coasts: there
     is no better estimate because the load runs on within the gap. unconfirmed: the estimate was
     learned before this run, and its samples do not confirm it yet. wrong_sign: there is no
-    estimate because y moves against v. waiting: samples that no fit has taken in yet. outliers:
+    estimate because y moves against v. undecided: there is none though v went back and forth, as
+    several gaps explain y alike. waiting: samples that no fit has taken in yet. outliers:
     readings rejected so far. reattributed: intervals so far over which another v acted than
     the one commanded. failed_fits: fits so far without a result.
     """
@@ -49,6 +50,7 @@ class LawReport:
     coasts: bool = False
     unconfirmed: bool = False
     wrong_sign: bool = False
+    undecided: bool = False
     waiting: int = 0
     outliers: int = 0
     reattributed: int = 0

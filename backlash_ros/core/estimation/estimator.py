@@ -24,7 +24,12 @@ from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Record, Se
 from backlash_ros.core.estimation.learning import learn
 from backlash_ros.core.estimation.observer import Following, Gains, Place, gains_of, place_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, LONGEST
+from backlash_ros.core.estimation.settings import (
+    FEWEST,
+    FIRST_FIT,
+    HELD_REVERSALS,
+    LONGEST,
+)
 from backlash_ros.core.jobs.executor import Executor, Failure, Samples
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
@@ -174,6 +179,8 @@ class MovingHorizon(Law):
             unconfirmed=belief.inherited is not None and belief.fit is None,
             coasts=belief.coasts,
             wrong_sign=belief.tried is not None and belief.tried.m < 0.0,
+            undecided=belief.published is None and belief.tried is not None
+            and belief.tried.m > 0.0 and belief.tried.turns >= HELD_REVERSALS,
             waiting=self._channel.record.end - belief.end,
             outliers=self._following.outliers,
             reattributed=self._reattributed,

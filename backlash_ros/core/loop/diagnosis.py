@@ -336,6 +336,8 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
          'estimates held as ~/freeze_adaptation asked; v is still answered'),
         ('known', OK, f.law.unconfirmed and status == Status.ACQUIRING,
          'estimates of before hold: only a v at several speeds could confirm them'),
+        ('undecided', OK, f.law.undecided and status == Status.ACQUIRING,
+         'learning: several gaps explain y alike: let v move between more than two values'),
         ('acquiring', OK, status == Status.ACQUIRING,
          'learning: the estimates still move freely'),
         ('learned', OK, status == Status.TRACKING, 'learned: the estimates agree with the data'),

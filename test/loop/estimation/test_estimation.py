@@ -5,6 +5,7 @@ from math import sin
 
 import numpy as np
 import pytest
+from cases.geared_motor import motor
 from contract.judged import judged
 from contract.learning_rows import PAPER as EXACT
 from contract.learning_rows import Job, Outcome, changes_jobs, run_job
@@ -97,3 +98,14 @@ def test_estimates_freeze_while_v_stays_within_the_gap(what: str) -> None:
     for name in ('m', 'c_r', 'c_l', 'std_c_r', 'std_c_l'):
         held = run.column(name)[first:]
         assert (held == held[0]).all() or np.isnan(held).all()
+
+
+def test_two_values_of_v_leave_open_whether_slope_or_gap_is_larger() -> None:
+    p = Parameters({
+        **motor(), 'waveform': 'square', 'amplitude': 0.2, 'frequency': 4.0,
+        'control.rate_max': 1e6, 'seed': 1,
+    })
+    loop = build_closed_loop(p)
+    run = loop.run(1600)
+    assert not (run.column('status') == Status.TRACKING).any()
+    assert loop.controller.estimator.report.undecided
