@@ -49,31 +49,8 @@ def _qos(e: Evidence) -> str:
     return '; '.join((*e.graph.misfits, *reliable))
 
 
-def _rate(e: Evidence) -> str:
-    period = e.timing.period_s
-    return f'{1.0 / period:.4g} Hz, a sample every {period * 1e3:.4g} ms'
-
-
-def _lost(e: Evidence) -> str:
-    return f'{e.timing.missing} of {len(e.timing.outputs) + e.timing.missing} samples'
-
-
-def _reported(e: Evidence) -> float:
-    return len(e.heard.applied) / max(len(e.timing.outputs), 1)
-
-
 def _use(e: Evidence) -> ReportUse:
     return report_use(e.p)
-
-
-def _clock(e: Evidence) -> str:
-    return f'samples arrive {abs(e.age_s) * 1e3:.2g} ms {"before" if e.age_s < 0.0 else "after"} ' \
-           'they left'
-
-
-def _noise(e: Evidence) -> str:
-    return f'deviation {e.best.noise:.2g}; estimator.output_noise_std says ' \
-           f'{e.p.estimator.output_noise_std:.2g}'
 
 
 def _predicted(e: Evidence) -> str:
@@ -90,6 +67,32 @@ def _predicted(e: Evidence) -> str:
 def _m(e: Evidence) -> float:
     return e.fit.estimates['m'][0]
 
+
+# What is said of a subject where nothing is wrong; '' for nothing.
+WELL: Mapping[str, Text] = {
+    'publisher': lambda e: 'one publisher on plant_output',
+    'QoS': lambda e: 'compatible',
+    'listener': lambda e: 'control is subscribed',
+    'rate': lambda e: f'{1.0 / e.timing.period_s:.4g} Hz, a sample every '
+                      f'{e.timing.period_s * 1e3:.4g} ms',
+    'jitter': lambda e: f'{e.timing.lateness:.0%} of a period (98 % of the samples)',
+    'lost samples': lambda e: f'{e.timing.missing} of {e.timing.total} samples',
+    'repeated samples': lambda e: 'none',
+    'clock': lambda e: f'samples arrive {abs(e.age_s) * 1e3:.2g} ms '
+                       f'{"before" if e.age_s < 0.0 else "after"} they left',
+    'values': lambda e: 'all finite',
+    'applied_control': lambda e: '' if not e.heard.applied else 'is published'
+    if e.control is None else 'differs from control, as it may'
+    if e.limited_by else 'agrees with control',
+    'reaction delay':
+        lambda e: f'{e.p.control.delay_samples} samples, as control.delay_samples says',
+    'sign and units': lambda e: f'm is about {_m(e):.4g}, within its bounds',
+    'G(z)': _predicted,
+    'noise on y': lambda e: f'deviation {e.best.noise:.2g}; estimator.output_noise_std says '
+                            f'{e.p.estimator.output_noise_std:.2g}',
+    'backlash': lambda e: ', '.join(
+        f'{name} = {value:.4g} ± {std:.1g}' for name, (value, std) in e.fit.estimates.items()),
+}
 
 REPORT = 'report v just before each y, or set estimator.use_applied_control: false'
 PAST = 'swing v past the gap in both directions, several times; raise --duration'
@@ -116,14 +119,14 @@ FAULTS = (
           'see that plant_output is published without pause; raise --duration',
           (*MESSAGES, *MOTION)),
     Fault('rate', lambda e: not e.timing.fits,
-          lambda e: f'{_rate(e)}; sample_period says {e.p.sample_period * 1e3:g} ms',
+          lambda e: f'{WELL["rate"](e)}; sample_period says {e.p.sample_period * 1e3:g} ms',
           'publish once per sample_period, or set sample_period to what the driver does and give '
           'G(z) for it', MOTION),
     Fault('jitter', lambda e: e.timing.lateness > MOST_LATE,
-          lambda e: f'{e.timing.lateness:.0%} of a period (98 % of the samples)',
+          WELL['jitter'],
           'publish from a timer with absolute deadlines; give the driver a real-time priority'),
     Fault('lost samples',
-          lambda e: e.timing.missing > TROUBLE * (len(e.timing.outputs) + e.timing.missing), _lost,
+          lambda e: e.timing.missing > TROUBLE * e.timing.total, WELL['lost samples'],
           'publish every sample, reliable, without skipping any; on a network, use a cable'),
     Fault('repeated samples', lambda e: e.timing.repeated,
           lambda e: f'{e.timing.repeated} came twice',
@@ -134,7 +137,7 @@ FAULTS = (
     Fault('repeated samples', lambda e: e.sensor_period,
           lambda e: f'y changes every {e.sensor_period * 1e3:.3g} ms only, and repeats between',
           'publish when the sensor has a new value; sample_period is that of the sensor'),
-    Fault('clock', lambda e: abs(e.age_s) > SKEW * e.timing.period_s, _clock,
+    Fault('clock', lambda e: abs(e.age_s) > SKEW * e.timing.period_s, WELL['clock'],
           'synchronise the clocks of both machines (chrony, PTP), or look for a slow network',
           MOTION),
     Fault('values', lambda e: e.implausible, lambda e: f'nan, inf or absurd: {e.implausible}',
@@ -142,8 +145,9 @@ FAULTS = (
     Fault('applied_control', lambda e: not e.heard.applied and _use(e) is ReportUse.ALWAYS,
           lambda e: 'is not published', REPORT),
     Fault('applied_control', lambda e: e.heard.applied and _use(e) is not ReportUse.NEVER
-          and _reported(e) < REPORTED,
-          lambda e: f'comes with {_reported(e):.0%} of the samples', REPORT),
+          and len(e.heard.applied) < REPORTED * len(e.timing.outputs),
+          lambda e: f'comes with {len(e.heard.applied) / len(e.timing.outputs):.0%} of the samples',
+          REPORT),
     Fault('applied_control', lambda e: _use(e) is ReportUse.NEVER and e.limited_by,
           lambda e: f'differs from control by up to {e.limited_by:.3g}',
           'set estimator.use_applied_control: true, or narrow control.min, max, rate_max'),
@@ -171,35 +175,12 @@ FAULTS = (
           'change the sign of y or v in the driver, or of plant.numerator'),
     Fault('sign and units', lambda e: e.outside, lambda e: e.outside,
           'see the units of v, y and G(z) and the zero of v, or widen estimator.bounds'),
-    Fault('noise on y', lambda e: e.noisy, _noise,
+    Fault('noise on y', lambda e: e.noisy, WELL['noise on y'],
           lambda e: f'set estimator.output_noise_std: {e.best.noise:.1e}' + (
               ', or give a more exact G(z): the residual is coloured' if e.coloured else '')),
     Fault('backlash', lambda e: e.fit.doubts,
           lambda e: f'{UNSEEN} {e.swing:.4g}; {"; ".join(e.fit.doubts)}', PAST),
 )
-
-# What is said of a subject where nothing is wrong; '' for nothing.
-WELL: Mapping[str, Text] = {
-    'publisher': lambda e: 'one publisher on plant_output',
-    'QoS': lambda e: 'compatible',
-    'listener': lambda e: 'control is subscribed',
-    'rate': _rate,
-    'jitter': lambda e: f'{e.timing.lateness:.0%} of a period (98 % of the samples)',
-    'lost samples': _lost,
-    'repeated samples': lambda e: 'none',
-    'clock': _clock,
-    'values': lambda e: 'all finite',
-    'applied_control': lambda e: '' if not e.heard.applied else 'is published'
-    if _use(e) is not ReportUse.NEVER or e.control is None else 'agrees with control',
-    'reaction delay':
-        lambda e: f'{e.p.control.delay_samples} samples, as control.delay_samples says',
-    'sign and units': lambda e: f'm is about {_m(e):.4g}, within its bounds',
-    'G(z)': _predicted,
-    'noise on y': _noise,
-    'backlash': lambda e: ', '.join(
-        f'{name} = {value:.4g} ± {std:.1g}' for name, (value, std) in e.fit.estimates.items()),
-}
-
 
 def judge(e: Evidence) -> list[Judgement]:
     """All findings; what a fault hides is said to be unknown."""

@@ -72,6 +72,11 @@ class Timing(NamedTuple):
     lateness: float
     fits: bool
 
+    @property
+    def total(self) -> int:
+        """Samples, missing ones as well."""
+        return len(self.outputs) + self.missing
+
 
 def timing_of(heard: Heard, sample_period_s: float) -> Timing:
     """Sort out what came twice or early, and count the samples; none where they are too few."""

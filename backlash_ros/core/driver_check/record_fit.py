@@ -39,8 +39,8 @@ class RecordFit:
     for another one; both without `delay` [samples]. doubts: why the backlash is not known from this
     record, a sentence each. fit: values and deviations, None where there is no fit, for a G of this
     sign. margins: log-likelihood by which each of the delays that were compared falls behind.
-    predicted: share of the motion of y that it predicts. reversals: of the play output. outliers:
-    samples that were left out. frequencies: between which y moves [rad/sample].
+    predicted: share of the motion of y that it predicts. reversals: of the play output.
+    frequencies: between which y moves [rad/sample].
     """
 
     nominal: TransferFunction
@@ -52,7 +52,6 @@ class RecordFit:
     margins: dict[int, float] = field(default_factory=dict)
     predicted: float = nan
     reversals: int = 0
-    outliers: int = 0
     frequencies: tuple[float, float] = (nan, nan)
 
     @property
@@ -154,7 +153,7 @@ def _with_delay(
     if family.count and fit.behind(np.zeros(family.count)) > 1.0:
         learned = _times(family.model_at(fit.xi), sign)
     result = RecordFit(
-        nominal, learned, fit=fit, sign=sign, outliers=int(wild.sum()),
+        nominal, learned, fit=fit, sign=sign,
         predicted=1.0 - fit.rms / max(float(np.nanstd(record.y)), 1e-300),
         reversals=_reversals(problem.input(fit)[0], fit), frequencies=frequencies_of(record.y),
     )

@@ -91,7 +91,7 @@ def from_messages(
     if record.commands is not None:
         record = replace(record, v=without_origin(record.v, record.commands))
     for topic, (times, _) in sent.items():
-        lost = round((times[-1] - times[0]) / step) + 1 - len(times)
+        lost = np.count_nonzero((t > times[0] - step) & (t <= times[-1])) - len(times)
         # A topic with fewer messages is published on change.
         if TROUBLE < lost / (lost + len(times)) < 0.5:
             notes.append(
