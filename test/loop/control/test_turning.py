@@ -44,8 +44,8 @@ def slow(seconds: float) -> Array:
     return 0.5 * np.sin(0.5 * np.arange(0.0, seconds, PERIOD))
 
 
-@pytest.mark.parametrize('band', [0.0, 1e-3, 1e-2])
-@pytest.mark.parametrize('noise', [0.0, 1e-4, 1e-3, 0.1 * GAP * KNOWN['m']])
+@pytest.mark.parametrize('band', [0.0, 1e-2])
+@pytest.mark.parametrize('noise', [0.0, 1e-4, 0.1 * GAP * KNOWN['m']])
 def test_noise_of_the_reference_does_not_make_v_cross_the_gap(noise: float, band: float) -> None:
     asked = slow(30.0)
     v, error = moved(asked, noise, inverse__direction_band=band)
