@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import hypot, inf, isnan, nan, sqrt
+from math import hypot, isnan, nan, sqrt
 from operator import sub
 
 import numpy as np
@@ -23,10 +23,10 @@ from backlash_ros.core.estimate import Estimate, Status
 TRUSTED_AFTER = 40  # samples for which an estimate has to hold before it gets full feedback
 # An estimate this sharp, in relative deviations of slope and gap, counts so many times per sample.
 SHARP, SHARP_COUNTS = 0.01, 17
-# Standard deviation of what feedback makes of noise, in units of the u that the gap takes, up to
-# which it is as hard as it may be. The band around it within which v does not turn lets a hard loop
-# cycle, and that often; a softer one makes less of the same noise, and cycles slower or not at all.
-NOISE_IN_GAP = 0.1
+# Feedback is as hard as leaves the standard deviation of what it makes of noise below this share of
+# the u that the gap takes, or of what it asks for. The band around noise within which v does not
+# turn lets a hard loop cycle, and often; a softer one makes less of the same noise.
+NOISE_SHARE = 0.1
 
 
 @dataclass
@@ -126,7 +126,9 @@ class StateFeedback:
             trust.slope = estimate.m
         return True
 
-    def begin(self, ideal: float, estimate: Estimate, first: bool) -> None:
+    def begin(
+        self, ideal: float, estimate: Estimate, deviation: Sequence[float], first: bool,
+    ) -> None:
         """Note u* of this sample, the scale of what is allowed, and count it for the estimate.
 
         first: of this loop; an estimate was known before then.
@@ -134,8 +136,7 @@ class StateFeedback:
         trust, gap = self.trust, estimate.c_r - estimate.c_l
         self.state.asked = max(self.state.asked, abs(ideal))
         self._scale = max(self.state.asked, estimate.m * gap)
-        allowed, last = NOISE_IN_GAP * estimate.m * gap if gap else inf, len(self._sizes) - 1
-        self._quiet = next((i for i in range(last) if self._noise_of(i) <= allowed), last)
+        self._quiet = self._hardest(estimate.m * gap, deviation)
         if not (trust.known and estimate.learned):
             # Without deviations nobody knows how far it may be relied on.
             trust.held_for = trust.in_use_for = 0
@@ -204,6 +205,16 @@ class StateFeedback:
         half its noise.
         """
         return max(self._u_std[level], 0.5 * self._noise_std * self._sizes[level])
+
+    def _hardest(self, gap_u: float, deviation: Sequence[float]) -> int:
+        """Level of the hardest gain that noise allows. gap_u: u that the gap takes."""
+        if not gap_u or self._noise_of(0) <= NOISE_SHARE * gap_u:
+            return 0
+        last = len(self._sizes) - 1
+        for i, asked in enumerate((self._gains[:last] @ np.array(deviation)).tolist()):
+            if self._noise_of(i) <= NOISE_SHARE * max(gap_u, abs(asked)):
+                return i
+        return last
 
     @property
     def most(self) -> float:

@@ -147,7 +147,7 @@ class Tracking(ControlStructure):
         self._go_on(estimate, inverse)
         plan = self._plan(y, y_m)
         deviation = feedback.deviation(inputs.x_hat, x_cov, plan.x)
-        feedback.begin(plan.u, estimate, first)
+        feedback.begin(plan.u, estimate, deviation, first)
         turned = self.trajectory.turn(
             max(self._noise_std, self._y_noise.std), inverse.direction_band, crossing)
         correction = feedback.u(deviation, inverse.limited or inverse.taking_up)
