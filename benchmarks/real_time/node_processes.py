@@ -59,8 +59,8 @@ def wait_for_event(
     """Time at which an event of this kind and process came [s]."""
     deadline = time.monotonic() + patience_s
     while time.monotonic() < deadline:
-        for event in supervisor.events(0.1):
-            if wanted(event.kind, event.plan.name):
+        for plan, event in supervisor.events(0.1):
+            if wanted(event['event'], plan.name):
                 return time.perf_counter()
         check_running(supervisor)
     raise RuntimeError('the nodes did not come to an end in time')
@@ -68,5 +68,6 @@ def wait_for_event(
 
 def check_running(supervisor: ProcessSupervisor) -> None:
     """Raise RuntimeError if a process has ended."""
-    for child in supervisor.ended():
-        raise RuntimeError(f'{child.plan.name} ended: {child.end_of_log()}')
+    for child in supervisor.children:
+        if child.has_ended:
+            raise RuntimeError(f'{child.plan.name} ended: {child.end_of_log()}')

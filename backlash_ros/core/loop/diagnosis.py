@@ -322,7 +322,9 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
     y, status, share = f.output, f.status, 100.0 * f.law.unexplained
     # Neither rate nor lateness turns a sign.
     held = status == Status.INCONSISTENT and not f.law.wrong_sign
-    late = not causes.isdisjoint(LATE_KINDS) and f.inconsistent_s < PATIENCE_S
+    # Where a tenth is late or lost nobody can tell what else is wrong.
+    many = f.late + f.lost > 0.1 * (f.heard + f.lost)
+    late = not causes.isdisjoint(LATE_KINDS) and (many or f.inconsistent_s < PATIENCE_S)
     return (
         ('held', WARN, held and 'rate' in causes,
          f'{y} does not follow from v at this rate: estimates held'),

@@ -162,6 +162,12 @@ def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
     assert findings_of(replace(WELL, **changes)) == [LEARNED]
 
 
+@pytest.mark.parametrize(('late', 'kinds'), [(20, ['model', 'late']), (90, ['late', 'held'])])
+def test_the_model_is_not_blamed_where_a_tenth_of_the_commands_is_late(late, kinds) -> None:
+    figures = replace(INCONSISTENT, late=late, inconsistent_s=60.0)
+    assert [finding.kind for finding in findings_of(figures)] == kinds
+
+
 def test_what_the_fit_has_found_goes_before_what_may_be_missing() -> None:
     for known in ({'law': LawReport(wrong_sign=True)}, {'law': LawReport(unexplained=0.2)}):
         figures = replace(INCONSISTENT, unreported=30, inconsistent_s=10.0, **known)
