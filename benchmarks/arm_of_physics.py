@@ -16,8 +16,6 @@ import argparse
 import os
 import sys
 import tempfile
-from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -121,10 +119,9 @@ def move(p: Parameters, passes: int) -> Motion:
     """The arm with these loops on so many periods of the trajectory."""
     arm, period_s, now_ns = ArmPhysics(), p.sample_period, 0
     v = dict.fromkeys(NAMES, 0.0)
-    reports: dict[str, deque[tuple[float, int]]] = {name: deque() for name in NAMES}
     before = known_before if p.estimates.load else first_guess
     loops = JointLoops(
-        p, v.update, lambda name: Driver(lambda: now_ns, lambda: emptied(reports[name])),
+        p, v.update, lambda name: Driver(lambda: now_ns),
         {name: before(p.of_joint(name)) for name in NAMES}, SampleCounter(period_s), dict(v),
     )
     references, positions, gaps, poses = [], [], [], []
@@ -144,7 +141,7 @@ def move(p: Parameters, passes: int) -> Motion:
             loop.core.refine()
         goals = [in_steps(v[name]) for name in NAMES]
         for name, goal in zip(NAMES, goals, strict=True):
-            reports[name].append((goal, now_ns + round(period_s * 1e9)))
+            loops.by_name[name].take_applied(goal, now_ns + round(period_s * 1e9))
         arm.move_to(goals)
         arm.advance(period_s)
     delays = [loop.core.structure.delay for loop in loops.by_name.values()]
@@ -159,12 +156,6 @@ def move(p: Parameters, passes: int) -> Motion:
 def in_steps(v: float) -> float:
     """A command as the servos take it [rad]."""
     return RESOLUTION * round(v / RESOLUTION)
-
-
-def emptied(reports: deque[tuple[float, int]]) -> Iterator[tuple[float, int]]:
-    """What has been reported since the last time."""
-    while reports:
-        yield reports.popleft()
 
 
 def rms(values: Array) -> Array:

@@ -92,7 +92,7 @@ class ControllerNode(ManagedNode):
         self._io = DriverIo(self, p)
         if not p.lockstep:
             # The first command begins with what the driver reports, even if it is not learned from.
-            self._io.listen_to_reports()
+            self._io.listen_to_reports(self._on_report)
         # Whoever waits for the others begins with them; who does not may have been restarted.
         self._counter = SampleCounter(
             p.sample_period, from_zero=not p.lockstep and p.wait_for_subscribers > 0
@@ -288,6 +288,11 @@ class ControllerNode(ManagedNode):
             self._pairs.references.append(self.loops.by_name[''].heard.y_m)
             self._answer_pairs()
 
+    def _on_report(self, applied: Mapping[str, float], stamp_ns: int) -> None:
+        if self.loops is not None:
+            for joint, v in applied.items():
+                self.loops.by_name[joint].take_applied(v, stamp_ns)
+
     def _on_clock(self, message: Clock) -> None:
         self._pairs.ticks.append(stamp_ns_of(message))
         self._answer_pairs()
@@ -300,7 +305,7 @@ class ControllerNode(ManagedNode):
             self._pairs.outputs.append(outputs[''])
             self._answer_pairs()
         elif self._knows_rivals() or not any(loop.begins for loop in loops.loops):
-            self._io.take_references()
+            self._io.serve_waiting()
             steps = loops.answer(outputs)
             if steps:
                 os.sched_yield()  # to the driver, which the command has woken
@@ -364,7 +369,7 @@ class ControllerNode(ManagedNode):
         loops = self.loops
         if loops is None or not self.active:
             return
-        self._io.take_references()
+        self._io.serve_waiting()
         for joint in self.joints:
             joint.save_now_and_then()
         if loops.give_up_silent():

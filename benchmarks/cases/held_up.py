@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Iterator
 from math import inf
 from pathlib import Path
 from random import Random
@@ -61,11 +60,11 @@ class HeldUpProcesses:
     def __init__(self, p: Parameters, load: float, seed: int, reports: bool) -> None:
         self.period = p.sample_period
         self._load, self._random = load, Random(seed)
-        self._reports: deque[tuple[float, int]] | None = deque() if reports else None
+        self._reports = reports
         self._now = 0.0
         self._sent = 0.0  # the newest command
         self.loop = ControlLoop(
-            p, self._send, Driver(lambda: _ns(self._now), self._new_reports), None,
+            p, self._send, Driver(lambda: _ns(self._now)), None,
             SampleCounter(self.period, False),
         )
         self._reference = build_reference(p)
@@ -108,8 +107,8 @@ class HeldUpProcesses:
         """A turn of the driver: the timer first, then the newest command."""
         if self._now >= self._due:
             y = motor.load_encoder()
-            if self._reports is not None:
-                self._reports.append((motor.motor_encoder(), _ns(self._now)))
+            if self._reports:
+                self.loop.take_applied(motor.motor_encoder(), _ns(self._now))
             self._now += CALL_S
             self._number += 1
             arrives = self._now + self._random.uniform(*TRANSPORT_S)
@@ -147,10 +146,6 @@ class HeldUpProcesses:
 
     def _send(self, v: float) -> None:
         self._sent = v
-
-    def _new_reports(self) -> Iterator[tuple[float, int]]:
-        while self._reports:
-            yield self._reports.popleft()
 
 
 def _ns(seconds: float) -> int:

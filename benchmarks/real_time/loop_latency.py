@@ -38,7 +38,7 @@ RATES_HZ = (100.0, 1000.0)
 BLOCK, SETTLE = 50, 10  # samples of a block, and how many of them at its start do not count
 WARM_UP_S = 3.0  # acquisition is not counted either
 PATIENCE_S = 0.2  # for an answer
-LATENCY_LIMITS = {0.5: 1.05, 0.99: 1.3}  # times the echo, by quantile
+LATENCY_LIMITS = {0.5: 1.0, 0.99: 1.2}  # times the echo, by quantile
 LOCKSTEP_SAMPLES = 3000
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import isfinite, nan
 from typing import NamedTuple
@@ -30,13 +30,11 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 class Driver(NamedTuple):
     """What a loop can ask about its driver.
 
-    now_ns: the clock of the stamps. reports: v and stamp [ns] of what it has reported since the
-    last call. may_report: whether it may yet say which v acts. applied: the name of these reports.
-    warn: tells the user. steady_s: a clock that nobody sets [s].
+    now_ns: the clock of the stamps. may_report: whether it may yet say which v acts. applied: the
+    name of these reports. warn: tells the user. steady_s: a clock that nobody sets [s].
     """
 
     now_ns: Callable[[], int]
-    reports: Callable[[], Iterable[tuple[float, int]]] = tuple
     may_report: Callable[[], bool] = lambda: False
     applied: str = 'applied_control'
     warn: Callable[[str], object] = lambda text: None
@@ -197,8 +195,6 @@ class ControlLoop:
         if plausible(output.y):
             self.heard.y_at = self._driver.steady_s()
             if plausible(y_m):
-                for v, stamp_ns in self._driver.reports():
-                    self.take_applied(v, stamp_ns)
                 return self._may_answer(output)
             statistics.without_reference += 1
         else:

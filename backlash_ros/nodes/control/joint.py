@@ -68,8 +68,8 @@ class Joint:
             warned.add(text)
 
         return Driver(
-            io.now_ns, lambda: io.reports_of(self.name),
-            lambda: io.has_reports and not io.is_simulated, io.topics.applied, warn_once,
+            io.now_ns, lambda: io.has_reports and not io.is_simulated, io.topics.applied,
+            warn_once,
         )
 
     def begin(self, loop: ControlLoop, before: Estimate) -> None:

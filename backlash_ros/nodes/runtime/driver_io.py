@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from math import nan
 from typing import Any, NamedTuple
 
@@ -122,9 +121,6 @@ class DriverIo:
         self._newest: dict[str, float] = {}  # v by joint
         self._referred = JointState()  # the newest message of references
         self._heard: dict[str, Subscription] = {}  # by what they are about
-        self._reported: dict[str, deque[tuple[float, int]]] = {
-            joint: deque(maxlen=KEPT_COMMANDS) for joint in p.joint_names
-        }
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -195,7 +191,7 @@ class DriverIo:
     def listen_to_references(
         self, hear: Callable[[Mapping[str, float]], None], qos: QoSProfile | int, polled: bool,
     ) -> None:
-        """Call hear with every y_m. polled: when take_references is called."""
+        """Call hear with every y_m. polled: when serve_waiting is called."""
         def hear_number(message: bytes, info: dict[str, Any]) -> None:
             hear({'': number_of(message)})
 
@@ -214,9 +210,10 @@ class DriverIo:
         """How y_m is listened to."""
         return self._heard['references'].qos_profile
 
-    def take_references(self) -> None:
-        """Serve the polled references."""
-        serve_polled(self._heard['references'])
+    def serve_waiting(self) -> None:
+        """Hear the references and reports that have come; not in lockstep, where nothing waits."""
+        for subscription in self._heard.values():
+            serve_polled(subscription)
 
     def listen_to_commands(self, hear: Callable[[Mapping[str, float]], None]) -> Subscription:
         """Call hear with every v that anybody sends to the driver."""
@@ -272,15 +269,16 @@ class DriverIo:
                 setattr(message, field, [passed[row[name]] for name in names])
         return message
 
-    def listen_to_reports(self) -> None:
-        """Keep what the driver reports to have applied until somebody asks for it."""
-        def hear(message: Float64 | JointState, info: dict[str, Any]) -> None:
-            stamp_ns = self.stamp_ns(info)
-            for joint, v in self.values(message).items():
-                self._reported[joint].append((v, stamp_ns))
+    def listen_to_reports(self, hear: Callable[[Mapping[str, float], int], None]) -> None:
+        """Call hear with each v that the driver reports to have applied, and its stamp [ns].
+
+        That is when serve_waiting is called.
+        """
+        def hear_values(message: Float64 | JointState, info: dict[str, Any]) -> None:
+            hear(self.values(message), self.stamp_ns(info))
 
         self._heard['reports'] = self._node.listen(
-            self.topics.applied_type, self.topics.applied, hear, KEPT_COMMANDS, polled=True
+            self.topics.applied_type, self.topics.applied, hear_values, KEPT_COMMANDS, polled=True
         )
 
     @property
@@ -288,10 +286,3 @@ class DriverIo:
         """Whether the driver reports what it has applied."""
         reports = self._heard.get('reports')
         return reports is not None and reports.get_publisher_count() > 0
-
-    def reports_of(self, joint: str) -> Iterator[tuple[float, int]]:
-        """v and stamp [ns] of what the driver has reported of a joint since the last call."""
-        if 'reports' in self._heard:
-            serve_polled(self._heard['reports'])
-        while self._reported[joint]:
-            yield self._reported[joint].popleft()
