@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from backlash_ros.core.jobs.executor import Samples
+from backlash_ros.core.jobs.executor import ChannelSamples
 
 
-def checksum(samples: Samples, factor: float) -> tuple[int, int, float]:
+def checksum(samples: ChannelSamples, factor: float) -> tuple[int, int, float]:
     """Which samples there are, and a number that depends on all of them and their order."""
     first, columns = samples
     weights = np.arange(1.0, columns.shape[1] + 1.0)

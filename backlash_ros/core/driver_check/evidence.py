@@ -22,7 +22,7 @@ from backlash_ros.core.driver_check.heard import (
     timing_of,
 )
 from backlash_ros.core.driver_check.record_fit import RecordFit, fit_record
-from backlash_ros.core.estimation.posterior import Fit
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.loop.command_history import ReportUse, report_use, v_of_intervals
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -142,7 +142,7 @@ class Evidence:
         return self._fitted(model, range(expected + MORE_DELAY + 1))
 
     @property
-    def best(self) -> Fit:
+    def best(self) -> WindowFit:
         """The values of the fit, where there is one."""
         assert self.fit.fit is not None
         return self.fit.fit

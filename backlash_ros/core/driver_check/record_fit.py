@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Bounds
 from backlash_ros.core.estimation.explanations import (
     SMALLEST_NOISE,
-    Record,
     Setup,
+    Window,
     afresh,
     outside_bounds,
     problem_of,
 )
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.posterior import Fit
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.settings import REVERSALS, STD_GAP, STD_SLOPE
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
@@ -46,7 +46,7 @@ class RecordFit:
     nominal: TransferFunction
     model: TransferFunction
     doubts: tuple[str, ...] = ()
-    fit: Fit | None = None
+    fit: WindowFit | None = None
     sign: float = 1.0
     delay: int = 0
     margins: dict[int, float] = field(default_factory=dict)
@@ -134,7 +134,7 @@ def _with_delay(
 ) -> RecordFit | None:
     """Fit v (N,) and y (N,) after it; None where a constant u explains y as well."""
     noise_std, wide = max(noise_std, SMALLEST_NOISE), (-1e300, 1e300)
-    record = Record(0, v, y, np.full(len(v), nan))
+    record = Window(0, v, y, np.full(len(v), nan))
     for sign in (1.0, -1.0):
         family = PlantFamily(_times(nominal, sign), uncertainty)
         setup = Setup(family, noise_std, Bounds((1e-300, 1e300), wide, wide), inf,
@@ -160,7 +160,7 @@ def _with_delay(
     return replace(result, doubts=tuple(_doubts(result, fit, bounds, float(np.ptp(v)))))
 
 
-def _reversals(p: Array, fit: Fit) -> int:
+def _reversals(p: Array, fit: WindowFit) -> int:
     """How often the play output p (N,) turned by more than the gap is uncertain.
 
     A side that is engaged without moving the play output, as one at the very start may be, tells
@@ -174,7 +174,7 @@ def _reversals(p: Array, fit: Fit) -> int:
     return int(np.count_nonzero(np.diff(np.sign(ways))))
 
 
-def _doubts(found: RecordFit, fit: Fit, bounds: Bounds | None, swing: float) -> list[str]:
+def _doubts(found: RecordFit, fit: WindowFit, bounds: Bounds | None, swing: float) -> list[str]:
     """What keeps it from being precise enough for the loop."""
     wanted = REVERSALS if len(fit.xi) else 1
     rest = f': {fit.unexplained:.0%} of its motion follows from no backlash and no G' \

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.explanations import (
-    Record,
     Setup,
+    Window,
     agree,
     is_known,
     moves_unexplained,
@@ -22,7 +22,7 @@ from backlash_ros.core.estimation.explanations import (
 )
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.play import NEITHER, RIGHT, engaged, reversals
-from backlash_ros.core.estimation.posterior import Fit, Prior, Start
+from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
 
 Array = NDArray[np.float64]
 
@@ -59,15 +59,15 @@ class Belief:
 
     state: State = State.SEARCHING
     reason: Status = Status.ACQUIRING
-    fit: Fit | None = None
+    fit: WindowFit | None = None
     first: int = 0
     end: int = 0
     next_at: int = settings.FIRST_FIT
     thorough_at: int = 0
     older: Prior | None = None
     start: Start | None = None
-    candidate: Fit | None = None
-    tried: Fit | None = None
+    candidate: WindowFit | None = None
+    tried: WindowFit | None = None
     doubt_from: int | None = None
     predicted: int = 0
     must_predict: int = 0
@@ -100,7 +100,7 @@ class Belief:
             return settings.PREDICTED
         return min(2 * self.must_predict, settings.MOST_PREDICTED)
 
-    def problem(self, setup: Setup, record: Record) -> Problem:
+    def problem(self, setup: Setup, record: Window) -> Problem:
         """The fit of a record beside what is believed of the samples before it."""
         walk_std = self.fit.walk_std if self.fit is not None else 0.0
         return problem_of(setup, record, self.older, self.start, walk_std=walk_std)
@@ -125,7 +125,7 @@ def published(setup: Setup, belief: Belief) -> Belief:
     return replace(belief, published=fit.crossings, cov=cov, reason=Status.TRACKING)
 
 
-def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) -> Belief:
+def _beside_inherited(setup: Setup, belief: Belief, fit: WindowFit, known: Inherited) -> Belief:
     """The same where something was known before the run.
 
     What the samples leave unexplained may be gap as well, and the lost motion of a gear differs
@@ -161,7 +161,7 @@ def _beside_inherited(setup: Setup, belief: Belief, fit: Fit, known: Inherited) 
 # --- what older samples leave -------------------------------------------------------------------
 
 
-def excess(setup: Setup, record: Record, problem: Problem, fit: Fit) -> int:
+def excess(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> int:
     """How many of the oldest samples may go: the others hold enough reversals.
 
     Those over which the backlash drifts by more than it is known have to go as well.
@@ -181,7 +181,7 @@ def excess(setup: Setup, record: Record, problem: Problem, fit: Fit) -> int:
     return cut if cut >= count // 6 else 0
 
 
-def shortened(setup: Setup, record: Record, belief: Belief, cut: int) -> Belief:
+def shortened(setup: Setup, record: Window, belief: Belief, cut: int) -> Belief:
     """Let the oldest samples go; what they say of theta stays, discounted as they were."""
     fit = belief.fit
     assert fit is not None
@@ -212,7 +212,7 @@ def shortened(setup: Setup, record: Record, belief: Belief, cut: int) -> Belief:
     )
 
 
-def _drifted(setup: Setup, fit: Fit, prior: Prior, samples: int) -> Prior | None:
+def _drifted(setup: Setup, fit: WindowFit, prior: Prior, samples: int) -> Prior | None:
     """What is left of a prior after so many samples of drift; None where it says too little."""
     if not setup.drift.any():
         return prior

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.fit import Problem
-from backlash_ros.core.estimation.posterior import Fit
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
 
-def coasts(problem: Problem, fit: Fit, known: Array | None = None) -> bool:
+def coasts(problem: Problem, fit: WindowFit, known: Array | None = None) -> bool:
     """Whether the load runs on within the gap: that of the fit, or the one known before.
 
     known: m, c_r, c_l (3,). The fit of a load that coasts may have next to no gap.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.belief import Belief, Inherited
-from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Record, Setup
+from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Setup, Window
 from backlash_ros.core.estimation.learning import learn
 from backlash_ros.core.estimation.observer import Following, Gains, Place, gains_of, place_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
@@ -30,7 +30,7 @@ from backlash_ros.core.estimation.settings import (
     HELD_REVERSALS,
     LONGEST,
 )
-from backlash_ros.core.jobs.executor import Executor, Failure, Samples
+from backlash_ros.core.jobs.executor import ChannelSamples, Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash
 from backlash_ros.core.parameters import Parameters
@@ -64,7 +64,7 @@ class Fitted(NamedTuple):
 
 
 def fitted(
-    samples: Samples, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
+    samples: ChannelSamples, setup: Setup, before: Belief, model: TransferFunction, proposed: Array,
     with_gains: bool,
 ) -> Fitted:
     """What is believed with these samples: the job that is done beside the loop.
@@ -72,7 +72,7 @@ def fitted(
     model: the G whose state the structure wants. proposed: xi (K,) of the newest proposal.
     with_gains: whether the gains of the observer of `model` are wanted.
     """
-    record = Record(samples.first, *samples.columns).swapped(before.swapped)
+    record = Window(samples.first, *samples.columns).swapped(before.swapped)
     belief = learn(setup, record.between(max(before.first, record.end - LONGEST)), before)
     fit = belief.fit
     if fit is None or belief.published is None:

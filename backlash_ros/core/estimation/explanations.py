@@ -15,7 +15,7 @@ from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS, Problem
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.play import engaged, play, reversals
-from backlash_ros.core.estimation.posterior import Fit, Prior, Start
+from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
 from backlash_ros.core.estimation.search import search
 
 Array = NDArray[np.float64]
@@ -42,7 +42,7 @@ class Setup:
     drift: Array
 
 
-class Record(NamedTuple):
+class Window(NamedTuple):
     """Samples from number `first` on: v that acted, y after it (nan: lost), v that may have acted
     instead (nan: none), all (N,)."""
 
@@ -56,17 +56,17 @@ class Record(NamedTuple):
         """Number of the sample after the last one."""
         return self.first + len(self.v)
 
-    def between(self, first: int, end: int | None = None) -> Record:
+    def between(self, first: int, end: int | None = None) -> Window:
         """The samples from one number to before another."""
         begin = max(first - self.first, 0)
         part = slice(begin, None if end is None else max(end - self.first, 0))
-        return Record(self.first + begin, self.v[part], self.y[part], self.other[part])
+        return Window(self.first + begin, self.v[part], self.y[part], self.other[part])
 
     def places(self, numbers: frozenset[int]) -> list[int]:
         """Where samples of these numbers stand."""
         return [k - self.first for k in numbers if self.first <= k < self.end]
 
-    def swapped(self, numbers: frozenset[int]) -> Record:
+    def swapped(self, numbers: frozenset[int]) -> Window:
         """The same where the other command acted over the intervals of these samples."""
         places = self.places(numbers)
         if not places:
@@ -75,7 +75,7 @@ class Record(NamedTuple):
         v[places], other[places] = self.other[places], self.v[places]
         return self._replace(v=v, other=other)
 
-    def without(self, numbers: frozenset[int]) -> Record:
+    def without(self, numbers: frozenset[int]) -> Window:
         """The same without these readings."""
         places = self.places(numbers)
         if not places:
@@ -86,7 +86,7 @@ class Record(NamedTuple):
 
 
 def problem_of(
-    setup: Setup, record: Record, older: Prior | None = None, start: Start | None = None,
+    setup: Setup, record: Window, older: Prior | None = None, start: Start | None = None,
     most_scale: float = inf, walk_std: float = 0.0,
 ) -> Problem:
     """The fit of a record by this setup."""
@@ -95,9 +95,9 @@ def problem_of(
 
 
 def afresh(
-    setup: Setup, record: Record, like: Fit | None = None, also: Fit | None = None,
+    setup: Setup, record: Window, like: WindowFit | None = None, also: WindowFit | None = None,
     walks: bool = False,
-) -> Fit | None:
+) -> WindowFit | None:
     """The best fit from nothing, mixed with other gaps that fit about as well; None for none.
 
     like: G is that of this fit, as well as that knows it. also: where to begin as well. walks:
@@ -113,7 +113,7 @@ def afresh(
     xi = np.zeros(family.count) if like is None else like.theta[3:]
     candidates, apart = 3, 0.1  # gaps of a search that are fitted, and their relative distance
     hopeless = not may_be_known(setup, record.v)  # whatever is found: to be named, not to be used
-    fits: list[Fit] = []
+    fits: list[WindowFit] = []
     # Once more around G as the best of the first gaps has it.
     rounds = 2 if family.count and like is None and not hopeless else 1
     for last in (False, True)[2 - rounds:]:
@@ -127,7 +127,7 @@ def afresh(
             if m * found[0].m > 0.0 and all(abs(gap - other) > apart * other for other in gaps):
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
-                start = p.step(Fit(np.zeros(1), p0, theta, noise), 1.0, held=True)
+                start = p.step(WindowFit(np.zeros(1), p0, theta, noise), 1.0, held=True)
                 fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
         xi = max(fits, key=lambda f: f.evidence).theta[3:]
     if not fits:
@@ -149,9 +149,9 @@ def afresh(
     return with_walk(setup, p, best) if walks else best
 
 
-def _different(fits: list[Fit]) -> list[Fit]:
+def _different(fits: list[WindowFit]) -> list[WindowFit]:
     """Fits without those that have come to the same gap as a likelier one."""
-    out: list[Fit] = []
+    out: list[WindowFit] = []
     for f in sorted(fits, key=lambda f: -f.evidence):
         same = (abs(f.gap - g.gap) < 0.1 * sqrt(max(float(g.cov[2, 2]), 0.0)) for g in out)
         if not any(same):
@@ -159,7 +159,7 @@ def _different(fits: list[Fit]) -> list[Fit]:
     return out
 
 
-def with_intervals(p: Problem, f: Fit) -> Fit:
+def with_intervals(p: Problem, f: WindowFit) -> WindowFit:
     """The finished fit, by intervals where readings have a step that the noise does not hide.
 
     The noise beside the rounding is the likeliest of a grid, but as large as leaves three
@@ -172,7 +172,7 @@ def with_intervals(p: Problem, f: Fit) -> Fit:
     if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
         return p.finished(f)
 
-    def at(level: float, begin: Fit) -> Fit:
+    def at(level: float, begin: WindowFit) -> WindowFit:
         return p.finished(p.fitted(replace(begin, step=step, noise_std=level), FEW_STEPS))
 
     first = max(min(f.noise_std if f.step else largest, largest), least)
@@ -190,7 +190,7 @@ def with_intervals(p: Problem, f: Fit) -> Fit:
     return p.finished(p.fitted(f.without_intervals))
 
 
-def with_walk(setup: Setup, p: Problem, f: Fit) -> Fit:
+def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
     """The fit, or one where u walks as well if that explains why residuals are correlated.
 
     One that walks already is compared with one that does not in the same way; a walk that is
@@ -215,7 +215,7 @@ def with_walk(setup: Setup, p: Problem, f: Fit) -> Fit:
     return best
 
 
-def _begun_elsewhere(p: Problem, f: Fit) -> Fit:
+def _begun_elsewhere(p: Problem, f: WindowFit) -> WindowFit:
     """The fit, or one with another beginning: y has a minimum wherever v has turned meanwhile."""
     beginnings = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
     likeliest, value = f, p.log_posterior(f) + 1.0
@@ -229,7 +229,7 @@ def _begun_elsewhere(p: Problem, f: Fit) -> Fit:
     return f if likeliest is f else p.finished(p.fitted(likeliest))
 
 
-def spread(p: Problem, best: Fit, others: Sequence[Fit] = ()) -> Array:
+def spread(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Array:
     """What the covariance of m, c_r, c_l lacks around the best fit (3, 3).
 
     That is the mixture with other fits, and what the readings leave open along the gap, all else
@@ -267,7 +267,7 @@ def spread(p: Problem, best: Fit, others: Sequence[Fit] = ()) -> Array:
     return out
 
 
-def of_xi(f: Fit) -> Prior | None:
+def of_xi(f: WindowFit) -> Prior | None:
     """What a fit knows of xi alone, as rows on theta."""
     count = len(f.theta) - 3
     if not count:
@@ -289,7 +289,7 @@ def _turns_needed(setup: Setup) -> int:
     return settings.REVERSALS if setup.family.count else 1
 
 
-def is_known(setup: Setup, f: Fit, turns: int) -> bool:
+def is_known(setup: Setup, f: WindowFit, turns: int) -> bool:
     """Whether m and the gap are known well enough to be published.
 
     turns: reversals of the engaged side that speak for it. While residuals are correlated the
@@ -308,17 +308,17 @@ def is_known(setup: Setup, f: Fit, turns: int) -> bool:
     return std_m < factor * settings.STD_SLOPE * f.m and (gap_known or no_gap)
 
 
-def moves_unexplained(setup: Setup, f: Fit) -> bool:
+def moves_unexplained(setup: Setup, f: WindowFit) -> bool:
     """Whether y moves by more than is tolerated in a way that no G makes, where G is uncertain."""
     return f.systematic and f.unexplained > settings.UNEXPLAINED and setup.family.count > 0
 
 
-def noisier(setup: Setup, f: Fit) -> bool:
+def noisier(setup: Setup, f: WindowFit) -> bool:
     """Whether readings are off by more than their configured noise, or their step, makes them."""
     return f.noise > settings.AS_GOOD * max(setup.noise_std, f.step / sqrt(12.0))
 
 
-def outside_bounds(bounds: Bounds, f: Fit) -> list[bool]:
+def outside_bounds(bounds: Bounds, f: WindowFit) -> list[bool]:
     """Whether m, c_r, c_l lie outside of their bounds by more than chance."""
     values = f.crossings
     apart = np.abs(values - bounds.project(*values.tolist()))
@@ -335,7 +335,7 @@ def agree(one: Array, other: Array, cov: Array) -> bool:
     return squares < float(chdtri(len(one), settings.CHANCE))
 
 
-def alike(one: Fit, other: Fit) -> bool:
+def alike(one: WindowFit, other: WindowFit) -> bool:
     """Whether the backlashes of two fits differ by chance."""
     return agree(one.crossings, other.crossings, one.crossings_cov + other.crossings_cov)
 

@@ -37,9 +37,9 @@ from backlash_ros.core.estimation.play import (
 )
 from backlash_ros.core.estimation.posterior import (
     LEAST_SCALE,
-    Fit,
     Prior,
     Start,
+    WindowFit,
     error_of_plant,
 )
 from backlash_ros.core.estimation.reading import Likelihood, independence, likelihood, step_of
@@ -54,7 +54,7 @@ STEPS, FIRST_STEPS, FEW_STEPS = 16, 6, 3  # of Gauss-Newton, at most
 class _Evaluated:
     """What a record is by the values of a fit: G as b / a, p, u and y (N,), and what was asked."""
 
-    fit: Fit
+    fit: WindowFit
     b: list[float]
     a: list[float]
     p: Array
@@ -101,16 +101,16 @@ class Problem:
 
     # --- the model -----------------------------------------------------------------------------
 
-    def input(self, f: Fit) -> tuple[Array, Array]:
+    def input(self, f: WindowFit) -> tuple[Array, Array]:
         """p and u = m p - o + d over the record, both (N,)."""
         evaluated = self._evaluated(f)
         return evaluated.p, evaluated.u
 
-    def output(self, f: Fit) -> Array:
+    def output(self, f: WindowFit) -> Array:
         """y that is expected (N,)."""
         return self._evaluated(f).y
 
-    def _evaluated(self, f: Fit) -> _Evaluated:
+    def _evaluated(self, f: WindowFit) -> _Evaluated:
         for one in self._newest:
             if (f.x is one.fit.x and f.theta is one.fit.theta and f.knots is one.fit.knots
                     and f.p0 == one.fit.p0):
@@ -124,21 +124,21 @@ class Problem:
         self._newest = [one, *self._newest[:2]]
         return one
 
-    def residual(self, f: Fit) -> Array:
+    def residual(self, f: WindowFit) -> Array:
         """y minus what is expected (N,), nan where it was lost."""
         return np.where(self.known, self.y - self.output(f), np.nan)
 
-    def weights(self, f: Fit) -> Array:
+    def weights(self, f: WindowFit) -> Array:
         """How much of an independent reading each one is where y is as f has it (N,)."""
         return self._independent(f)[0]
 
-    def _independent(self, f: Fit) -> tuple[Array, NDArray[np.intp]]:
+    def _independent(self, f: WindowFit) -> tuple[Array, NDArray[np.intp]]:
         one = self._evaluated(f)
         if one.independent is None:
             one.independent = independence(self.y, self.known, one.y, self.step_of_readings)
         return one.independent
 
-    def _likelihood(self, f: Fit) -> Likelihood:
+    def _likelihood(self, f: WindowFit) -> Likelihood:
         one, how = self._evaluated(f), (f.noise_std, f.step)
         if how not in one.likelihoods:
             found = likelihood(self.y - one.y, *how)
@@ -147,7 +147,7 @@ class Problem:
             one.likelihoods[how] = found._replace(log_density=density)
         return one.likelihoods[how]
 
-    def log_posterior(self, f: Fit, w: Array | None = None) -> float:
+    def log_posterior(self, f: WindowFit, w: Array | None = None) -> float:
         """Of these values but for constants; -inf where it is no number.
 
         w: weights of the readings (N,), the same for all that are compared; None: those of f.
@@ -175,8 +175,8 @@ class Problem:
     # --- a Gauss-Newton step --------------------------------------------------------------------
 
     def step(
-        self, f: Fit, most_scale: float = np.inf, held: bool = False, begun: bool = False,
-    ) -> Fit:
+        self, f: WindowFit, most_scale: float = np.inf, held: bool = False, begun: bool = False,
+    ) -> WindowFit:
         """The values that the linearization around f makes likeliest, with their posterior.
 
         held: whether the gap stays, so that all else fits it; begun: whether the beginning does.
@@ -204,10 +204,10 @@ class Problem:
             min(most_scale, self.most_scale)
         )
 
-    def _knots_of(self, f: Fit) -> Array:
+    def _knots_of(self, f: WindowFit) -> Array:
         return f.knots if len(f.knots) == len(self._hats) else np.zeros(len(self._hats))
 
-    def jacobian(self, f: Fit, out: Array | None = None) -> Array:
+    def jacobian(self, f: WindowFit, out: Array | None = None) -> Array:
         """Derivatives of y by X, knots, p0, m, o, g, xi: (N, P); out: where they are written."""
         one = self._evaluated(f)
         b, a = one.b, one.a
@@ -236,7 +236,7 @@ class Problem:
             out[:, at:] = np.tensordot(late, slopes, ((0, 1), (1, 2)))
         return out
 
-    def _beside(self, f: Fit, size: int, held: bool, begun: bool) -> list[Array]:
+    def _beside(self, f: WindowFit, size: int, held: bool, begun: bool) -> list[Array]:
         """Rows of what is known beside the samples, and what gap and beginning are held at."""
         vague = 100.0  # prior deviation of the state before a record, over the largest reading
         tight = 1e6  # weight of a beginning that is known
@@ -271,7 +271,9 @@ class Problem:
             rows.append(walks / self._knot_std)
         return rows
 
-    def _solved(self, f: Fit, r: Array, order: int, count: float, most_scale: float) -> Fit:
+    def _solved(
+        self, f: WindowFit, r: Array, order: int, count: float, most_scale: float,
+    ) -> WindowFit:
         """Means and covariance from the triangle r (P+1, P+1), the target in its last column."""
         size = r.shape[1] - 1
         k = self.family.count - self.family.leaks
@@ -304,7 +306,7 @@ class Problem:
 
     # --- the fit --------------------------------------------------------------------------------
 
-    def fitted(self, f: Fit, steps: int = STEPS) -> Fit:
+    def fitted(self, f: WindowFit, steps: int = STEPS) -> WindowFit:
         """Gauss-Newton steps from f until they move nothing, halved where they go too far."""
         least_move = 0.02  # deviations of the gap that a step may still move it by at the end
         far_steps = 4  # the first of them, over which G is no further off than configured
@@ -334,8 +336,8 @@ class Problem:
         return f
 
     def _stepped(
-        self, f: Fit, best: float, weights: Array, most_scale: float, begun: bool = False,
-    ) -> tuple[Fit, Fit, float]:
+        self, f: WindowFit, best: float, weights: Array, most_scale: float, begun: bool = False,
+    ) -> tuple[WindowFit, WindowFit, float]:
         """What a step leads to, where it goes as far as that helps, and its log-posterior."""
         shortest_step = 0.05  # share of a Gauss-Newton step that is tried
         new = self.kept(self.step(f, most_scale, begun=begun))
@@ -354,7 +356,7 @@ class Problem:
             value = self.log_posterior(there, weights)
         return new, there, value
 
-    def kept(self, f: Fit) -> Fit:
+    def kept(self, f: WindowFit) -> WindowFit:
         """The same with its gap and its beginning where they can be."""
         gap = min(max(f.gap, 0.0), 2.0 * float(np.ptp(self.v)))
         theta = np.concatenate([f.theta[:2], [gap], f.theta[3:]])
@@ -363,13 +365,13 @@ class Problem:
         first = float(self.v[0])
         return replace(f, theta=theta, p0=min(max(f.p0, first), first + gap))
 
-    def _noise_of(self, f: Fit) -> float:
+    def _noise_of(self, f: WindowFit) -> float:
         r = np.where(self.known, self.y - self.output(f), 0.0)
         w = self.weights(f)
         free = max(float(w.sum()) - len(f.x) - len(f.knots) - 4.0, 0.0)
         return sqrt((float((w * r) @ r) + self.nominal**2) / (free + 1.0))
 
-    def finished(self, f: Fit) -> Fit:
+    def finished(self, f: WindowFit) -> WindowFit:
         """The same with its evidence and the correlation of what is left."""
         known = self.known
         r = np.where(known, self.y - self.output(f), 0.0)
@@ -390,7 +392,7 @@ class Problem:
             turns=len(reversals(engaged(self.v, self.input(f)[0], max(f.gap, 0.0)))),
         )
 
-    def state(self, f: Fit) -> Array:
+    def state(self, f: WindowFit) -> Array:
         """The state before the record that explains it best, everything else held."""
         b, a = self.family.at(f.xi)
         order = len(a) - 1
@@ -399,7 +401,7 @@ class Problem:
         return np.asarray(np.linalg.lstsq(columns, r, rcond=1e-12)[0])
 
 
-def _towards(f: Fit, new: Fit, share: float = 1.0) -> Fit:
+def _towards(f: WindowFit, new: WindowFit, share: float = 1.0) -> WindowFit:
     """The values this share of the way from f to new, with the posterior of new."""
     longest = 2.0  # prior deviations by which G moves at once
     furthest = float(np.abs(new.theta[3:] - f.theta[3:]).max(initial=0.0))

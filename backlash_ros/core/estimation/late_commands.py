@@ -21,16 +21,16 @@ from math import log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.explanations import Record
+from backlash_ros.core.estimation.explanations import Window
 from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.play import play
-from backlash_ros.core.estimation.posterior import Fit
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
 
-def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozenset[int],
+def swapped(problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
             ) -> frozenset[int]:
     """Numbers of the samples from `since` on over which the other command acted.
 
@@ -85,7 +85,7 @@ def swapped(problem: Problem, fit: Fit, record: Record, since: int, back: frozen
     return frozenset(record.first + k for k in chosen)
 
 
-def _change(v: Array, other: Array, p: Array, k: int, reach: int, fit: Fit) -> Array:
+def _change(v: Array, other: Array, p: Array, k: int, reach: int, fit: WindowFit) -> Array:
     """By how much p would be another one from sample k on, were the other command to act there."""
     end = min(k + reach, len(v))
     acting = v[k:end].copy()
@@ -93,8 +93,8 @@ def _change(v: Array, other: Array, p: Array, k: int, reach: int, fit: Fit) -> A
     return play(acting, fit.gap, float(p[k - 1]) if k else fit.p0) - p[k:end]
 
 
-def likelier(problem: Problem, fit: Fit, record: Record, since: int, back: frozenset[int],
-             ) -> tuple[Record, frozenset[int]]:
+def likelier(problem: Problem, fit: WindowFit, record: Window, since: int, back: frozenset[int],
+             ) -> tuple[Window, frozenset[int]]:
     """The record as it is likelier, and the numbers of all samples over which others acted."""
     found = swapped(problem, fit, record, since, back)
     return record.swapped(found), back ^ found

@@ -28,8 +28,8 @@ from backlash_ros.core.estimation import settings
 from backlash_ros.core.estimation.belief import Belief, State, excess, published, shortened
 from backlash_ros.core.estimation.coasting import coasts
 from backlash_ros.core.estimation.explanations import (
-    Record,
     Setup,
+    Window,
     afresh,
     alike,
     is_known,
@@ -44,7 +44,7 @@ from backlash_ros.core.estimation.explanations import (
 from backlash_ros.core.estimation.fit import FEW_STEPS, Problem
 from backlash_ros.core.estimation.late_commands import likelier
 from backlash_ros.core.estimation.play import engaged, play, reversals
-from backlash_ros.core.estimation.posterior import Fit
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.settings import FEWEST, GROWTH, MISFIT, PREDICTED
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ Array = NDArray[np.float64]
 SHORT_SEARCH = 400  # samples of a record in which other gaps are looked for again
 
 
-def learn(setup: Setup, record: Record, before: Belief) -> Belief:
+def learn(setup: Setup, record: Window, before: Belief) -> Belief:
     """What is believed with the samples of this record, which begins at `before.first`.
 
     Raises nothing: where the numbers get too large, it begins anew with the newest samples.
@@ -77,7 +77,7 @@ def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
 # --- SEARCHING --------------------------------------------------------------------------------
 
 
-def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
+def _searching(setup: Setup, record: Window, before: Belief) -> Belief:
     shortest = 50  # samples of a part of a record that is searched alone
     count, tried = len(record.v), before.tried
     soon = record.end + max(count // settings.BLOCKS, FEWEST)
@@ -120,8 +120,8 @@ def _searching(setup: Setup, record: Record, before: Belief) -> Belief:
 
 
 def _with_commands(
-    setup: Setup, record: Record, found: Fit, swapped: frozenset[int],
-) -> tuple[Fit, frozenset[int]]:
+    setup: Setup, record: Window, found: WindowFit, swapped: frozenset[int],
+) -> tuple[WindowFit, frozenset[int]]:
     """The fit and the commands that go with each other, found in turn.
 
     Commands that leave more than noise explain nothing: those that were sent stay.
@@ -136,7 +136,7 @@ def _with_commands(
     return (found, swapped) if _leaves_more(setup, fit) else (fit, others)
 
 
-def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Status:
+def _why(setup: Setup, found: WindowFit | None, record: Window, before: Belief) -> Status:
     """What to say while nothing is known."""
     if len(record.v) < 100 and before.reason is Status.ACQUIRING:
         return Status.ACQUIRING
@@ -154,16 +154,16 @@ def _why(setup: Setup, found: Fit | None, record: Record, before: Belief) -> Sta
     return Status.INCONSISTENT if wrong or contradicts else Status.ACQUIRING
 
 
-def _turns(record: Record, gap: float, p0: float) -> int:
+def _turns(record: Window, gap: float, p0: float) -> int:
     return len(reversals(engaged(record.v, play(record.v, gap, p0), gap)))
 
 
-def _leaves_more(setup: Setup, found: Fit) -> bool:
+def _leaves_more(setup: Setup, found: WindowFit) -> bool:
     """Whether a fit leaves more than noise, and correlated."""
     return found.systematic and noisier(setup, found)
 
 
-def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
+def _adopted(setup: Setup, record: Window, fit: WindowFit, before: Belief) -> Belief:
     """The fit of this record is what is believed."""
     count, must = len(record.v), before.must_predict
     another_noise = before.published is None or fit.walk_std > 0.0
@@ -180,7 +180,7 @@ def _adopted(setup: Setup, record: Record, fit: Fit, before: Belief) -> Belief:
 # --- KNOWN ------------------------------------------------------------------------------------
 
 
-def _known(setup: Setup, record: Record, before: Belief) -> Belief:
+def _known(setup: Setup, record: Window, before: Belief) -> Belief:
     held = before.fit
     assert held is not None
     count, new = len(record.v), before.end - record.first
@@ -233,7 +233,7 @@ def _known(setup: Setup, record: Record, before: Belief) -> Belief:
     return replace(after, coasts=wrong and coasts(problem, fit))
 
 
-def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> Fit:
+def _beside_others(setup: Setup, record: Window, problem: Problem, fit: WindowFit) -> WindowFit:
     """The fit of a short record, or another one that is likelier, mixed with each other."""
     other = afresh(setup, record)
     if other is None or not is_known(setup, other, settings.REVERSALS):
@@ -242,7 +242,7 @@ def _beside_others(setup: Setup, record: Record, problem: Problem, fit: Fit) -> 
     return replace(best, spread=spread(problem, best, [fit, other]))
 
 
-def _contradicts(problem: Problem, held: Fit, fit: Fit, new: int) -> bool:
+def _contradicts(problem: Problem, held: WindowFit, fit: WindowFit, new: int) -> bool:
     """Whether the samples from `new` on contradict what was held, and `fit` that takes them in.
 
     They do as well where it takes them in at the cost of all others.
@@ -268,7 +268,7 @@ def _contradicts(problem: Problem, held: Fit, fit: Fit, new: int) -> bool:
 # --- DOUBTED ----------------------------------------------------------------------------------
 
 
-def _doubted(setup: Setup, record: Record, before: Belief) -> Belief:
+def _doubted(setup: Setup, record: Window, before: Belief) -> Belief:
     """The samples since the doubt: over, another backlash, or nothing that explains them."""
     held, since = before.fit, before.doubt_from
     assert held is not None

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.estimation.explanations import Record
+from backlash_ros.core.estimation.explanations import Window
 from backlash_ros.core.estimation.play import play, walk
-from backlash_ros.core.estimation.posterior import Fit
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.settings import GATE, OUTLIERS
 from backlash_ros.core.law import Interval
 from backlash_ros.core.laws.fixed import FixedBacklash
@@ -176,7 +176,7 @@ class Place(NamedTuple):
     model: TransferFunction
 
 
-def place_of(fit: Fit, record: Record, model: TransferFunction, memory: int) -> Place:
+def place_of(fit: WindowFit, record: Window, model: TransferFunction, memory: int) -> Place:
     """Where this fit of the record says that play and this G stand after it.
 
     memory: of G [samples].

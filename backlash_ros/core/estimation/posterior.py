@@ -34,7 +34,7 @@ class Start(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fit:
+class WindowFit:
     """Values of all unknowns with their posterior; compared, sent and printed like a number.
 
     x: state before the record. knots: of the walk (W,), and walk_std, 0 for none. p0: p before the
@@ -132,7 +132,7 @@ class Fit:
         return self.count * self.correlation > 1.0 and self.rms > rounding
 
     @property
-    def without_intervals(self) -> Fit:
+    def without_intervals(self) -> WindowFit:
         """The same values with readings that are normal, rounding being part of the noise."""
         return replace(self, step=0.0, noise_std=self.noise)
 
@@ -143,7 +143,7 @@ class Fit:
 
 
 def error_of_plant(
-    f: Fit, r: Array, squares: float, freedom: float, most_scale: float,
+    f: WindowFit, r: Array, squares: float, freedom: float, most_scale: float,
 ) -> tuple[Array, Array, float, float, float]:
     """xi (K,), its covariance, its scale, what it adds to the evidence, variance of the noise.
 

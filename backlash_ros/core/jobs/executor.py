@@ -23,7 +23,7 @@ Job = Callable[..., Any]
 LOST = 'lost'  # kind of the failure of a job whose worker died
 
 
-class Samples(NamedTuple):
+class ChannelSamples(NamedTuple):
     """Consecutive samples, the newest last.
 
     first: number of the first of them, counted from the first one ever appended. columns: their
@@ -67,14 +67,14 @@ class SampleBuffer:
             del self.values[:(first - self.first) * self.quantities]
             self.first = first
 
-    def between(self, first: int, end: int) -> Samples:
+    def between(self, first: int, end: int) -> ChannelSamples:
         """A copy of the samples from one number to before another, as far as they are there."""
         first = max(first, self.first)
         begin, stop = ((k - self.first) * self.quantities for k in (first, max(end, first)))
         rows = np.frombuffer(self.values[begin:stop]).reshape(-1, self.quantities)
         columns = np.array(rows.T, order='C')
         columns.flags.writeable = False
-        return Samples(first, columns)
+        return ChannelSamples(first, columns)
 
 
 class Channel:

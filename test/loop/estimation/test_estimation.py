@@ -62,8 +62,9 @@ def test_wear_and_a_step_of_a_crossing_are_followed(seed: int) -> None:
     assert max(c_r[100:1000].max(), c_r[1100:].max()) <= 0.03
 
 
-@pytest.mark.parametrize('known', [False, True])
-def test_crossings_walk_with_a_disturbance_of_u(known: bool) -> None:
+@pytest.mark.parametrize('known', [0.0, 0.4])
+def test_crossings_walk_with_a_disturbance_of_u(known: float) -> None:
+    # known: share of the walk that is configured: what is more is learned.
     (job,) = (job for job in changes_jobs(0.1) if job.group == 'walk')
     std = job.changes['truth.walk_std'] if known else 0.0
     changes = {**job.changes, 'estimator.input_noise_std': std}

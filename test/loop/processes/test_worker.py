@@ -19,8 +19,8 @@ from worker_jobs import checksum, foreign_modules, last_for_ever
 from backlash_ros.core.jobs.executor import (
     LOST,
     Channel,
+    ChannelSamples,
     Failure,
-    Samples,
 )
 from backlash_ros.core.jobs.worker import WorkerExecutor
 
@@ -113,7 +113,7 @@ def test_a_worker_that_stands_still_holds_up_nobody(executor: WorkerExecutor) ->
     for _ in range(1000):
         assert channel.poll() is other.poll() is None
     os.kill(executor.pid, signal.SIGCONT)
-    all_of_them = Samples(0, np.array([np.arange(50_000.0), np.ones(50_000)]))
+    all_of_them = ChannelSamples(0, np.array([np.arange(50_000.0), np.ones(50_000)]))
     assert result_of(channel) == checksum(all_of_them, 1.0)
     assert result_of(other) == b'x' * 1_000_000 + b'y'
 
@@ -129,7 +129,7 @@ def test_a_worker_that_is_killed_costs_nothing_but_the_job_under_way(executor, t
         for value in rows.tolist():
             channel.append(value)
         values += rows.tolist()
-        expected = Samples(max(len(values) - 3000, 0), np.array([values[-3000:]]))
+        expected = ChannelSamples(max(len(values) - 3000, 0), np.array([values[-3000:]]))
         assert channel.submit(checksum, 1.0)
         assert third.submit(operator.neg, count)
         assert executor.pid is not None

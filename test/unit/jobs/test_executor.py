@@ -6,13 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from backlash_ros.core.jobs.executor import (
+    ChannelSamples,
     Executor,
     Failure,
-    Samples,
 )
 
 
-def everything(samples: Samples, *more: object) -> tuple[object, ...]:
+def everything(samples: ChannelSamples, *more: object) -> tuple[object, ...]:
     return samples.first, samples.columns.tolist(), *more
 
 
@@ -52,7 +52,7 @@ def test_samples_cannot_be_changed_by_a_job() -> None:
     assert channel.poll() == (0, [[1.0]])
 
 
-def overwrite(samples: Samples) -> None:
+def overwrite(samples: ChannelSamples) -> None:
     samples.columns[:] = 0.0
 
 
