@@ -143,7 +143,7 @@ def afresh(
     best = max(fits, key=lambda f: f.evidence)
     if best.m < 0.0 or hopeless:
         return best
-    best = _begun_elsewhere(p, best)
+    best = begun_elsewhere(p, best)
     best = with_intervals(p, best)
     best = replace(best, spread=spread(p, best, fits))
     return with_walk(setup, p, best) if walks else best
@@ -215,7 +215,7 @@ def with_walk(setup: Setup, p: Problem, f: WindowFit) -> WindowFit:
     return best
 
 
-def _begun_elsewhere(p: Problem, f: WindowFit) -> WindowFit:
+def begun_elsewhere(p: Problem, f: WindowFit) -> WindowFit:
     """The fit, or one with another beginning: y has a minimum wherever v has turned meanwhile."""
     beginnings = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the play in its gap, that are compared with a fit
     likeliest, value = f, p.log_posterior(f) + 1.0

@@ -20,12 +20,7 @@ from math import inf, isfinite, log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import (
-    PlantFamily,
-    filtered,
-    padded,
-    state_columns,
-)
+from backlash_ros.core.estimation.plant_family import Family, filtered, padded, state_columns
 from backlash_ros.core.estimation.play import (
     LEFT,
     NEITHER,
@@ -69,19 +64,19 @@ class Problem:
 
     noise_std: nominal, a weak prior. older: what samples before the record say. start: where the
     play rests, None where unknown. most_scale: of the error of G. walk_std: of u per square root
-    of a sample, 0 for none.
+    of a sample, 0 for none. step: of the readings, None to be told from them.
     """
 
     def __init__(
-        self, family: PlantFamily, v: Array, y: Array, noise_std: float,
+        self, family: Family, v: Array, y: Array, noise_std: float,
         older: Prior | None = None, start: Start | None = None, most_scale: float = inf,
-        walk_std: float = 0.0,
+        walk_std: float = 0.0, step: float | None = None,
     ) -> None:
         self.family, self.v, self.nominal = family, v, noise_std
         self.older, self.start, self.most_scale = older, start, most_scale
         self.known = np.isfinite(y)
         self.y = np.where(self.known, y, 0.0)
-        self.step_of_readings = step_of(y)
+        self.step_of_readings = step_of(y) if step is None else step
         self._newest: list[_Evaluated] = []  # of which nothing is computed again
         self._walk_by(walk_std)
 
@@ -182,7 +177,24 @@ class Problem:
         held: whether the gap stays, so that all else fits it; begun: whether the beginning does.
         Raises LinAlgError where the numbers get too large.
         """
-        weights = self.weights(f)
+        stack = self.rows(f, held, begun)
+        size, order = stack.shape[1] - 1, len(self._evaluated(f).a) - 1
+        scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
+        scale[-1] = 1.0
+        stack /= scale
+        from scipy.linalg.lapack import dgeqrf  # where fits are made: 31 MB
+
+        r = dgeqrf(stack, overwrite_a=1)[0][:size + 1]
+        return self._solved(
+            f, np.triu(r) * scale, order, float(self.weights(f).sum()),
+            min(most_scale, self.most_scale)
+        )
+
+    def rows(self, f: WindowFit, held: bool = False, begun: bool = False) -> Array:
+        """The least squares of a step: a row for each sample, then those beside, the target last.
+
+        Readings have deviation 1 in it, shape (N + B, P + 1). held, begun: as above.
+        """
         _, score, information = self._likelihood(f)
         x = padded(f.x, len(self._evaluated(f).a) - 1)
         beta = np.concatenate([x, self._knots_of(f), [f.p0], f.theta])
@@ -192,17 +204,13 @@ class Problem:
         rows, stack[count:] = stack[:count], beside
         jacobian = self.jacobian(f, rows[:, :-1])
         rows[:, -1] = jacobian @ beta + score / information
-        rows *= np.sqrt(information * weights)[:, None]
-        scale = np.maximum(np.sqrt(np.einsum('ij,ij->j', stack, stack)), 1e-300)
-        scale[-1] = 1.0
-        stack /= scale
-        from scipy.linalg.lapack import dgeqrf  # where fits are made: 31 MB
+        rows *= np.sqrt(information * self.weights(f))[:, None]
+        return stack
 
-        r = dgeqrf(stack, overwrite_a=1)[0][:len(beta) + 1]
-        return self._solved(
-            f, np.triu(r) * scale, len(x), float(weights.sum()),
-            min(most_scale, self.most_scale)
-        )
+    def normalised(self, f: WindowFit) -> Array:
+        """Residuals of deviation 1, or what stands for them with intervals (N,); 0 where lost."""
+        _, score, information = self._likelihood(f)
+        return np.asarray(score * np.sqrt(self.weights(f) / information))
 
     def _knots_of(self, f: WindowFit) -> Array:
         return f.knots if len(f.knots) == len(self._hats) else np.zeros(len(self._hats))
@@ -343,7 +351,7 @@ class Problem:
         new = self.kept(self.step(f, most_scale, begun=begun))
         there = _towards(f, new)
         value = self.log_posterior(there, weights)
-        if not value > best - 0.5:
+        if -inf < value <= best - 0.5:
             # Beyond a kink of the play, where another side was engaged, it may be better.
             again = _towards(there, self.kept(self.step(there, most_scale, begun=begun)))
             of_again = self.log_posterior(again, weights)
@@ -358,7 +366,9 @@ class Problem:
 
     def kept(self, f: WindowFit) -> WindowFit:
         """The same with its gap and its beginning where they can be."""
-        gap = min(max(f.gap, 0.0), 2.0 * float(np.ptp(self.v)))
+        least = 1e-9  # gap over the swing of v: with none at all, neither side would be told
+        swing = float(np.ptp(self.v))
+        gap = min(max(f.gap, least * swing), 2.0 * swing)
         theta = np.concatenate([f.theta[:2], [gap], f.theta[3:]])
         if self.start is not None:
             return replace(f, theta=theta)
@@ -391,6 +401,14 @@ class Problem:
             rms=sqrt(float(r @ r) / max(int(known.sum()), 1)),
             turns=len(reversals(engaged(self.v, self.input(f)[0], max(f.gap, 0.0)))),
         )
+
+    def explained(self, f: WindowFit) -> Array:
+        """y that is expected (N,) with the state before the record and the offset at their best."""
+        order = len(self._evaluated(f).a) - 1
+        columns = self.jacobian(f)[:, [*range(order), order + len(self._hats) + 2]]
+        beyond = (self.y - self.output(f))[self.known]
+        change = np.linalg.lstsq(columns[self.known], beyond, rcond=1e-12)[0]
+        return np.asarray(self.output(f) + columns @ change)
 
     def state(self, f: WindowFit) -> Array:
         """The state before the record that explains it best, everything else held."""

@@ -26,6 +26,8 @@ from backlash_ros.core.estimation.fit import Problem
 from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.plant.filtering import lfilter
+from backlash_ros.core.plant.model_check import ON_CIRCLE
+from backlash_ros.core.plant.state_model import memory_of
 
 Array = NDArray[np.float64]
 
@@ -44,7 +46,8 @@ def swapped(problem: Problem, fit: WindowFit, record: Window, since: int, back: 
     if not len(open_) or fit.m <= 0.0:
         return frozenset()
     b, a = problem.family.at(fit.xi)
-    reach = problem.family.memory
+    modes = np.abs(np.roots(a))
+    reach = memory_of(float(modes[modes < 1.0 - ON_CIRCLE].max(initial=0.0)))
     chosen: set[int] = set()
     y = problem.output(fit)
     known = problem.known.astype(np.float64)

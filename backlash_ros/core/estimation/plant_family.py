@@ -16,6 +16,7 @@ they are.
 from __future__ import annotations
 
 from math import cos, cosh, exp, floor, inf, log, sin, sinh, sqrt
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,27 @@ from backlash_ros.core.plant.transfer_function import TransferFunction
 Array = NDArray[np.float64]
 
 LEAK = 5e-3  # prior deviation of the leak of an integrator, per sample and unit of uncertainty
+
+
+class Family(Protocol):
+    """Plants b / a that a fit chooses from, by K = count unknowns xi.
+
+    leaks: how many of the first xi have a prior of deviation 1 each; the others share a scale.
+    """
+
+    @property
+    def count(self) -> int:
+        """K."""
+
+    @property
+    def leaks(self) -> int:
+        """See above."""
+
+    def at(self, xi: list[float]) -> tuple[list[float], list[float]]:
+        """b and a of y(k) = sum b_i u(k-i) - sum a_i y(k-i), of one length."""
+
+    def slopes(self, xi: list[float]) -> tuple[Array, Array]:
+        """Derivatives of b and a by each xi, both of shape (K, n + 1)."""
 
 
 class PlantFamily:
@@ -204,9 +226,9 @@ def state_columns(a: list[float], count: int) -> Array:
     impulse = np.zeros(count)
     impulse[0] = 1.0
     once = lfilter([1.0], a, impulse)
-    return np.column_stack([
+    return np.column_stack([np.zeros((count, 0)), *(
         np.concatenate([np.zeros(i), once[:count - i]]) for i in range(len(a) - 1)
-    ])
+    )])
 
 
 def _sections(poles: NDArray[np.complex128]) -> tuple[int, list[float]]:

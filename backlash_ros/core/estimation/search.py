@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.plant_family import PlantFamily, state_columns
+from backlash_ros.core.estimation.plant_family import Family, state_columns
 from backlash_ros.core.estimation.play import plays
 from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.plant.filtering import lfilter
@@ -30,18 +30,18 @@ class Hypothesis(NamedTuple):
 
 
 def search(
-    family: PlantFamily, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
-    closely: bool,
+    family: Family, v: Array, y: Array, noise_std: float, widest: float, xi: Array,
+    closely: bool, smallest: float = 0.01,
 ) -> tuple[list[Hypothesis], float]:
     """Hypotheses, and the evidence of a u that never moves.
 
     The likeliest one and those of other gaps that are likelier than their neighbours come first.
 
     v, y: (N,), y nan where lost. widest: gap that is considered. xi: error of G (K,), around which
-    G is linearized. closely: whether to look once more around the best gap.
+    G is linearized. closely: whether to look once more around the best gap. smallest: gap that is
+    compared, over the swing of v.
     """
     none = 1e-9  # gap that counts as none, over the swing of v
-    smallest = 0.01  # gap that is compared, over the swing of v
     peaks = 3  # that come first
     compared = _Comparison(family, v, y, noise_std, xi.tolist())
     swing = float(np.ptp(v))
@@ -72,7 +72,7 @@ class _Comparison:
     """Gaps compared by one record. null: evidence of a u that never moves."""
 
     def __init__(
-        self, family: PlantFamily, v: Array, y: Array, noise_std: float, xi: list[float],
+        self, family: Family, v: Array, y: Array, noise_std: float, xi: list[float],
     ) -> None:
         self._family, self._v = family, v
         self._b, self._a = family.at(xi)

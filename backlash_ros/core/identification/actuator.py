@@ -36,8 +36,9 @@ def with_actuator(found: Identification, commands: Array) -> Identification:
     off = float(np.sqrt(np.mean((found.v - commands)**2)))
     if details is None or off <= negligible * gap:
         return found
-    p = details.fit.p
-    side = np.where(p <= found.v, 1.0, np.where(p >= found.v + gap, -1.0, 0.0))
+    place, begin = (details.p - details.v) / gap, details.first - 1 - found.delay
+    side = np.zeros(len(found.v))
+    side[begin:begin + len(place)] = (place < 1e-9) * 1.0 - (place > 1.0 - 1e-9)
     pushed = side != 0.0
     pushed[:pushed_for] = False
     for ago in range(1, pushed_for + 1):

@@ -1,7 +1,9 @@
 """From v and y to backlash, G(z), delay and noise, with deviations and all that keeps them apart.
 
-    search the gap with a general G  ->  compare orders, delays, integrator on held-out samples
+    search the gap with a general G  ->  compare orders, delays, integrators on held-out samples
     ->  search the gap again with the one that is taken  ->  deviations, judgement
+
+Search and fit are those of the loop, for plants without a prior (structure.py).
 """
 
 from __future__ import annotations
@@ -14,36 +16,37 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification import uncertainty
-from backlash_ros.core.identification.gap_search import SEARCH_ROWS, Profile, search
-from backlash_ros.core.identification.least_response import least_response
+from backlash_ros.core.estimation.deviations import covariance_of, ljung_box
+from backlash_ros.core.estimation.explanations import begun_elsewhere
+from backlash_ros.core.estimation.fit import FEW_STEPS, FIRST_STEPS
+from backlash_ros.core.estimation.reading import step_of
+from backlash_ros.core.estimation.search import search
+from backlash_ros.core.estimation.settings import ROWS
 from backlash_ros.core.identification.not_play import Observed, what_it_is
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
-    RACE_STEPS,
     Compared,
     cancelled_poles,
     compare,
-    effective_rows,
+    effective,
+    eligible,
     equal_delays,
     gives_way,
     lag_one,
     predicted,
     selected,
 )
-from backlash_ros.core.identification.output_error import (
+from backlash_ros.core.identification.response import Response, least_response, response_of
+from backlash_ros.core.identification.structure import (
     TINY,
-    Fit,
+    VAGUE,
+    Model,
     Samples,
     Structure,
-    best_start,
-    fit,
-    linear_rows,
-    squares_left,
-    steiglitz_mcbride,
-    triangle,
+    first_model,
+    fitted,
+    moved_to,
 )
-from backlash_ros.core.identification.uncertainty import Covariance
 from backlash_ros.core.identification.verdict import ANOTHER, CERTAIN, Findings, Verdict, judge
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.records.readings import quantum
@@ -55,6 +58,7 @@ Array = NDArray[np.float64]
 POLES = 3  # of the general G with which the gap is searched first; it has a tap for each delay
 EARLY, LONGEST_DELAY = (0, 1, 2, 3), 40  # delays that are compared first, and the longest
 ALIKE = 5.0  # log-likelihood by which a delay that fits alike may be worse
+SMALLEST_GAP = 2e-3  # that is searched for, over the swing of v
 
 
 @dataclass(frozen=True)
@@ -71,28 +75,38 @@ class Options:
 
 
 class HeldOut(NamedTuple):
-    """Prediction of samples that were not fitted. first: index of the first of them; simulated
-    (M,); rms of the error; trained: rms of the fit to the samples before."""
+    """Prediction of samples that were not fitted. first: number of the first of them; measured,
+    simulated (M,); rms of the error; trained: rms of the fit to the samples before."""
 
     first: int
+    measured: Array
     simulated: Array
     rms: float
     trained: float
 
 
 class Details(NamedTuple):
-    """What pictures show. samples: all that was fitted; searched: the part of it, from sample
-    searched_from on, in which structures were compared. profile: of the gap."""
+    """What pictures show, in units of the record.
 
-    samples: Samples
-    searched: Samples
-    searched_from: int
-    fit: Fit
-    covariance: Covariance
+    first: number of the first y that was fitted; v, y, p, simulated: of each y from there on, v and
+    p as they act on it. profile: gaps (G,), and the rms that G refitted to first order leaves.
+    """
+
+    first: int
+    v: Array
+    y: Array
+    p: Array
+    simulated: Array
+    response: Response
     compared: tuple[Compared, ...]
     chosen: Compared
-    profile: Profile
+    profile: tuple[Array, Array]
     held_out: HeldOut
+
+    @property
+    def residual(self) -> Array:
+        """y less what is simulated, nan where lost."""
+        return np.asarray(self.y - self.simulated)
 
 
 @dataclass(frozen=True)
@@ -141,18 +155,32 @@ class Identification:
         return not self.reasons
 
 
-class _Search(NamedTuple):
-    """The best of the structures that were compared. rivals: other minima (gap, how far behind).
+class _Units(NamedTuple):
+    """Middle and size of v and of y, by which both are centred and scaled."""
 
-    apart: deviation of the gap beside the fit's, by a model or a delay that fits alike.
+    v: float
+    v_size: float
+    y: float
+    y_size: float
+
+
+AS_SCALED = _Units(0.0, 1.0, 0.0, 1.0)
+
+
+class _Search(NamedTuple):
+    """The best of the structures that were compared, in scaled units.
+
+    rivals: other minima (gap, how far behind). profile: gaps, and their rms. apart: deviation of
+    the gap beside the fit's, by a model or a delay that fits alike.
     """
 
     samples: Samples
     compared: list[Compared]
     chosen: Compared
-    best: Fit
+    best: Model
     rivals: list[tuple[float, float]]
-    curve: Profile
+    profile: tuple[Array, Array]
+    held_out: HeldOut
     delays: Sequence[int]
     apart: float = 0.0
 
@@ -182,33 +210,42 @@ def identifying(
     nothing = _why_nothing(v, y[part], options)
     if nothing:
         return replace(given, reasons=(nothing,))
+    units = _Units(float(v.mean()), float(np.ptp(v[part])), float(np.nanmedian(y)),
+                   float(np.nanstd(y[part])))
+    v, y = (v - units.v) / units.v_size, (y - units.y) / units.y_size
     s = yield from _searched(v[part], y[part], options, options.delays or EARLY)
     if not options.delays:
         s = yield from _later(s, options)
     yield 'choosing the delay'
-    best, rows = s.best, effective_rows(s.best)
+    best, rows = s.best, effective(s.best.left)
     others = [
-        fit(s.samples, best.structure._replace(delay=delay), best.point)
+        fitted(s.samples, structure, moved_to(structure, best))
         for delay in equal_delays(s.compared, s.chosen) if delay != best.structure.delay
+        for structure in [replace(best.structure, delay=delay)]
     ]
     # With as many poles, some of them may fit worse.
-    best = least_response(best, [
+    best, beside = least_response(s.samples, best, [
         one for one in others if rows * log(max(one.squares, TINY) / max(best.squares, TINY))
         <= PLATEAU
     ], best.squares / rows)
-    if len(v) > len(s.samples.v):
+    samples = s.samples
+    if len(v) > len(samples.v):
         yield 'fitting the whole record'
-        kept = y.copy()
-        kept[part] = s.samples.whole_y
-        samples = Samples(v, kept, s.samples.first, len(v), penalty=best.samples.penalty)
-        begin = best_start(samples, best.structure, [best.point.a], best.point.gap, (0.0, 0.5, 1.0))
-        best = fit(samples, best.structure, begin)
-        wild = _without_outliers(samples, best)
-        best = best if wild is samples else fit(wild, best.structure, best.point)
+        whole = y.copy()
+        whole[part] = samples.y
+        samples = replace(samples, v=v, y=whole, last=len(v))
+        begin = moved_to(best.structure, best, p0=float(v[0]) + 0.5 * best.gap)
+        best = _begun(fitted(samples, best.structure, begin, FIRST_STEPS, beside))
+        kept = _without_outliers(samples, best)
+        if kept is not samples:
+            samples = kept
+            best = fitted(samples, best.structure, best.fit, beside=beside)
     yield 'judging'
-    given = replace(given, outliers=int((np.isfinite(y) & np.isnan(best.samples.whole_y)).sum()))
-    found = _described(s, best, given, options, part.start)
-    return _as_a_gain(found, s, best, given, options, part.start)
+    given = replace(given, outliers=int((np.isfinite(given.y) & np.isnan(samples.y)).sum()))
+    s = s._replace(samples=samples, best=best, held_out=s.held_out._replace(
+        first=part.start + s.held_out.first))
+    found = _described(s, given, options, units)
+    return _as_a_gain(found, s, given, options, units)
 
 
 def _why_nothing(v: Array, y: Array, options: Options) -> str:
@@ -231,70 +268,113 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
     return ''
 
 
-def _general(first: int, last: int) -> Structure:
-    """G with which the gap is searched: a few poles, and a tap for each delay."""
-    return Structure(POLES, first, False, POLES + last - first)
-
-
 def _searched(
     v: Array, y: Array, options: Options, delays: Sequence[int],
 ) -> Generator[str, None, _Search]:
     """The best structure with one of these delays."""
     far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
-    samples, whole = Samples(v, y, max(delays) + 1, len(v)), _general(min(delays), max(delays))
     yield 'searching the gap'
-    found, _ = search(samples, whole)
-    kept = _without_outliers(samples, fit(samples, whole, found[0].point))
+    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y))
+    cut = samples.last - round(options.held_out * samples.count)
+    found = _with_general(samples, delays)
+    kept = _without_outliers(samples, found[0])
+    if found[0].rms > kept.step > 0.0:
+        kept = replace(kept, step=0.0)
     if kept is not samples:
         samples = kept
-        found, _ = search(samples, whole)
-    candidates = [one.point for one in found[:2]]
+        found = _with_general(samples, delays)
+    candidates = found[:2]
     structures = [
         Structure(order, delay, integrator) for integrator in options.integrators
         for delay in delays for order in options.orders if order >= integrator
     ]
     for again in (True, False):
         yield 'comparing orders and delays'
-        compared = compare(samples, candidates, structures, options.held_out)
+        compared = compare(samples, candidates, structures, cut)
         yield 'refining'
-        while True:
+        for _ in structures:
             chosen = selected(compared)
-            best, rivals, curve = _refined(samples, chosen)
-            if not gives_way(best, compared):
+            models, profile = _of_gaps(samples, chosen.whole)
+            best = _begun(models[0])
+            if not gives_way(best, eligible(compared)):
                 break
             # Only the best fit of all shows that a pole is none.
-            compared = [one._replace(fit=best) if one is chosen else one for one in compared]
-        off = abs(best.point.gap - candidates[0].gap)
-        if not again or off <= far_off * best.point.gap:
+            compared = [one._replace(whole=best) if one is chosen else one for one in compared]
+        if not again or abs(best.gap - candidates[0].gap) <= far_off * best.gap:
             break
-        candidates = [best.point, candidates[0]]  # the general G may have been a poor one
-    return _Search(samples, compared, chosen, best, rivals, curve, delays)
+        candidates = [best, candidates[0]]  # the general G may have been a poor one
+    rows = effective(best.left)
+    rivals = sorted(
+        (0.5 * rows * log(max(one.squares, TINY) / max(best.squares, TINY)), one.gap)
+        for one in models if abs(one.gap - best.gap) > ANOTHER * best.gap
+    )
+    held_out = HeldOut(
+        cut, samples.y[cut:samples.last], predicted(chosen.trained, replace(samples, first=cut)),
+        chosen.held_out, chosen.trained.rms)
+    return _Search(samples, compared, chosen, best, [(gap, behind) for behind, gap in rivals],
+                   (profile[0], best.rms * profile[1]), held_out, delays)
 
 
-def _without_outliers(samples: Samples, found: Fit) -> Samples:
+def _with_general(samples: Samples, delays: Sequence[int]) -> list[Model]:
+    """Models of different gaps, the best first, with a few poles and a tap for each delay."""
+    general = Structure(POLES, min(delays), False, POLES + max(delays) - min(delays))
+    swing = float(np.ptp(samples.v))
+    begins = sorted((
+        first_model(samples, general, gap, float(samples.v[0]) + 0.5 * gap)
+        for gap in (0.0, 0.05 * swing, 0.2 * swing, 0.5 * swing)
+    ), key=lambda one: one.squares)
+    rough = [fitted(samples, general, one.fit, FEW_STEPS) for one in begins[:2]]
+    best = min(rough, key=lambda one: one.squares)
+    for _ in range(2):
+        models, _ = _of_gaps(samples, best)
+        if models[0].squares > 0.9 * best.squares:
+            break
+        best = models[0]
+    return models
+
+
+def _of_gaps(samples: Samples, like: Model) -> tuple[list[Model], tuple[Array, Array]]:
+    """Fits of the same structure to the minima over the gap, the best first; the profile."""
+    most, apart = 4, 0.005  # minima that are fitted, and the relative distance of different ones
+    structure, problem = like.structure, like.problem
+    y = np.where(problem.known, problem.y, nan)
+    swing = float(np.ptp(problem.v))
+    hypotheses, _ = search(structure, problem.v, y, 1e-12, 0.98 * swing,
+                           like.fit.theta[3:], True, SMALLEST_GAP)
+    begins, gaps = [like.fit], [like.gap]
+    for _, gap, p0, _ in hypotheses:
+        if len(begins) <= most and all(abs(gap - other) > ANOTHER * other for other in gaps):
+            gaps.append(gap)
+            begins.append(problem.step(moved_to(structure, like, gap, p0), held=True))
+    some = sorted((fitted(samples, structure, begin, FIRST_STEPS) for begin in begins),
+                  key=lambda one: one.squares)
+    models: list[Model] = []
+    for one in some:
+        model = one if one.squares > 1.5 * some[0].squares else fitted(samples, structure, one.fit)
+        if all(abs(model.gap - other.gap) > apart * other.gap for other in models):
+            models.append(model)
+    models.sort(key=lambda one: one.squares)
+    by_gap: dict[float, float] = {}
+    for h in hypotheses:
+        by_gap[h.gap] = max(h.evidence, by_gap.get(h.gap, -inf))
+    curve = np.array(sorted(by_gap.items())).reshape(-1, 2)
+    behind = curve[:, 1].max(initial=-inf) - curve[:, 1]
+    return models, (curve[:, 0], np.exp(behind / min(len(problem.v), ROWS)))
+
+
+def _begun(found: Model) -> Model:
+    """The model, or one whose play began elsewhere."""
+    return replace(found, fit=begun_elsewhere(found.problem, found.fit))
+
+
+def _without_outliers(samples: Samples, found: Model) -> Samples:
     """The same without readings that are none; rounding makes none."""
-    wild = outliers(found.residual, quantum(samples.y))
+    wild = outliers(found.residual, quantum(samples.fitted_y()))
     if not wild.any():
         return samples
-    y = samples.whole_y.copy()
+    y = samples.y.copy()
     y[samples.first:samples.last][wild] = nan
-    return replace(samples, whole_y=y)
-
-
-def _refined(
-    samples: Samples, chosen: Compared,
-) -> tuple[Fit, list[tuple[float, float]], Profile]:
-    """The best fit of the chosen structure, other minima (gap, how far behind), the profile."""
-    found, curve = search(samples, chosen.structure, chosen.fit)
-    near = [one for one in found if one.squares < 1.5 * found[0].squares]
-    fits = [chosen.fit, *(fit(samples, chosen.structure, one.point) for one in near[:5])]
-    best = min(fits, key=lambda one: one.squares)
-    rows, gap = effective_rows(best), best.point.gap
-    rivals = sorted(
-        (0.5 * rows * log(max(one.squares, TINY) / max(best.squares, TINY)), one.point.gap)
-        for one in fits if abs(one.point.gap - gap) > ANOTHER * gap
-    )
-    return best, [(gap, behind) for behind, gap in rivals], curve
+    return replace(samples, y=y)
 
 
 def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
@@ -306,116 +386,140 @@ def _later(early: _Search, options: Options) -> Generator[str, None, _Search]:
     worse_for = 3  # delays in a row that fit worse, behind which no later one is tried
     yield 'searching later delays'
     best, latest = early.best, min(LONGEST_DELAY, len(early.samples.v) // 20)
-    samples = replace(early.samples, first=latest + 1, most=SEARCH_ROWS)
-    scan = [fit(samples, best.structure, best.point)]
-    alike, rows = list(scan), effective_rows(scan[0])
+    samples = replace(early.samples, first=latest + 1)
+    scan = [fitted(samples, best.structure, best.fit)]
+    alike, rows = list(scan), effective(scan[0].left)
     while scan[-1].structure.delay < min(latest, alike[-1].structure.delay + worse_for):
-        (a, gap, start), delay = scan[-1].point, scan[-1].structure.delay + 1
-        structure = best.structure._replace(delay=delay)
-        models = [a, *steiglitz_mcbride(samples, structure, scan[-1].p)[:1]]
-        scan.append(fit(
-            samples, structure, best_start(samples, structure, models, gap, (), start), RACE_STEPS))
+        before = scan[-1]
+        structure = replace(best.structure, delay=before.structure.delay + 1)
+        begins = [moved_to(structure, before), first_model(
+            samples, structure, before.gap, before.fit.p0, (0.6,)).fit]
+        scan.append(min((fitted(samples, structure, begin, FIRST_STEPS) for begin in begins),
+                        key=lambda one: one.squares))
         most = min(one.squares for one in scan) * exp(2.0 * ALIKE / rows)
         alike = [one for one in scan if one.squares <= most]
     first, last = (alike[k].structure.delay for k in (0, -1))
     if last <= EARLY[-1]:
         return early
-    gaps = [one.point.gap for one in (best, *alike)]
-    early = early._replace(apart=0.5 * (max(gaps) - min(gaps)))
+    # Their mixture.
+    share = np.array([one.squares for one in alike])
+    share = (share.min() / share) ** (0.5 * rows)
+    off = np.array([one.gap - best.gap for one in alike])
+    early = early._replace(apart=sqrt(float(share @ off**2) / float(share.sum())))
     # What no G with a backlash explains, any delay explains a little better.
-    other = what_it_is(_observed(best))
+    other = what_it_is(_observed(early.samples, best))
     if last - first > most_alike or (other is not None and not other.known):
         return early
-    late = yield from _searched(early.samples.v, early.samples.whole_y, options, range(
+    late = yield from _searched(early.samples.v, early.samples.y, options, range(
         max(first - 1, 0), min(last + 2, latest) + 1))
-    better = effective_rows(late.best) * log(max(best.rms, TINY) / max(late.best.rms, TINY))
+    better = effective(late.best.left) * log(max(best.rms, TINY) / max(late.best.rms, TINY))
     return late if late.best.structure.delay < max(late.delays) and better > -ALIKE else early
 
 
-def _delay_open(best: Fit) -> bool:
+def _delay_open(samples: Samples, best: Model) -> bool:
     """Whether one more sample of delay fits as well."""
-    samples = replace(best.samples, first=best.samples.first + 1)
-    longer = best.structure._replace(delay=best.structure.delay + 1)
-    this, other = (fit(samples, structure, best.point) for structure in (best.structure, longer))
+    samples = replace(samples, first=samples.first + 1)
+    longer = replace(best.structure, delay=best.structure.delay + 1)
+    this, other = (fitted(samples, structure, moved_to(structure, best))
+                   for structure in (best.structure, longer))
     ratio = log(max(other.squares, TINY) / max(this.squares, TINY))
-    return bool(best.structure.delay) and effective_rows(this) * ratio < PLATEAU
+    return bool(best.structure.delay) and effective(this.left) * ratio < PLATEAU
 
 
-def _observed(best: Fit) -> Observed:
-    """The signals of a fit, each where it acts on y."""
-    samples = best.samples
-    noise = noise_of(samples.known.astype(float), samples.y[samples.known])
-    return Observed(
-        samples.v[samples.first:samples.last], samples.y,
-        samples.delayed(best.p, best.structure.delay), best.simulated,
-        max(noise, quantum(samples.y) / sqrt(12.0)), best.point.gap,
-    )
+def _observed(
+    samples: Samples, best: Model, units: _Units = AS_SCALED,
+) -> Observed:
+    """The signals of a fit; v at the same samples as y."""
+    v0, v_size, y0, y_size = units
+    problem = best.problem
+    y = np.where(problem.known, problem.y, nan)
+    noise = noise_of(np.flatnonzero(problem.known).astype(float), y[problem.known])
+    noise = max(noise, quantum(y) / sqrt(12.0))
+    v = samples.v[samples.first:samples.last]
+    return Observed(v0 + v_size * v, y0 + y_size * y, v0 + v_size * best.p,
+                    y0 + y_size * best.simulated, y_size * noise, v_size * best.gap)
+
+
+def _crossings(best: Model, covariance: Array, units: _Units) -> tuple[float, Array]:
+    """c_r, and the covariance of (gap, c_r), shape (2, 2)."""
+    taps = best.structure.numerator_taps
+    b, a = float(best.numerator.sum()), 1.0 + float(best.a.sum())
+    # Unless G integrates, the middle of y is part of the offset.
+    shift = 0.0 if best.structure.integrator or not b else units.y / units.y_size * a / b
+    c_r = units.v + units.v_size * (float(best.fit.theta[1]) - shift)
+    jacobian = np.zeros((2, len(covariance)))
+    jacobian[0, 2] = jacobian[1, 1] = units.v_size
+    jacobian[1, 3:3 + taps] = VAGUE * units.v_size * shift / b if b else 0.0
+    jacobian[1, 3 + taps:] = -VAGUE * units.v_size * shift / a if a else 0.0
+    return c_r, np.asarray(jacobian @ covariance @ jacobian.T)
 
 
 def _described(
-    s: _Search, best: Fit, given: Identification, options: Options, searched_from: int,
+    s: _Search, given: Identification, options: Options, units: _Units,
 ) -> Identification:
     """Everything there is to say of the best fit."""
-    samples, structure = best.samples, best.structure
-    covariance = uncertainty.covariance_of(best)
-    crossings = uncertainty.crossings_covariance(best, covariance)
+    best, chosen, structure = s.best, s.chosen, s.best.structure
+    covariance = covariance_of(best.problem, best.fit)
+    c_r, crossings = _crossings(best, covariance, units)
+    gap, apart = units.v_size * best.gap, units.v_size * s.apart
     gap_var, c_r_var = np.diag(crossings).tolist()
     c_l_var = max(gap_var + c_r_var - 2.0 * float(crossings[0, 1]), 0.0)
-    gap_var += s.apart**2
-    band = frequencies_of(best.simulated)
-    low = max(band[0], np.pi / samples.count)
-    frequencies = np.geomspace(low, max(band[1], 1.01 * low), 60, dtype=np.float64)
-    spread = uncertainty.response_std(best, covariance, frequencies)
-    gain_std = float(uncertainty.response_std(best, covariance, np.zeros(1))[0])
+    gap_var += apart**2
+    g = response_of(best, covariance, units.y_size / units.v_size)
+    low, high = frequencies_of(best.simulated)
+    low = max(low, np.pi / len(best.simulated))
+    frequencies = np.geomspace(low, max(high, 1.01 * low), 60, dtype=np.float64)
+    spread, gain_std = g.std(frequencies), float(g.std(np.zeros(1))[0])
     middle = np.sqrt(frequencies[:1] * frequencies[-1:])
-    residual = best.residual[samples.known]
-    squares, still = float(residual @ residual), _still(best)
-    chosen = s.chosen
-    cut = s.samples.last - round(options.held_out * s.samples.count)
-    held_out = HeldOut(cut, predicted(chosen.trained, replace(s.samples, first=cut)),
-                       chosen.held_out, chosen.trained.rms)
+    residual, squares, still = best.left, best.squares, _still(best)
+    first, measured, simulated, rms, trained = s.held_out
+    held_out = HeldOut(first, units.y + units.y_size * measured,
+                       units.y + units.y_size * simulated, units.y_size * rms,
+                       units.y_size * trained)
     delays = tuple(sorted({*equal_delays(s.compared, chosen), structure.delay}))
     correlation = max(lag_one(residual) - 3.0 / sqrt(len(residual)), 0.0)
-    step, total = quantum(samples.y), float(best.numerator.sum())
+    observed = _observed(s.samples, best, units)
+    step, total = quantum(observed.y), float(g.numerator.sum())
     verdict = judge(Findings(
-        _observed(best), best.point.gap, sqrt(gap_var), best.c_r, sqrt(max(c_r_var, 0.0)),
-        float(np.abs(uncertainty.response(best, middle))[0]),
-        total if structure.integrator else total / float(best.denominator.sum()),
+        observed, gap, sqrt(gap_var), c_r, sqrt(max(c_r_var, 0.0)), float(np.abs(g.at(middle))[0]),
+        total if structure.integrator else total / float(g.denominator.sum()),
         gain_std, float(spread.max()),
         # Whatever the correlation: what explains nine tenths of y shows v.
-        inf if squares < 0.01 * still
-        else 0.5 * effective_rows(best) * log(still / max(squares, TINY)),
-        correlation, held_out.rms, held_out.trained, s.rivals, best.reversals, step,
+        inf if squares < 0.1 * still
+        else 0.5 * effective(residual) * log(still / max(squares, TINY)),
+        correlation, held_out.rms, held_out.trained,
+        [(units.v_size * rival, behind) for rival, behind in s.rivals], best.reversals, step,
         cancelled_poles(best), structure.delay,
         # Where many fit alike, the gap does not depend on the delay.
-        structure.delay == max(s.delays) and len(delays) < 3 and _delay_open(best),
+        structure.delay == max(s.delays) and len(delays) < 3 and _delay_open(s.samples, best),
     ))
     # What no model explains moves both sides of the gap alike.
     more = 0.25 * (verdict.gap_std**2 - gap_var)
     # As parameters have it: z where G is a gain, for B acts a sample late.
     at_zero = structure.numerator_taps - structure.order
+    free = len(residual) - structure.unknowns
     return replace(
-        given, m=options.slope, gap=best.point.gap, c_r=best.c_r, c_l=best.c_r - best.point.gap,
+        given, m=options.slope, gap=gap, c_r=c_r, c_l=c_r - gap,
         std={'m': options.slope * gain_std, 'gap': verdict.gap_std,
              'c_r': sqrt(max(c_r_var + more, 0.0)), 'c_l': sqrt(c_l_var + more)},
-        numerator=tuple((best.numerator / options.slope).tolist()),
+        numerator=tuple((g.numerator / options.slope).tolist()),
         denominator=(*best.denominator.tolist(), *[0.0] * at_zero),
-        delay=structure.delay,
-        delays=delays,
-        integrator=structure.integrator,
-        noise_std=sqrt(squares / max(len(residual) - structure.unknowns, 1)),
-        quantum=step, correlation=correlation, ljung_box=uncertainty.ljung_box(best.residual),
+        delay=structure.delay, delays=delays, integrator=structure.integrator,
+        noise_std=units.y_size * sqrt(squares / max(free, 1)), quantum=step,
+        correlation=correlation, ljung_box=ljung_box(best.residual),
         frequencies=frequencies, response_std=spread,
         uncertainty=_as_parameter(2.0 * float(spread.max())),
         reasons=verdict.reasons, remarks=verdict.remarks, verdict=verdict,
-        details=Details(samples, s.samples, searched_from, best, covariance, tuple(s.compared),
-                        chosen, s.curve, held_out),
+        details=Details(
+            s.samples.first, units.v + units.v_size * best.problem.v, observed.y, observed.p,
+            observed.simulated, g,
+            tuple(one._replace(held_out=units.y_size * one.held_out) for one in s.compared), chosen,
+            (units.v_size * s.profile[0], units.y_size * s.profile[1]), held_out),
     )
 
 
 def _as_a_gain(
-    found: Identification, s: _Search, best: Fit, given: Identification, options: Options,
-    searched_from: int,
+    found: Identification, s: _Search, given: Identification, options: Options, units: _Units,
 ) -> Identification:
     """With a G that is a gain and a delay, where a better one is not known but the gap is.
 
@@ -425,24 +529,27 @@ def _as_a_gain(
     assert found.verdict is not None
     if not gains or not found.verdict.backlash.known or found.verdict.model.known:
         return found
-    chosen = min(gains, key=lambda one: one.fit.squares)
-    best = fit(replace(best.samples, penalty=None), chosen.structure, chosen.trained.point)
-    apart = s.apart + 0.5 * abs(best.point.gap - found.gap)  # what depends on the model
+    chosen = min(gains, key=lambda one: one.whole.squares)
+    best = fitted(s.samples, chosen.structure, chosen.trained.fit)
+    # What depends on the model.
+    apart = s.apart + 0.5 * abs(best.gap - found.gap / units.v_size)
     gain = _described(
-        s._replace(chosen=chosen, apart=apart), best, given, options, searched_from)
+        s._replace(chosen=chosen, best=best, apart=apart), given, options, units)
     assert gain.verdict is not None
     known = gain.verdict.backlash.known and gain.verdict.model.known
-    if not known or apart >= CERTAIN * found.std['gap']:
+    if not known or apart * units.v_size >= CERTAIN * found.std['gap']:
         return found
-    moved = sqrt(best.squares / float(np.nanvar(best.samples.y)) / len(best.samples.known))
+    moved = sqrt(best.squares / float(np.var(best.problem.y[best.problem.known])) / len(best.left))
     return replace(gain, uncertainty=max(gain.uncertainty, _as_parameter(2.0 * moved)))
 
 
-def _still(best: Fit) -> float:
+def _still(best: Model) -> float:
     """Squares left over by a u that stands still, through the same G."""
-    samples, structure = replace(best.samples, penalty=None), best.structure
-    rows = linear_rows(samples, structure, best.point.a, best.p)[structure.numerator_taps:]
-    return max(squares_left(triangle(np.vstack([samples.reduced(rows), samples.target]))), TINY)
+    problem, fit = best.problem, best.fit
+    theta = fit.theta.copy()
+    theta[2] = 2.0 * float(np.ptp(problem.v))
+    y = problem.explained(replace(fit, p0=float(problem.v.max()), theta=theta))
+    return max(float(np.sum((problem.y - y)[problem.known] ** 2)), TINY)
 
 
 def _as_parameter(spread: float) -> float:

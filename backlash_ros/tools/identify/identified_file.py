@@ -11,8 +11,6 @@ import numpy as np
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimate import Estimate
 from backlash_ros.core.identification.identification import Details, Identification
-from backlash_ros.core.identification.least_response import known_up_to
-from backlash_ros.core.identification.uncertainty import response
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PLANT
@@ -97,7 +95,7 @@ def _reference(found: Identification, details: Details) -> dict[str, Value]:
     """A reference that the actuator can follow, and that shows the gap."""
     y = found.y[np.isfinite(found.y)]
     middle = 0.0 if found.integrator else 0.5 * float(np.percentile(y, 5) + np.percentile(y, 95))
-    gain = float(np.abs(response(details.fit, found.frequencies[:1]))[0])
+    gain = float(np.abs(details.response.at(found.frequencies[:1]))[0])
     reach = 0.5 * (float(np.ptp(found.v)) - found.gap)
     share = max(0.4, min(0.75 * found.gap / reach, 0.8))
     return {
@@ -109,11 +107,11 @@ def _reference(found: Identification, details: Details) -> dict[str, Value]:
 def _weights(found: Identification, details: Details) -> dict[str, Value]:
     """The usual weight of u, at a frequency where G is known and v still moves y."""
     w = np.linspace(found.frequencies[0], USUAL_FREQUENCY, 200)
-    gain = np.abs(response(details.fit, w))
+    gain = np.abs(details.response.at(w))
     if found.actuator is not None:
         gain = gain * np.abs(found.actuator.lag.response(np.exp(1j * w)))
     # Beyond a tenth of the gain at the lowest frequency motion of y takes too much of v.
-    limit = known_up_to(details.fit, details.covariance)
+    limit = details.response.known_up_to
     beyond = np.flatnonzero((w > limit) | (gain < 0.1 * gain[0]))
     if not len(beyond):
         return {}

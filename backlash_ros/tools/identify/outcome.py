@@ -196,7 +196,7 @@ def _compared(details: Details) -> str:
     for order, integrator in kinds:
         best = min((one for one in details.compared if one.structure.order == order
                     and one.structure.integrator == integrator), key=lambda one: one.held_out)
-        taken = best.structure[:3] == details.chosen.structure[:3]
+        taken = best.structure == details.chosen.structure
         rows.append((
             f'{order} pole{"s" * (order != 1)}' + ', one an integrator' * integrator
             + ' (taken)' * taken, str(best.structure.delay), f'{best.held_out:.4g}',

@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
+from backlash_ros.core.estimation.deviations import autocorrelation
 from backlash_ros.core.identification.identification import Details, Identification
-from backlash_ros.core.identification.uncertainty import autocorrelation, response, response_std
 from backlash_ros.tools.figures import (
     HUES,
     TIME_LABEL,
@@ -46,8 +46,9 @@ def pictures(found: Identification) -> Iterator[Picture]:
          'v: c<sub>r</sub> while v pushes to the right, c<sub>l</sub> to the left, and in between '
          'while v crosses the gap after each turn.', 4.6, draw_loop),
         ('gap.png', 'Misfit over the gap',
-         'What is left over for each width of the gap, everything else refitted. One narrow '
-         'valley: the gap is known. Two valleys of one depth: it is not.', 4.2, draw_profile),
+         'What is left over for each width of the gap, all else refitted to first order. One '
+         'narrow valley: the gap is known. Two valleys of one depth: it is not.', 4.2,
+         draw_profile),
         ('residual.png', 'Residual of the fit',
          'y minus the simulation of the whole record. Its autocorrelation should stay within the '
          'band of white noise; the rounding of an encoder may leave it. Over v it should show no '
@@ -71,16 +72,14 @@ def pictures(found: Identification) -> Iterator[Picture]:
 def draw_held_out(figure: Figure, found: Identification, details: Details) -> None:
     """Measured and simulated y over the samples held out, and their difference."""
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1.0])
-    first, simulated = details.held_out.first, details.held_out.simulated
-    begin = details.searched_from + first
-    t = found.sample_period * np.arange(begin, begin + len(simulated), dtype=float)
-    y = details.searched.whole_y[first:first + len(t)]
+    first, y, simulated, rms, _ = details.held_out
+    t = found.sample_period * np.arange(first, first + len(simulated), dtype=float)
     curve(upper, t, y, HUES['y'], 'measured', width=2.2)
     curve(upper, t, simulated, HUES['u_d'], 'simulated', '--')
     legend_above(upper)
     curve(lower, t, y - simulated, HUES['e'])
     zero_line(lower)
-    share = 1.0 - details.held_out.rms / max(float(np.nanstd(y)), 1e-300)
+    share = 1.0 - rms / max(float(np.nanstd(y)), 1e-300)
     label(upper, f'{share:.2%} of the motion is predicted', 'y')
     label(lower, '', 'difference', TIME_LABEL)
 
@@ -89,10 +88,10 @@ def draw_loop(figure: Figure, found: Identification, details: Details) -> None:
     """y over v, and v - u / m over v, between the crossings."""
     loop_points = 4000  # samples that the curves over v show
     left, right = figure.subplots(1, 2)
-    v = details.samples.v[-loop_points:]
-    curve(left, v, details.samples.whole_y[-loop_points:], HUES['y'], width=0.8)
+    v = details.v[-loop_points:]
+    curve(left, v, details.y[-loop_points:], HUES['y'], width=0.8)
     label(left, 'As measured', 'y', 'v')
-    curve(right, v, v - details.fit.p[-loop_points:] + found.c_r, HUES['u'], width=0.8)
+    curve(right, v, v - details.p[-loop_points:] + found.c_r, HUES['u'], width=0.8)
     for name, value in (('c_r', found.c_r), ('c_l', found.c_l)):
         right.axhline(value, color=HUES[name], linewidth=4.0, alpha=0.5,
                       label=f'${name}$ = {value:.4g}')
@@ -103,8 +102,7 @@ def draw_loop(figure: Figure, found: Identification, details: Details) -> None:
 def draw_profile(figure: Figure, found: Identification, details: Details) -> None:
     """RMS of the residual over the gap, whole and near its minimum."""
     whole, near = figure.subplots(1, 2)
-    gaps, std = details.profile.gaps, found.std['gap']
-    rms = np.sqrt(details.profile.squares / max(details.profile.best.rows, 1))
+    (gaps, rms), std = details.profile, found.std['gap']
     close = np.abs(gaps - found.gap) <= max(0.21 * found.gap, 2.0 * BAND_STDS * std)
     for axes, chosen in ((whole, np.full(len(gaps), True)), (near, close)):
         axes.plot(gaps[chosen], rms[chosen], '.-', color=HUES['m'], markersize=4)
@@ -121,9 +119,8 @@ def draw_residual(figure: Figure, found: Identification, details: Details) -> No
     grid = figure.add_gridspec(2, 2)
     over_time = figure.add_subplot(grid[0, :])
     correlated, over_v = figure.add_subplot(grid[1, 0]), figure.add_subplot(grid[1, 1])
-    samples = details.samples
-    residual = samples.y - details.fit.simulated
-    t = found.sample_period * np.arange(samples.first, samples.last, dtype=float)
+    residual, v = details.residual, details.v
+    t = found.sample_period * (details.first + np.arange(len(residual), dtype=float))
     curve(over_time, t, residual, HUES['e'], width=0.8)
     label(over_time, f'Deviation {found.noise_std:.3g}', 'residual', TIME_LABEL)
     bound = BAND_STDS / np.sqrt(np.isfinite(residual).sum())
@@ -132,7 +129,6 @@ def draw_residual(figure: Figure, found: Identification, details: Details) -> No
     correlated.vlines(np.arange(1, len(r) + 1), 0.0, r, color=HUES['e'], linewidth=1.5)
     correlated.set_ylim(*limits([np.append(r, [-3.0 * bound, 3.0 * bound])], 0.1))
     label(correlated, f'Autocorrelation (Ljung–Box p = {found.ljung_box:.2g})', '', 'lag [samples]')
-    v = samples.delayed(samples.v, details.fit.structure.delay)
     over_v.plot(v, residual, '.', color=HUES['e'], markersize=2, alpha=0.4, rasterized=True)
     known = np.isfinite(residual)
     edges = np.linspace(v.min(), v.max(), 26)
@@ -149,8 +145,8 @@ def draw_bode(figure: Figure, found: Identification, details: Details) -> None:
     """Magnitude and phase of m G, its delay included."""
     rooms = figure.subplots(2, 1, sharex=True)
     w = np.geomspace(max(found.frequencies[0] / 5.0, 1e-5), 0.98 * np.pi, 400)
-    value = response(details.fit, w) * np.exp(-1j * w * found.delay)
-    spread = BAND_STDS * response_std(details.fit, details.covariance, w)
+    value = details.response.at(w) * np.exp(-1j * w * found.delay)
+    spread = BAND_STDS * details.response.std(w)
     f, size, phase = w / (2.0 * np.pi * found.sample_period), np.abs(value), np.degrees(
         np.unwrap(np.angle(value)))
     turn = np.degrees(np.arcsin(np.minimum(spread, 1.0)))

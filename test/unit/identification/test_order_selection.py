@@ -1,5 +1,6 @@
 """Which structure is taken: a pole that a zero cancels is none."""
 
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.play import play
+from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.identification.identification import Options, identify
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.order_selection import (
@@ -15,28 +17,28 @@ from backlash_ros.core.identification.order_selection import (
     gives_way,
     selected,
 )
-from backlash_ros.core.identification.output_error import Fit, Point, Samples, Structure
+from backlash_ros.core.identification.structure import Model, Samples, Structure
 
-SAMPLES = Samples(np.zeros(2), np.zeros(2), 1, 2)
+SAMPLES = Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
 
 
-def fit_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Fit:
-    """A fit with these roots; poles: without the integrator."""
+def model_of(integrator: bool, poles: list[complex], zeros: list[complex]) -> Model:
+    """A model with these roots; poles: without the integrator."""
     structure = Structure(len(poles) + integrator, 0, integrator)
     a = np.real(np.poly(poles))[1:] if poles else np.empty(0)
-    b = np.zeros(structure.order)
-    b[structure.order - 1 - len(zeros):] = np.real(np.poly(zeros))
-    return Fit(SAMPLES, structure, Point(a, 1.0, 0.0), np.append(b, 0.0), np.empty(0),
-               np.empty(0), 1.0)
+    b = np.zeros(structure.numerator_taps)
+    b[len(b) - 1 - len(zeros):] = np.real(np.poly(zeros))
+    theta = np.concatenate([[1.0, 0.0, 1.0], structure.xi(b, a)])
+    return Model(structure, SAMPLES.problem(structure), WindowFit(np.zeros(1), 0.0, theta, 1.0))
 
 
-def compared(fit: Fit, held_out: float, criterion: float) -> Compared:
-    return Compared(fit.structure, held_out, fit, fit, criterion)
+def compared(model: Model, held_out: float, criterion: float) -> Compared:
+    return Compared(model.structure, held_out, model, model, criterion)
 
 
-PLAIN = compared(fit_of(False, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8]), 1.2, -20.0)
-NO_INTEGRATOR = compared(fit_of(True, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0]), 1.1, -30.0)
-NEITHER = compared(fit_of(True, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0, 0.98]), 1.0, -40.0)
+PLAIN = compared(model_of(False, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8]), 1.2, -20.0)
+NO_INTEGRATOR = compared(model_of(True, [0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0]), 1.1, -30.0)
+NEITHER = compared(model_of(True, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0, 0.98]), 1.0, -40.0)
 
 
 @pytest.mark.parametrize(('integrator', 'poles', 'zeros', 'cancelled'), [
@@ -47,24 +49,24 @@ NEITHER = compared(fit_of(True, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 1.0, 0.98
     (True, [], [], []), (False, [0.9, 0.5], [], []),
 ])
 def test_a_pole_with_a_zero_on_it_is_cancelled(integrator, poles, zeros, cancelled):
-    assert cancelled_poles(fit_of(integrator, poles, zeros)) == pytest.approx(cancelled)
+    assert cancelled_poles(model_of(integrator, poles, zeros)) == pytest.approx(cancelled)
 
 
 def test_a_cancelled_pole_gives_way_however_well_it_predicts() -> None:
     assert selected([PLAIN, NO_INTEGRATOR, NEITHER]) is PLAIN
     # The structure without the slow pole is not needed either, nor the one without the integrator.
-    slow = compared(fit_of(False, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 0.98]), 1.05, -35.0)
+    slow = compared(model_of(False, [0.98, 0.6 + 0.4j, 0.6 - 0.4j], [-0.8, 0.98]), 1.05, -35.0)
     assert selected([PLAIN, NO_INTEGRATOR, slow, NEITHER]) is PLAIN
 
 
 def test_it_gives_way_to_nothing_else_than_the_structure_without_it() -> None:
-    assert gives_way(NO_INTEGRATOR.fit, [PLAIN])
-    assert not gives_way(PLAIN.fit, [PLAIN])
+    assert gives_way(NO_INTEGRATOR.whole, [PLAIN])
+    assert not gives_way(PLAIN.whole, [PLAIN])
     # Neither of two orders less nor of another delay.
-    assert not gives_way(NEITHER.fit, [PLAIN, NEITHER])
+    assert not gives_way(NEITHER.whole, [PLAIN, NEITHER])
     assert selected([PLAIN, NEITHER]) is NEITHER
-    later = PLAIN._replace(structure=PLAIN.structure._replace(delay=1))
-    assert not gives_way(NO_INTEGRATOR.fit, [later, NO_INTEGRATOR])
+    later = PLAIN._replace(structure=replace(PLAIN.structure, delay=1))
+    assert not gives_way(NO_INTEGRATOR.whole, [later, NO_INTEGRATOR])
 
 
 def test_a_gain_and_a_delay_have_no_poles_and_can_be_controlled() -> None:
