@@ -134,7 +134,7 @@ def without_slips(y: Array, v: Array) -> tuple[Array, float]:
     lively = 3.0 * float(np.percentile(moves, 95.0))
     for turn in (2.0 * np.pi, 360.0) if 0 < len(jumps) <= 0.01 * len(steps) else ():
         whole = np.abs(np.abs(steps[jumps]) - turn) <= usual + 1e-3 * turn
-        alone = [moves[max(known[k] - 5, 0):known[k + 1] + 5].max() <= lively for k in jumps]
+        alone = [moves[max(known[k] - 50, 0):known[k + 1] + 5].max() <= lively for k in jumps]
         if whole.all() and all(alone):
             lost = np.zeros(len(known))
             lost[jumps + 1] = turn * np.sign(steps[jumps])

@@ -134,7 +134,9 @@ def spread_evenly(t: Array, said: list[str], *signals: Array) -> Array:
     within = np.diff(t) == 0.0
     for signal in signals:
         moves = np.abs(np.diff(signal))
-        if not np.nanmean(moves[within]) > 0.5 * np.nanmean(moves[~within]):
+        known = np.isfinite(moves)
+        of_run, between = moves[within & known], moves[~within & known]
+        if not len(of_run) or not len(between) or of_run.mean() <= 0.5 * between.mean():
             return t
     period = float(np.median(spans[1:] / lengths[1:]))
     # The first run may have begun before the log did; a pause is between two runs.
