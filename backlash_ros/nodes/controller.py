@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections import deque
@@ -29,12 +28,7 @@ from backlash_ros.core.jobs.executor import Executor
 from backlash_ros.core.jobs.worker import WorkerExecutor
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.joint_loops import JointLoops
-from backlash_ros.core.loop.sample_counter import (
-    UNNUMBERED,
-    Output,
-    SampleCounter,
-    kept_outputs,
-)
+from backlash_ros.core.loop.sample_counter import UNNUMBERED, Output, SampleCounter, kept_outputs
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER
 from backlash_ros.nodes.control.joint import Joint
@@ -308,8 +302,10 @@ class ControllerNode(ManagedNode):
             self._io.serve_waiting()
             steps = loops.answer(outputs)
             if steps:
-                os.sched_yield()  # to the driver, which the command has woken
-                loops.use_spare_time(next(iter(outputs.values())).received_ns)
+                if loops.keeps_up(next(iter(outputs.values())).received_ns):
+                    # On a busy processor the driver, woken by the command, would have to wait.
+                    time.sleep(0.05 * self.settings.sample_period)
+                loops.use_spare_time()
                 self._follow_up(loops, steps)
 
     def _answer_pairs(self) -> None:

@@ -67,15 +67,21 @@ class JointLoops:
         self.counter.sender.learn()
         return steps
 
-    def use_spare_time(self, received_ns: int) -> None:
+    def keeps_up(self, received_ns: int) -> bool:
+        """Whether the output that was answered was the newest one, as far as can be known.
+
+        received_ns: when it came, by the system clock; 0: not known.
+        """
+        is_behind = 0 < received_ns < time.time_ns() - self._period_s * 1e9
+        self._behind = self._behind + 1 if is_behind else 0
+        return not is_behind
+
+    def use_spare_time(self) -> None:
         """Let the next loop take up and submit fits, once the commands have left.
 
         Where the next output is waiting already, there is no time for what may be put off.
-        received_ns: when the output came that was answered, by the system clock; 0: not known.
         """
         put_off = 5  # samples for which one that is behind may leave it alone
-        is_behind = 0 < received_ns < time.time_ns() - self._period_s * 1e9
-        self._behind = self._behind + 1 if is_behind else 0
         if self._behind % put_off == 0:
             next(self._turns).core.refine(REFINE_SHARE * self._period_s)
 

@@ -10,10 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-LOOK_AFTER, KEPT_PAIRS = 20, 200  # intervals between two looks at the newest ones
 LOOKS = 10  # that tell the origin, after which it counts as settled
-CORRELATED = 10.0  # neighbouring intervals that share their error
-SIGNIFICANT = 5.0  # standard deviations
 
 
 class ReportOrigin:
@@ -37,7 +34,7 @@ class ReportOrigin:
     def restart(self) -> None:
         """Look again: the driver was restarted, and its encoder perhaps zeroed."""
         self._looks = 0
-        self._pairs: deque[tuple[float, float]] = deque(maxlen=KEPT_PAIRS + 1)
+        self._pairs: deque[tuple[float, float]] = deque(maxlen=201)
         self._new = 0  # pairs since the last look
 
     @property
@@ -47,11 +44,12 @@ class ReportOrigin:
 
     def changed_by(self, report: float, command: float) -> bool:
         """Take in what was reported of an interval and commanded in it; whether `value` changed."""
+        look_after, correlated, significant = 20, 10.0, 5.0  # intervals, intervals, deviations
         if self._looks == LOOKS:
             return False
         self._pairs.append((report, command))
         self._new += 1
-        if self._new <= LOOK_AFTER:
+        if self._new <= look_after:
             return False
         self._new = 0
         r, v = np.array(self._pairs).T
@@ -63,14 +61,14 @@ class ReportOrigin:
             return False
         p = float((x - x_mean) @ (y - y_mean)) / spread
         rest = float(np.mean((y - y_mean - p * (x - x_mean)) ** 2))
-        p_std = sqrt(CORRELATED * rest / spread)
-        if not 1.0 - p > SIGNIFICANT * p_std + 1e-6:
+        p_std = sqrt(correlated * rest / spread)
+        if not 1.0 - p > significant * p_std + 1e-6:
             return False
         self._looks += 1
         found = (y_mean - p * x_mean) / (1.0 - p)
         off = abs(found - self.value)
-        std = sqrt(CORRELATED * rest / len(x) + (p_std * (x_mean - found)) ** 2) / (1.0 - p)
-        if off <= SIGNIFICANT * max(std, sqrt(rest)) + rounding:
+        std = sqrt(correlated * rest / len(x) + (p_std * (x_mean - found)) ** 2) / (1.0 - p)
+        if off <= significant * max(std, sqrt(rest)) + rounding:
             return False
         self.value, self._looks = found, LOOKS
         return True
