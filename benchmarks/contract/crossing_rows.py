@@ -103,12 +103,14 @@ def case_of(seed: int) -> tuple[dict[str, Any], Array, Array, dict[str, Any]]:
                    'estimator.initial.c_l': off * hidden.c_l}
     count = round(min(LONGEST_S, max(12.0, 5.3 * 2.0 * pi / omega)) / period_s)
     t = period_s * np.arange(min(count, MOST_SAMPLES))
+    shape: Array = np.sin(omega * t)
     if motion == 'moves':
         shape = moves_with_rests(rng, period_s, omega, float(t[-1]) + period_s)[:len(t)]
-    else:
-        shape = {'sine': np.sin, 'steps': lambda phase: np.sign(np.sin(phase + 1e-9)),
-                 'triangle': lambda phase: sawtooth(phase + 0.5 * pi, 0.5)}[motion](omega * t)
-    wanted = amplitude * np.asarray(shape)
+    elif motion == 'steps':
+        shape = np.sign(np.sin(omega * t + 1e-9))
+    elif motion == 'triangle':
+        shape = sawtooth(omega * t + 0.5 * pi, 0.5)
+    wanted = amplitude * shape
     heard = wanted + heard_noise * rng.standard_normal(len(t))
     drawn = {'plant': plant, 'motion': motion, 'constants': constants, 'rate': 1.0 / period_s,
              'omega': omega, 'amplitude': amplitude / of_gap, 'noise': noise / of_gap,
