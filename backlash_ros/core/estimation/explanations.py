@@ -127,7 +127,8 @@ def afresh(
             if m * found[0].m > 0.0 and all(abs(gap - other) > apart * other for other in gaps):
                 gaps.append(gap)
                 theta = np.concatenate([[m, m * (p0 - record.v[0]), gap], xi])
-                start = p.step(WindowFit(np.zeros(1), p0, theta, noise), 1.0, held=True)
+                start = p.step(
+                    WindowFit(np.zeros(1), p0, theta, noise), 1.0, held=True, begun=True)
                 fits.append(p.finished(p.fitted(start, FIRST_STEPS)))
         xi = max(fits, key=lambda f: f.evidence).theta[3:]
     if not fits:
