@@ -158,7 +158,7 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
         resource.prlimit(nodes['recorder'].process.pid, resource.RLIMIT_FSIZE, limit)
         reason = nodes['recorder'].wait_for('recording_stopped')['reason']
         assert f'recording to {bag} stopped: ' in reason
-        assert re.search(r'saved are \d+ messages of \d+\.\d s', reason)
+        saved, seconds = re.search(r'saved are (\d+) messages of (\d+\.\d) s', reason).groups()
         assert reason.endswith(f'ros2 run backlash_ros recorder --repair {bag}')
         probe.wait_until(
             lambda: any(
@@ -178,8 +178,8 @@ def test_full_disk_stops_the_recording_and_nothing_else(tmp_path: Path) -> None:
     assert log.count('stopped: ') == 1
     assert 'Traceback' not in log
     assert re.search(r'[1-9]\d* messages came after the recording had stopped', log)
-    saved = int(re.search(r'saved are (\d+) messages', reason)[1])
-    assert sum(1 for _ in BagReader(bag).messages()) >= saved > 0
+    assert 0.0 < float(seconds) < 600.0  # about a second
+    assert sum(1 for _ in BagReader(bag).messages()) >= int(saved) > 0
     assert read_bag(bag).record.samples > 20
     assert recorder('--repair', bag).returncode == 0
     assert damage(bag) == ''
