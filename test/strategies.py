@@ -53,16 +53,6 @@ def signals(size: float = 100.0, min_size: int = 1, max_size: int = 60) -> st.Se
     return st.lists(value, min_size=min_size, max_size=max_size)
 
 
-@st.composite
-def strokes(draw: st.DrawFn, size: float = 60.0, most: int = 8) -> list[float]:
-    """A signal that moves from one random value to the next, each time in 2 to 30 samples."""
-    signal = [0.0]
-    for _ in range(draw(st.integers(2, most))):
-        count = draw(st.integers(2, 30))
-        signal += np.linspace(signal[-1], draw(st.floats(-size, size)), count + 1)[1:].tolist()
-    return signal
-
-
 def eighths(low: int, high: int) -> st.SearchStrategy:
     return st.integers(low, high).map(lambda i: i / 8.0)
 
