@@ -24,12 +24,7 @@ from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Setup, Win
 from backlash_ros.core.estimation.learning import learn
 from backlash_ros.core.estimation.observer import Following, Gains, Place, gains_of, place_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
-from backlash_ros.core.estimation.settings import (
-    FEWEST,
-    FIRST_FIT,
-    HELD_REVERSALS,
-    LONGEST,
-)
+from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, HELD_REVERSALS, LONGEST
 from backlash_ros.core.jobs.executor import ChannelSamples, Executor, Failure
 from backlash_ros.core.law import Interval, Law, LawReport
 from backlash_ros.core.laws.fixed import FixedBacklash

@@ -21,22 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.plant_family import Family, filtered, padded, state_columns
-from backlash_ros.core.estimation.play import (
-    LEFT,
-    NEITHER,
-    engaged,
-    hats,
-    play,
-    reversals,
-    walk,
-)
-from backlash_ros.core.estimation.posterior import (
-    LEAST_SCALE,
-    Prior,
-    Start,
-    WindowFit,
-    error_of_plant,
-)
+from backlash_ros.core.estimation.play import LEFT, NEITHER, engaged, hats, play, reversals, walk
+from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit, error_of_plant
 from backlash_ros.core.estimation.reading import Likelihood, independence, likelihood, step_of
 from backlash_ros.core.plant.filtering import lfilter
 
@@ -156,12 +142,7 @@ class Problem:
                 squares, count = float((w * r) @ r), float(w.sum()) + 1.0
                 value = -0.5 * count * log((squares + self.nominal**2) / count) \
                     if isfinite(squares) else -inf
-            if self.older is not None:
-                value -= 0.5 * float(np.sum((self.older.rows @ f.theta - self.older.values) ** 2))
-            leaks, scale = self.family.leaks, max(f.scale, LEAST_SCALE)
-            leak, xi = f.theta[3:3 + leaks], f.theta[3 + leaks:]
-            value -= 0.5 * float(xi @ xi) / scale**2 + len(xi) * log(scale) + 0.5 * log(scale) ** 2
-            value -= 0.5 * float(leak @ leak)
+            value += f.log_prior(self.older, self.family.leaks)
             if len(self._hats):
                 moves = np.diff(self._knots_of(f), append=0.0) / self._knot_std
                 value -= 0.5 * float(moves @ moves)

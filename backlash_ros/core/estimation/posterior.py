@@ -7,7 +7,7 @@ N / (1 - rho + N rho) independent ones. The scale of the error of G is integrate
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from math import sqrt
+from math import log, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -90,6 +90,15 @@ class WindowFit:
         apart = self.theta[3:] - xi
         cov = self.cov_xi + 1e-16 * np.eye(len(apart))
         return 0.5 * float(apart @ np.linalg.solve(cov, apart))
+
+    def log_prior(self, older: Prior | None, leaks: int) -> float:
+        """Of theta, given what older samples say of it; leaks: how many of xi are leaks."""
+        scale = max(self.scale, LEAST_SCALE)
+        leak, xi = self.theta[3:3 + leaks], self.theta[3 + leaks:]
+        squares = float(xi @ xi) / scale**2 + float(leak @ leak)
+        if older is not None:
+            squares += float(np.sum((older.rows @ self.theta - older.values) ** 2))
+        return -0.5 * (squares + log(scale) ** 2) - len(xi) * log(scale)
 
     @property
     def crossings(self) -> Array:
