@@ -257,8 +257,11 @@ def spread(p: Problem, best: WindowFit, others: Sequence[WindowFit] = ()) -> Arr
                 best, p0=v + (best.p0 - v) * gap / best.gap,
                 theta=best.theta + best.cov[:, 2] * reach / std,
             )
-            for _ in range(FEW_STEPS):
-                there = p.kept(p.step(there, held=True))
+            try:
+                for _ in range(FEW_STEPS):
+                    there = p.kept(p.step(there, held=True))
+            except np.linalg.LinAlgError:  # so far away that y is no number
+                break
             behind = max(likeliest - p.log_posterior(there, weights), 1.0)
             apart = there.crossings - best.crossings
             wider = max(0.5 / behind - reach**-2, 0.0) * np.outer(apart, apart)

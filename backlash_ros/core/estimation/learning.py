@@ -68,8 +68,9 @@ def learn(setup: Setup, record: Window, before: Belief) -> Belief:
 
 def _begun_anew(before: Belief, first: int, end: int, next_at: int) -> Belief:
     """Nothing is known of the samples; what was published stays."""
+    reason = Status.INCONSISTENT if before.fit is not None else before.reason
     return replace(
-        before, state=State.SEARCHING, reason=Status.INCONSISTENT, fit=None, first=first, end=end,
+        before, state=State.SEARCHING, reason=reason, fit=None, first=first, end=end,
         next_at=next_at, older=None, start=None, candidate=None, doubt_from=None,
     )
 
