@@ -163,12 +163,12 @@ def _different(fits: list[WindowFit]) -> list[WindowFit]:
 def with_intervals(p: Problem, f: WindowFit) -> WindowFit:
     """The finished fit, by intervals where readings have a step that the noise does not hide.
 
-    The noise beside the rounding is the likeliest of a grid, but as large as leaves three
-    readings near an edge of their interval for every unknown: fewer are no normal posterior.
+    The noise beside the rounding is the likeliest of a grid, but as large as leaves a
+    reading near an edge of its interval for every unknown: fewer are no normal posterior.
     """
     step, unknowns = p.step_of_readings, len(f.x) + len(f.knots) + 1 + len(f.theta)
     largest = 0.25 * step
-    edges = 3.0 * unknowns / max(float(p.weights(f).sum()), 1.0)
+    edges = unknowns / max(float(p.weights(f).sum()), 1.0)
     least = min(step * max(1.0 / 64.0, edges), largest)
     if not step or f.m <= 0.0 or (not f.step and f.noise_std > 0.75 * step):
         return p.finished(f)
