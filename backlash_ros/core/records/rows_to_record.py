@@ -60,6 +60,7 @@ def record_of(
     table = table[:, int(np.argmax(np.isfinite(table[1]))):]
     t = spread_evenly(table[0] - table[0, 0], said, *table[1:3])
     v, y = readings(t, _held(table[1]), table[2], said, notes)
+    _check(y=y)
     if sent is not None:
         v = sent - np.array([[table[0, 0]], [0.0]])
     record = on_grid(Rows(t, v, y, None if commands is None else _held(table[3])), period)

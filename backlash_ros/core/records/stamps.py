@@ -26,6 +26,7 @@ def in_seconds(
             raise RecordError(f'{what}: give --period S, the time from row to row')
         said.append(f'{what}: rows are counted')
         return np.asarray(period * np.arange(count, dtype=float))
+    t = np.where(np.isfinite(t), t, np.nan)
     unit_s = unit_s or _guessed_unit(known, period, said)
     for around in (2.0**16, 2.0**32, 86400.0 / unit_s, 43200.0 / unit_s, 3600.0 / unit_s):
         falls = np.diff(t, prepend=t[0]) < -0.5 * around

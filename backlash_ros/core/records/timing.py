@@ -68,7 +68,8 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     are too few, or they are spread over too long a time.
     """
     nearly_even = 0.02  # of a period that stamps of even samples may be off
-    guess = period or (typical_step(rows.t) if late else _period(rows.t))
+    typical = typical_step(rows.t)
+    guess = period or (typical if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
     if late:
         found = _line(numbered(rows.t / guess), rows.t)
@@ -137,7 +138,8 @@ def _longest_stretch(rows: Rows, period: float) -> tuple[Rows, str]:
 def _numbering(t: Array, steps: Array, period: float) -> Numbering:
     """The numbers of rows t (M,) that lie closest to a line. steps (M - 1,): in periods."""
     # The median of uneven steps is off by more than a long record bears.
-    mean = period * float(np.mean(steps[steps < 0.5 * BREAK])) or period
+    usual = steps[steps < 0.5 * BREAK]
+    mean = period * (float(np.mean(usual)) if usual.any() else 1.0)
     found = []
     for index in (
         _risen(np.append(0.0, np.cumsum(np.round(steps)))), numbered(t / period),
@@ -145,7 +147,11 @@ def _numbering(t: Array, steps: Array, period: float) -> Numbering:
     ):
         found.append(_line(index, t))
         # Around the line that all of them tell, as far as they are late by less than a period.
-        found.append(_line(_risen(np.round((t - found[-1].begin) / found[-1].period)), t))
+        if found[-1].period > 0.0:
+            found.append(_line(_risen(np.round((t - found[-1].begin) / found[-1].period)), t))
+    found = [one for one in found if one.period > 0.0 and one.numbers[-1] < MOST_SAMPLES]
+    if not found:
+        raise RecordError('t does not rise steadily: give --period S, or cut out one motion')
     best = min(found, key=lambda one: round(float(np.std(one.off)) / one.period, 9))
     # With no more digits than the stamps bear.
     deviation = max(2.0 * float(np.std(best.off)), 1e-12 * period) / float(best.numbers[-1])

@@ -187,6 +187,7 @@ def test_the_unit_of_a_time_stands_in_its_name(name: str, unit: float | None) ->
     ('t,v,y\n0,a,2\n1,b,1\n', "column 'v': 'a' in row 1 is no number"),
     ('t,v,y\nsoon,1,2\nlater,2,1\n', "'soon' in row 1 is no time"),
     ('t,v,y\n0,1,2\n0,1,3\n', 't does not move'),
+    ('t,v,y\ninf,1,2\ninf,2,3\n0,3,4\n', 't does not move'),
     ('t,v,y\n0,1,\n1,2,\n', 'y holds no number'), ('t,v,y\n0,,1\n1,,1\n', 'v holds no number'),
     ('t,v,y\n0,1,1\n1,1,2\n', 'v does not move'),
     ('t,v,y\n0,1,2\n1,1e300,2\n', 'v reaches 1e+300'),
