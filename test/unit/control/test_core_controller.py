@@ -14,7 +14,6 @@ from backlash_ros.core.control.limits import Limits
 from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.law import Interval, Law
-from backlash_ros.core.parameters.errors import ParameterError
 
 PAPER = Estimate(1.3, 3.0, -3.0, 0.22)
 
@@ -134,27 +133,6 @@ def test_input_that_is_not_finite_is_refused_and_changes_nothing(name: str, bad:
         disturbed.step(values['y'], values['y_m'], applied=(values['applied'],))
     assert estimator.updates == []
     assert disturbed.step(0.2, 3.0) == reference.step(0.2, 3.0)
-
-
-def test_negative_number_of_lost_samples_is_refused() -> None:
-    c = controller(Notebook())
-    c.step(0.0, 1.0)
-    with pytest.raises(ValueError, match='lost'):
-        c.step(0.1, 2.0, lost=-1)
-    assert c.lost_samples == 0
-
-
-@pytest.mark.parametrize(('intervals', 'name'), [
-    (((0.0, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
-    (((1.0, 0.5), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
-    (((nan, 1.0), (0.0, 1.0), (-1.0, 0.0)), 'estimator.bounds.m'),
-    (((0.5, 1.0), (0.0, 1.0), (1.0, 2.0)), 'estimator.bounds.c_l'),
-    (((0.5, 1.0), (0.0, 1.0), (-1.0, nan)), 'estimator.bounds.c_l'),
-])
-def test_invalid_bounds_are_refused_and_named(intervals, name):
-    with pytest.raises(ParameterError) as refusal:
-        Bounds(*intervals)
-    assert refusal.value.name == name
 
 
 @given(values=st.tuples(*[st.floats(-1e3, 1e3)] * 3))

@@ -1,6 +1,6 @@
 """Backlash inverse, equations (2.2) and (2.3)."""
 
-from math import ceil, nan
+from math import ceil
 
 import pytest
 from hypothesis import given
@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 from strategies import plays, signals, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash
 
 
@@ -63,15 +62,3 @@ def test_take_up_crosses_the_gap_with_limited_slope_and_then_arrives(play, take_
     for _ in range(ceil(play.gap / take_up) + 2):
         u = backlash.step(inverse.step(target, play.m, play.c_r, play.c_l))
     assert u == pytest.approx(target, abs=play.rounding(u_d + abs(target)))
-
-
-@pytest.mark.parametrize(('options', 'name'), [
-    ({'direction_band': -1.0}, 'inverse.direction_band'),
-    ({'direction_band': nan}, 'inverse.direction_band'),
-    ({'take_up': 0.0}, 'inverse.take_up_rate'),
-    ({'take_up': nan}, 'inverse.take_up_rate'),
-])
-def test_invalid_options_are_refused_and_named(options: dict[str, float], name: str) -> None:
-    with pytest.raises(ParameterError) as refusal:
-        BacklashInverse(**options)
-    assert refusal.value.name == name

@@ -1,14 +1,11 @@
 """Backlash, equation (2.1)."""
 
 from fractions import Fraction
-from math import inf, nan
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from strategies import eighths
 
-from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.backlash import Backlash, Region
 
 
@@ -37,18 +34,3 @@ def test_clamp_equals_the_three_printed_cases(m, c_l, gap, u, signal):
         )
         assert backlash.step(v) == expected
         assert backlash.region == region
-
-
-@pytest.mark.parametrize(('values', 'name'), [
-    ((-1.0, 3.0, -3.0, 0.0), 'backlash.m'),
-    ((nan, 3.0, -3.0, 0.0), 'backlash.m'),
-    ((1.0, inf, -3.0, 0.0), 'backlash.c_r'),
-    ((1.0, 3.0, -inf, 0.0), 'backlash.c_l'),
-    ((1.0, -3.0, 3.0, 0.0), 'backlash.c_l'),
-    ((1.0, 3.0, -3.0, nan), 'backlash.initial_u'),
-])
-def test_invalid_backlash_is_refused_and_named(values, name):
-    with pytest.raises(ParameterError) as refusal:
-        Backlash(*values)
-    assert refusal.value.name == name
-    assert str(refusal.value).startswith(f'{name}=')

@@ -83,24 +83,3 @@ def test_given_plant_takes_the_place_of_the_known_one_in_the_simulation_alone() 
 def test_bad_truth_is_named_as_such() -> None:
     with pytest.raises(ParameterError, match=r'truth\.numerator=.* of truth\.denominator'):
         build_plant(Parameters({'truth.numerator': [1.0, 2.0], 'truth.denominator': [1.0, 0.5]}))
-
-
-def test_walk_of_u_is_one_and_leaves_the_noise_alone() -> None:
-    samples, std = 4000, 0.2
-    values = {'plant.numerator': [1.0], 'plant.denominator': [1.0, 0.0], 'backlash.c_r': 1e-9,
-              'backlash.c_l': -1e-9, 'output_noise_std': 1e-3, 'sample_period': PERIOD}
-
-    def outputs(**changes: float) -> NDArray[np.float64]:
-        plant = build_plant(Parameters({**values, **changes}))
-        y = []
-        for _ in range(samples):
-            y.append(plant.measure())
-            # The walk is a disturbance, and not the output of the backlash.
-            assert plant.step(0.0) == pytest.approx(0.0, abs=1e-8)
-        return np.array(y)
-
-    walk = outputs(**{'truth.walk_std': std}) - outputs()
-    assert walk[1] == pytest.approx(0.0, abs=1e-8)
-    steps = np.diff(walk[1:])
-    assert steps.std() == pytest.approx(std * PERIOD**0.5, rel=0.05)
-    assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 0.05
