@@ -1,6 +1,5 @@
 """Hypothesis strategies and stand-ins shared by the tests of the core."""
 
-from collections import deque
 from dataclasses import dataclass
 from math import nan
 
@@ -117,27 +116,15 @@ NO_STATE = NoState()
 class KnownInput:
     """Stands in for InputReconstruction where u is known: hand u(k-1) over as y(k)."""
 
-    std = 0.0
-    innovation = nan
+    std, innovation, lag, ready = 0.0, nan, 1, True
 
-    def __init__(self, lag: int = 1) -> None:
-        self.lag = lag
-        self._window: deque[float] = deque([0.0] * lag, maxlen=lag)
-        self._samples = 0
-
-    @property
-    def u_hat(self) -> float:
-        return self._window[0]
-
-    @property
-    def ready(self) -> bool:
-        return self._samples >= self.lag
+    def __init__(self) -> None:
+        self.u_hat = 0.0
 
     def newer(self, samples: int) -> float:
-        return self._window[min(samples, self.lag - 1)]
+        return self.u_hat
 
     def update(self, y: float) -> float:
-        """Take in u(k-1) and return u(k - lag)."""
-        self._window.append(y)
-        self._samples += 1
-        return self._window[0]
+        """Take in u(k-1) and return it."""
+        self.u_hat = y
+        return y

@@ -1,7 +1,6 @@
 """The executor of the nodes: messages at once, and nothing else forgotten over them."""
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 import rclpy
@@ -13,7 +12,7 @@ from ros_processes import wait_until
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from backlash_ros.nodes.runtime.executor import Polled, PromptExecutor, serve_polled
+from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.tools.bringup.environment import free_domain
 
 
@@ -49,32 +48,6 @@ def loop() -> Iterator[Loop]:
         loop = Loop(domain)
         yield loop
         loop.close()
-
-
-def test_messages_of_a_polled_subscription_wait_and_wake_nobody(loop: Loop) -> None:
-    taken: list[tuple[float, int]] = []
-
-    def take(message: Float64, info: dict[str, Any]) -> None:
-        taken.append((message.data, info['publication_sequence_number']))
-
-    untyped: Any = take
-    polled = loop.node.create_subscription(
-        Float64, 'number', untyped, 3, callback_group=Polled()
-    )
-    other: list[float] = []
-    loop.node.create_subscription(Float64, 'other', lambda message: other.append(message.data), 10)
-    publisher = loop.node.create_publisher(Float64, 'other', 10)
-    loop.spin_until(publisher.get_subscription_count, 'the other subscriber')
-    loop.say(*map(float, range(5)))
-    # What is said later and heard already shows that the numbers have come.
-    publisher.publish(Float64(data=1.0))
-    loop.spin_until(lambda: other, 'the other message')
-    assert taken == []
-    serve_polled(polled)
-    assert [value for value, _ in taken] == [2.0, 3.0, 4.0]
-    assert [number - taken[0][1] for _, number in taken] == [0, 1, 2]
-    serve_polled(polled)
-    assert len(taken) == 3
 
 
 def test_a_flood_of_messages_stops_neither_timers_nor_services(loop: Loop) -> None:

@@ -163,14 +163,3 @@ def test_a_worker_ends_with_its_parent_though_it_works(tmp_path: Path, number: i
             parent.send_signal(number)
         wait_until(lambda: not is_there(worker), 'the worker has ended')
         assert parent.stderr.read().count('Traceback') == (number == signal.SIGINT)
-
-
-def test_interrupts_are_for_the_loop_alone(executor: WorkerExecutor) -> None:
-    channel = executor.open()
-    channel.submit(operator.neg, 1)
-    assert result_of(channel) == -1
-    assert executor.pid is not None
-    os.kill(executor.pid, signal.SIGINT)
-    channel.submit(operator.neg, 2)
-    assert result_of(channel) == -2
-    assert os.getpgid(executor.pid) != os.getpgid(0)  # nor does a terminal send it any

@@ -33,14 +33,6 @@ def test_hold_sends_nothing_and_zero_one_command(v: float) -> None:
     assert list(last_commands('zero', at_rest(v), lambda: Limits(low=2.0))) == [2.0]
 
 
-def test_limits_that_change_on_the_way_hold_at_once() -> None:
-    limits = [Limits(move=2.0)]
-    commands = last_commands('ramp', at_rest(10.0), lambda: limits[0])
-    assert next(commands) == 8.0
-    limits[0] = Limits(high=20.0, low=5.0, move=0.5)
-    assert list(commands) == [7.5, 7.0, 6.5, 6.0, 5.5, 5.0]
-
-
 @pytest.mark.parametrize('name', ['on_stop', 'on_timeout'])
 def test_ramp_without_a_rate_is_refused(name: str) -> None:
     with pytest.raises(ParameterError, match=r'needs a finite control\.rate_max'):

@@ -1,6 +1,5 @@
 """Records and jobs, computed at once."""
 
-import operator
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,7 +7,6 @@ from hypothesis import strategies as st
 from backlash_ros.core.jobs.executor import (
     ChannelSamples,
     Executor,
-    Failure,
 )
 
 
@@ -39,28 +37,3 @@ def test_a_job_sees_no_samples_before_those_it_needs() -> None:
     for since in (15, 19, 20):
         channel.submit(everything, since=since)
         assert channel.poll() == (since, [[*range(since, 20)]])
-
-
-def test_samples_cannot_be_changed_by_a_job() -> None:
-    channel = Executor().open(1, 10)
-    channel.append(1.0)
-    channel.submit(overwrite)
-    failure = channel.poll()
-    assert isinstance(failure, Failure)
-    assert failure.kind == 'ValueError'
-    channel.submit(everything)
-    assert channel.poll() == (0, [[1.0]])
-
-
-def overwrite(samples: ChannelSamples) -> None:
-    samples.columns[:] = 0.0
-
-
-def test_one_job_at_a_time_whose_result_is_told_once() -> None:
-    channel = Executor().open()
-    assert channel.submit(operator.add, 2, 3)
-    assert not channel.submit(operator.add, 4, 5)
-    assert channel.busy
-    assert channel.poll() == 5
-    assert not channel.busy
-    assert channel.poll() is None

@@ -116,14 +116,6 @@ def test_values_that_cannot_be_are_refused(tmp_path, part, value, reason):
         load_estimate(parameters(file))
 
 
-def test_file_of_another_format_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / 'estimates.json'
-    save_estimate(file, LEARNED, parameters(file))
-    file.write_text(file.read_text().replace('"version": 1', '"version": 2'))
-    with pytest.raises(ParameterError, match='has format 2'):
-        load_estimate(parameters(file))
-
-
 def test_a_first_guess_is_not_worth_saving() -> None:
     assert worth_saving(LEARNED)
     assert not worth_saving(Estimate(1.0, 1.0, -1.0, 0.2))

@@ -10,7 +10,7 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rich.console import Console
 
 from backlash_ros.nodes.watching.followed import ControllerState
-from backlash_ros.nodes.watching.screen import axis_end, bar, screen
+from backlash_ros.nodes.watching.screen import bar, screen
 
 VALUES = {
     'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',
@@ -53,13 +53,6 @@ def test_a_bar_ends_at_the_value_and_shades_the_band() -> None:
     assert bar(5.0, 1e-9, 10.0, 10) == '████▒·····'
     assert bar(0.0, 1e-9, 10.0, 10) == '▒·········'
     assert bar(nan, 1.0, 10.0, 10) == ' ' * 10
-
-
-@pytest.mark.parametrize(('largest', 'end'), [
-    (0.0, 0.0), (1.3, 2.0), (0.95, 2.0), (3.0, 5.0), (0.017, 0.02), (80.0, 100.0), (9.5, 20.0),
-])
-def test_an_axis_ends_at_a_round_number_beyond_the_largest_value(largest, end):
-    assert axis_end(largest) == pytest.approx(end)
 
 
 def test_state_estimates_and_figures_are_shown() -> None:

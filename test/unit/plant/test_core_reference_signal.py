@@ -60,11 +60,6 @@ def test_file_plays_sample_k_at_the_kth_period_whatever_the_rounding(k, period):
     assert reference(k * period) == float(k)
 
 
-def test_unknown_waveform_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"waveform='sin' must be one of sine, "):
-        signal('sin')
-
-
 @pytest.mark.parametrize(('text', 'complaint'), [
     ('', 'header t,y_m'),
     ('t,y_m\n0,1,2\n', 'line 2 must hold t,y_m'),

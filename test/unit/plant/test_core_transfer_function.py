@@ -1,15 +1,12 @@
 """G(z) and its state space, against scipy.signal."""
 
-from math import inf, nan
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 from strategies import output_of, plants
 
-from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.transfer_function import TransferFunction
 
 
@@ -31,18 +28,3 @@ def test_state_space_and_simulation_agree_with_scipy(model: TransferFunction, se
 def test_frequency_response_agrees_with_scipy(model: TransferFunction) -> None:
     w, expected = signal.freqz(model.numerator, model.denominator, np.linspace(0.1, 3.1, 30))
     np.testing.assert_allclose(model.response(np.exp(1j * w)), expected, rtol=1e-6, atol=1e-12)
-
-
-@pytest.mark.parametrize(('numerator', 'denominator', 'name'), [
-    ([1.0, 0.0], [1.0, 0.5], 'plant.numerator'),
-    ([0.0, 0.0], [1.0, 0.5], 'plant.numerator'),
-    ([], [1.0, 0.5], 'plant.numerator'),
-    ([nan], [1.0, 0.5], 'plant.numerator'),
-    ([1.0], [0.0, 1.0, 0.5], 'plant.denominator'),
-    ([1.0], [1.0, inf], 'plant.denominator'),
-    ([1.0], [], 'plant.denominator'),
-])
-def test_invalid_polynomials_are_refused_and_named(numerator, denominator, name):
-    with pytest.raises(ParameterError) as refusal:
-        TransferFunction(numerator, denominator)
-    assert refusal.value.name == name
