@@ -269,17 +269,15 @@ def _why_nothing(v: Array, y: Array, options: Options) -> str:
 
 
 def _searched(
-    v: Array, y: Array, options: Options, delays: Sequence[int],
+    v: Array, y: Array, options: Options, delays: Sequence[int], step: float | None = None,
 ) -> Generator[str, None, _Search]:
-    """The best structure with one of these delays."""
+    """The best structure with one of these delays. step: of the readings, None: told from them."""
     far_off = 0.03  # relative distance of the last gap from the first, with which to begin anew
     yield 'searching the gap'
-    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y))
+    samples = Samples(v, y, max(delays) + 1, len(v), step_of(y) if step is None else step)
     cut = samples.last - round(options.held_out * samples.count)
     found = _with_general(samples, delays)
     kept = _without_outliers(samples, found[0])
-    if found[0].rms > kept.step > 0.0:
-        kept = replace(kept, step=0.0)
     if kept is not samples:
         samples = kept
         found = _with_general(samples, delays)
@@ -303,6 +301,8 @@ def _searched(
         if not again or abs(best.gap - candidates[0].gap) <= far_off * best.gap:
             break
         candidates = [best, candidates[0]]  # the general G may have been a poor one
+    if best.rms > samples.step > 0.0:  # rounding is the least of what is left
+        return (yield from _searched(v, y, options, delays, 0.0))
     rows = effective(best.left)
     rivals = sorted(
         (0.5 * rows * log(max(one.squares, TINY) / max(best.squares, TINY)), one.gap)
