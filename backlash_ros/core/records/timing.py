@@ -71,6 +71,8 @@ def on_grid(rows: Rows, period: float | None = None, late: bool = False) -> Reco
     typical = typical_step(rows.t)
     guess = period or (typical if late else _period(rows.t))
     rows, cut = _longest_stretch(rows, guess)
+    if not np.isfinite(rows.y).any():
+        raise RecordError(f'{cut}but y holds no number there: cut out one motion with --from, --to')
     if late:
         found = _line(numbered(rows.t / guess), rows.t)
         # All stamps together tell it better than one step does, but for how late the first and the
