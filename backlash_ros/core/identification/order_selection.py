@@ -38,7 +38,7 @@ from backlash_ros.core.plant.filtering import lfilter
 
 Array = NDArray[np.float64]
 
-RACE_STEPS = 4  # of a fit that tells whether a structure may be the best
+RACE_STEPS = 10  # of a fit that tells whether a structure may be the best
 PLATEAU = 10.0  # difference of the criterion below which two delays are equally good
 
 
@@ -63,7 +63,7 @@ def compare(
 ) -> list[Compared]:
     """Fit every structure, from models whose gap and beginning are about right.
 
-    A few steps on the first part tell which structures may be the best; only these are fitted to
+    Ten steps on the first part tell which structures may be the best; only these are fitted to
     the end. cut: number of the first sample that is held out.
     """
     train, later = replace(samples, last=cut), replace(samples, first=cut)
