@@ -10,8 +10,8 @@ import numpy as np
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.control.inverse import BacklashInverse
 from backlash_ros.core.control.limits import Limits, check_last_commands
+from backlash_ros.core.control.paper_structure import Proportional
 from backlash_ros.core.control.pole_placement import PolePlacement
-from backlash_ros.core.control.proportional import Proportional
 from backlash_ros.core.control.protocol import ControlStructure
 from backlash_ros.core.control.serial_plant import DOUBT, SerialPlant
 from backlash_ros.core.control.tracking.design import (

@@ -10,7 +10,7 @@ import numpy as np
 
 from backlash_ros.core.assembly import build_controller, build_model, build_plant, build_state_model
 from backlash_ros.core.control.controller import ControlStep
-from backlash_ros.core.control.proportional import LARGEST_F_OVER_M
+from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M
 from backlash_ros.core.control.protocol import LARGEST_FEEDBACK, LARGEST_IN_ACQUISITION
 from backlash_ros.core.control.tracking.design import Weights, feedback_around
 from backlash_ros.core.control.tracking.rest import TOLERANCE

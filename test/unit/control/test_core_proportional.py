@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from strategies import NO_STATE, Play, usual_plays
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.proportional import LARGEST_F_OVER_M, Proportional
+from backlash_ros.core.control.paper_structure import LARGEST_F_OVER_M, Proportional
 from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.estimate import Estimate
 

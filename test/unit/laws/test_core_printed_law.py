@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from strategies import NO_STATE, KnownInput, eighths
 
 from backlash_ros.core.control.inverse import BacklashInverse
-from backlash_ros.core.control.proportional import Proportional
+from backlash_ros.core.control.paper_structure import Proportional
 from backlash_ros.core.control.protocol import Command, ControlInput
 from backlash_ros.core.estimate import Bounds, Estimate
 from backlash_ros.core.law import Interval

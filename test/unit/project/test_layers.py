@@ -26,7 +26,7 @@ ROOMS = (
 )
 ESTIMATION = (
     'settings', 'plant_family', 'play', 'reading', 'posterior', 'fit', 'deviations', 'search',
-    'explanations', 'late_commands', 'coasting', 'belief', 'learning', 'observer', 'estimator',
+    'explanations', 'late_commands', 'coasting', 'belief', 'states', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}
 ROS_SUFFIXES = ('_msgs', '_srvs', '_interfaces')
