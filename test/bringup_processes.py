@@ -95,7 +95,8 @@ def bringup_sessions(folder: Path) -> Iterator[Callable[..., Session]]:
         environment.update(variables or {})
         stdout, stderr = own / 'stdout.txt', own / 'stderr.txt'
         whole = drawn or '--no-record' in arguments
-        program = ['-m', 'backlash_ros.tools.bringup'] if whole else [str(UNDRAWN)]
+        program = ['-m', 'backlash_ros.tools.bringup'] if whole else [
+            str(UNDRAWN), bringup.__name__]
         with stdout.open('wb') as out, stderr.open('wb') as err:
             process = subprocess.Popen(
                 [sys.executable, *program, '--out', str(own / 'results'), *arguments],

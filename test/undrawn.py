@@ -1,11 +1,10 @@
-"""Reports without what takes most of their time, for tests of all else; as a program, bringup."""
+"""Reports without what takes most of their time, for tests of all else; as a program, MODULE ..."""
 
 import sys
+from importlib import import_module
 from typing import IO
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-from backlash_ros.tools.bringup import __main__ as bringup
 
 NO_PICTURE = b'\x89PNG'
 
@@ -16,4 +15,4 @@ def leave_out(canvas: FigureCanvasAgg, file: IO[bytes], **_: object) -> None:
 
 if __name__ == '__main__':
     FigureCanvasAgg.print_png = leave_out
-    sys.exit(bringup.main())
+    sys.exit(import_module(sys.argv.pop(1)).main())

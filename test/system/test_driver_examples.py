@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from bringup_processes import UNDRAWN
 from places import ROOT
 
 from backlash_ros.tools.bringup.environment import child_environment, free_domain
@@ -39,6 +40,8 @@ def runnable(words: list[str]) -> list[str]:
     arguments = [a.replace('.venv/bin/python', sys.executable) for a in arguments]
     if name == 'python':
         return [sys.executable, *arguments]
+    if name in ('bringup', 'identify'):
+        return [sys.executable, str(UNDRAWN), f'backlash_ros.{modules[name]}', *arguments]
     call = f'import sys; from backlash_ros.{modules[name]} import main; sys.exit(main())'
     return [sys.executable, '-c', call, *arguments]
 
