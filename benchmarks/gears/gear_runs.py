@@ -20,12 +20,9 @@ from backlash_ros.core.assembly import build_controller
 from backlash_ros.core.control.controller import AdaptiveController
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.identification.actuator import with_actuator
-from backlash_ros.core.identification.identification import (
-    Identification,
-    Options,
-    identify,
-)
+from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.identification.result import Identification, Options
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value

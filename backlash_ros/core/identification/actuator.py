@@ -15,7 +15,7 @@ from math import log
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.identification.identification import Identification
+from backlash_ros.core.identification.result import Identification
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.plant.actuator import Actuator
 from backlash_ros.core.plant.filtering import lfilter

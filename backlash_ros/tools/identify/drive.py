@@ -20,7 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from backlash_ros import topics
-from backlash_ros.core.identification.identification import Identification
+from backlash_ros.core.identification.result import Identification
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record, RecordError

@@ -10,7 +10,7 @@ import numpy as np
 
 from backlash_ros.core.assembly import build_controller, first_guess
 from backlash_ros.core.estimate import Estimate
-from backlash_ros.core.identification.identification import Details, Identification
+from backlash_ros.core.identification.result import Details, Identification
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.parameters.table import BRINGUP, BY_NAME, PLANT

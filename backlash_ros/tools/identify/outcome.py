@@ -17,12 +17,8 @@ from tqdm import tqdm
 from backlash_ros.atomic_file import write_atomically
 from backlash_ros.core.estimates_file import save_estimate
 from backlash_ros.core.identification.actuator import with_actuator
-from backlash_ros.core.identification.identification import (
-    Details,
-    Identification,
-    Options,
-    identifying,
-)
+from backlash_ros.core.identification.identification import identifying
+from backlash_ros.core.identification.result import Details, Identification, Options
 from backlash_ros.core.parameters.errors import ParameterError
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.core.records.record import Record

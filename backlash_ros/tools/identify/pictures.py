@@ -12,7 +12,7 @@ from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from backlash_ros.core.estimation.deviations import autocorrelation
-from backlash_ros.core.identification.identification import Details, Identification
+from backlash_ros.core.identification.result import Details, Identification
 from backlash_ros.tools.figures import (
     HUES,
     TIME_LABEL,

@@ -10,8 +10,9 @@ import pytest
 
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.identification.actuator import with_actuator
-from backlash_ros.core.identification.identification import Identification, Options, identify
+from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.identification.result import Identification, Options
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.records.record import Record
 from backlash_ros.tools.identify.identified_file import commented_yaml, identified_parameters

@@ -12,12 +12,9 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.play import play
-from backlash_ros.core.identification.identification import (
-    Identification,
-    Options,
-    identify,
-)
+from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
+from backlash_ros.core.identification.result import Identification, Options
 from backlash_ros.core.identification.structure import Samples, Structure, first_model, fitted
 
 Array = NDArray[np.float64]

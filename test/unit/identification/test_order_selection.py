@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from backlash_ros.core.estimation.play import play
 from backlash_ros.core.estimation.posterior import WindowFit
-from backlash_ros.core.identification.identification import Options, identify
+from backlash_ros.core.identification.identification import identify
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.identification.order_selection import (
     Compared,
@@ -17,6 +17,7 @@ from backlash_ros.core.identification.order_selection import (
     gives_way,
     selected,
 )
+from backlash_ros.core.identification.result import Options
 from backlash_ros.core.identification.structure import Model, Samples, Structure
 
 SAMPLES = Samples(np.zeros(2), np.full(2, np.nan), 1, 2, 0.0)
