@@ -161,7 +161,7 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
                 while (left := next_s - time.perf_counter()) > 0.0:
                     driver.spin(left)
             share = (used_s(pids) - used) / (time.perf_counter() - first)
-            resident_mb = sum(resident_mb(pid) for pid in family(pids))
+            memory_mb = sum(resident_mb(pid) for pid in family(pids))
         finally:
             driver.close()
         supervisor.stop()
@@ -169,7 +169,7 @@ def measure(together: bool, law: str, rate: float, seconds: float) -> list[str]:
     p50, p99 = 1e3 * np.nanpercentile(latencies, (50, 99))
     return [
         'six joints in one' if together else 'six controllers', f'{start_up:.1f}',
-        f'{100.0 * share:.1f}', f'{resident_mb:.0f}', f'{p50:.2f}', f'{p99:.2f}',
+        f'{100.0 * share:.1f}', f'{memory_mb:.0f}', f'{p50:.2f}', f'{p99:.2f}',
         f'{late} of {len(latencies)}',
     ]
 
