@@ -31,7 +31,7 @@ from backlash_ros.nodes.runtime.messages import DEPTH
 # What was counted, as /diagnostics and the last line of the log call it.
 COUNTS = {
     'samples': 'used', 'lost': 'lost', 'of these never sent': 'unsent', 'late': 'late',
-    'non-finite dropped': 'dropped', 'repeated or from a second driver': 'extra',
+    'non-finite dropped': 'dropped', 'repeated, too early or from a second driver': 'extra',
     'interruptions': 'interruptions', 'limits hit': 'limited',
     'before the first reference': 'without_reference', 'without applied_control': 'unreported',
 }
