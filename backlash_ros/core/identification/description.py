@@ -8,7 +8,7 @@ from math import inf, log, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.deviations import covariance_of, ljung_box
+from backlash_ros.core.identification.deviations import covariance_of, ljung_box
 from backlash_ros.core.identification.order_selection import (
     PLATEAU,
     cancelled_poles,

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.deviations import covariance_of
 from backlash_ros.core.estimation.fit import FIRST_STEPS
 from backlash_ros.core.estimation.posterior import Prior
+from backlash_ros.core.identification.deviations import covariance_of
 from backlash_ros.core.identification.structure import VAGUE, Model, Samples, fitted
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from backlash_ros.core.estimation.deviations import autocorrelation
+from backlash_ros.core.identification.deviations import autocorrelation
 from backlash_ros.core.identification.result import Details, Identification
 from backlash_ros.tools.figures import (
     HUES,

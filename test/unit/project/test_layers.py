@@ -25,7 +25,7 @@ ROOMS = (
     'identification', 'driver_check',
 )
 ESTIMATION = (
-    'settings', 'plant_family', 'play', 'reading', 'posterior', 'fit', 'deviations', 'search',
+    'settings', 'plant_family', 'play', 'reading', 'posterior', 'fit', 'search',
     'explanations', 'late_commands', 'coasting', 'belief', 'states', 'observer', 'estimator',
 )
 NUMERIC = {'numpy', 'scipy'}

@@ -4,7 +4,7 @@
 
 with normalised rows J and the Toeplitz matrix R of the residual's autocovariance, tapered to zero
 at sqrt(N) lags. Of white residuals that is H^-1; the error of a quantised y is not white. No
-variance is less than that of white noise. Other than the inflation of posterior.py it believes
+variance is less than that of white noise. Other than the inflation of a WindowFit it believes
 that what is left over is noise, and averages out in the end.
 """
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from backlash_ros.core.estimation.deviations import covariance_of, ljung_box
 from backlash_ros.core.estimation.play import play
+from backlash_ros.core.identification.deviations import covariance_of, ljung_box
 from backlash_ros.core.identification.structure import Samples, Structure, first_model, fitted
 
 
