@@ -12,17 +12,13 @@ from pathlib import Path
 os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
-import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
 from reporting import Check
 from std_msgs.msg import Float64
 
 from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.parameters import Parameters
-from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.nodes.runtime.executor import PromptExecutor
+from real_time.measuring_node import MeasuringNode
 from real_time.node_processes import DEADLINE_S, node_command, processes, wait_for_event
 
 COST_HEADER = ('rate', 'process', 'processor [%]', 'per sample [us]', '/ echo', 'memory [MB]')
@@ -32,15 +28,11 @@ MEMORY_LIMIT_MB, START_LIMIT_S = 80.0, 1.0
 NODES = ('controller', 'reference', 'echo')
 
 
-class Driver:
+class Driver(MeasuringNode):
     """A plant that publishes y at a steady rate, and a number for an echo at the same time."""
 
     def __init__(self, domain: int, parameters: Parameters) -> None:
-        self._context = Context()
-        prefer_loopback(os.environ)
-        rclpy.init(args=[], context=self._context, domain_id=domain)
-        self._node = Node('driver', context=self._context)
-        self._executor = PromptExecutor(self._node)
+        super().__init__(domain)
         self._plant, self._v = build_plant(parameters), 0.0
         self._period_s = parameters.sample_period
         self.first_command_at = np.nan
@@ -72,12 +64,6 @@ class Driver:
                 raise RuntimeError(f'no command came within {DEADLINE_S:g} s')
             self.run(1)
         return self.first_command_at
-
-    def close(self) -> None:
-        """Leave the domain."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
 
 
 def measure_costs(

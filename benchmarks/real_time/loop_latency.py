@@ -15,8 +15,6 @@ os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
 
 import numpy as np
 import rclpy
-from rclpy.context import Context
-from rclpy.node import Node
 from reporting import Check
 from std_msgs.msg import Float64
 
@@ -24,8 +22,7 @@ from backlash_ros import topics
 from backlash_ros.core.assembly import build_plant, build_reference
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.table import CONTROLLER, PARAMETERS
-from backlash_ros.middleware.loopback import prefer_loopback
-from backlash_ros.nodes.runtime.executor import PromptExecutor
+from real_time.measuring_node import MeasuringNode
 from real_time.node_processes import (
     DEADLINE_S,
     check_running,
@@ -73,17 +70,11 @@ class Latencies:
 LATENCY_HEADER = ('rate', '', 'y to v [us]', 'echo [us]', 'ratio', 'samples')
 
 
-class Driver:
+class Driver(MeasuringNode):
     """A plant driver that asks controller and echo, and measures how long each takes."""
 
     def __init__(self, domain: int, parameters: Parameters) -> None:
-        self._context = Context()
-        prefer_loopback(os.environ)
-        rclpy.init(args=[], context=self._context, domain_id=domain)
-        self._node = Node('driver', context=self._context)
-        # The executor of rclpy would begin to wait after the answer has come: the times would
-        # be those of the driver.
-        self._executor = PromptExecutor(self._node)
+        super().__init__(domain)
         self._plant, self._reference = build_plant(parameters), build_reference(parameters)
         self._period = parameters.sample_period
         self._v = self._v_before = 0.0
@@ -163,12 +154,6 @@ class Driver:
         passed = self._ask(self._y, self._plant.measure())
         self._y_m.publish(Float64(data=self._reference(t + self._period)))
         return passed
-
-    def close(self) -> None:
-        """Leave the domain."""
-        self._executor.shutdown()
-        self._node.destroy_node()
-        rclpy.shutdown(context=self._context)
 
 
 def measure_latency(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import re
 import time
-from pathlib import Path
 
 from reporting import Check
 
-from backlash_ros.tools.bringup.supervisor import ProcessSupervisor
+from real_time.costs import resident_mb
 from real_time.node_processes import node_command, processes, wait_for_event
 
 PERIOD_S = 1e-3
@@ -36,12 +35,12 @@ def soak_checks(seconds: float) -> list[Check]:
     with processes(commands) as (supervisor, _):
         wait_for_event(supervisor, lambda kind, who: (kind, who) == ('ready', 'plant'))
         time.sleep(WARM_UP * seconds)
-        before = _resident_mb(supervisor)
+        controller = next(c for c in supervisor.children if c.plan.name == 'controller')
+        before = resident_mb(controller.process.pid)
         time.sleep((1.0 - WARM_UP) * seconds - 1.0)
-        growth = _resident_mb(supervisor) - before
+        growth = resident_mb(controller.process.pid) - before
         wait_for_event(supervisor, lambda kind, _: kind == 'done', 2.0 * seconds)
         supervisor.stop()
-        controller = next(c for c in supervisor.children if c.plan.name == 'controller')
         said = controller.plan.log.read_text().strip().splitlines()[-1]
     counts = dict(re.findall(r'([a-z][a-z ]*): (\d+)', said))
     lost, unsent = (int(counts.get(name, 0)) for name in ('lost', 'of these never sent'))
@@ -53,11 +52,3 @@ def soak_checks(seconds: float) -> list[Check]:
         Check(f'memory of the controller after {(1.0 - WARM_UP) * seconds:g} s [MB]',
               f'< {GROWTH_LIMIT_MB:g}', f'{growth:+.3f}', growth < GROWTH_LIMIT_MB),
     ]
-
-
-def _resident_mb(supervisor: ProcessSupervisor) -> float:
-    controller = next(c for c in supervisor.children if c.plan.name == 'controller')
-    status = Path(f'/proc/{controller.process.pid}/status').read_text()
-    found = re.search(r'VmRSS:\s+(\d+) kB', status)
-    assert found
-    return int(found[1]) / 1024.0
