@@ -38,7 +38,7 @@ class Topic(NamedTuple):
     definition: str
 
 
-class Message(NamedTuple):
+class BagMessage(NamedTuple):
     """A recorded message in CDR."""
 
     topic: Topic
@@ -76,7 +76,9 @@ class BagReader:
                 'is neither the folder of a bag nor an .mcap or .db3 file'
             raise NoBagError(f'{path}: {rule}')
 
-    def messages(self, wanted: Callable[[Topic], bool] = lambda topic: True) -> Iterator[Message]:
+    def messages(
+        self, wanted: Callable[[Topic], bool] = lambda topic: True,
+    ) -> Iterator[BagMessage]:
         """Every sound message of the wanted topics, in the order in which they were written."""
         self.damage = ''
 
@@ -94,7 +96,7 @@ class BagReader:
                 self.damage = 'is damaged' if closed else 'was never closed'
 
 
-def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Message]:
+def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
     """Messages up to the first record that is not sound; a chunk that is not is left out."""
     topics: dict[int, Topic] = {}  # the wanted ones by the number of their channel
     schemas: dict[int, Schema] = {}
@@ -119,12 +121,12 @@ def _read_mcap(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Message]
                     if wanted(topic):
                         topics[record.id] = topic
                 elif isinstance(record, McapMessage) and record.channel_id in topics:
-                    yield Message(topics[record.channel_id], record.log_time, record.data)
+                    yield BagMessage(topics[record.channel_id], record.log_time, record.data)
     if broken:
         raise BagError(f'{file}: {broken} chunks are damaged')
 
 
-def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Message]:
+def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[BagMessage]:
     """Messages of all transactions that were committed, up to the first page that is not sound."""
     # Opened for writing as well, SQLite takes back what a crash has left half done.
     uri = f'{file.resolve().as_uri()}?mode=rw'
@@ -141,6 +143,6 @@ def _read_sqlite(file: Path, wanted: Callable[[Topic], bool]) -> Iterator[Messag
             'SELECT topic_id, timestamp, data FROM messages NOT INDEXED '
             f'WHERE topic_id IN ({", ".join(map(str, chosen))}) ORDER BY id'
         ):
-            yield Message(topics[number], int(stamp_ns), bytes(data))
+            yield BagMessage(topics[number], int(stamp_ns), bytes(data))
         if not database.execute('SELECT count(*) FROM metadata').fetchone()[0]:
             raise BagError(f'{file}: was never closed')

@@ -115,8 +115,8 @@ def afresh(
     hopeless = not may_be_known(setup, record.v)  # whatever is found: to be named, not to be used
     fits: list[WindowFit] = []
     # Once more around G as the best of the first gaps has it.
-    rounds = 2 if family.count and like is None and not hopeless else 1
-    for last in (False, True)[2 - rounds:]:
+    again = family.count > 0 and like is None and not hopeless
+    for last in (False, True) if again else (True,):
         found, null = search(family, record.v, record.y, setup.noise_std, setup.widest, xi, last)
         if not found or (not fits and found[0].evidence < null + settings.ENGAGED):
             break

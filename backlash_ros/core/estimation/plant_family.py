@@ -216,6 +216,7 @@ def filtered(b: list[float], a: list[float], u: Array, x: Array) -> Array:
 
 
 def padded(x: Array, length: int) -> Array:
+    """The first values of x, and zeros behind them, (length,)."""
     out = np.zeros(length)
     out[:min(length, len(x))] = x[:length]
     return out

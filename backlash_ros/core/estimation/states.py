@@ -127,8 +127,10 @@ def _with_commands(
 
     Commands that leave more than noise explain nothing: those that were sent stay.
     """
+    if not np.isfinite(record.other).any():
+        return found, swapped
     fit, others = found, swapped
-    for _ in range(4 * bool(np.isfinite(record.other).any())):
+    for _ in range(4):
         before = others
         record, others = likelier(problem_of(setup, record), fit, record, record.first, before)
         if others == before:

@@ -77,9 +77,9 @@ class CommandHistory:
     before it was in use: v is as long under way as y is. Times are those of one clock [ns].
 
     counts: where late commands and missing reports are counted. trust: whether reports go before
-    own commands. origin: of them, which is
-    subtracted. newest_ns: when the newest command left, own or of another controller. output_ns:
-    stamp of the newest output that was used; reports up to the first one belong to nothing.
+    own commands. origin: of reports, which is subtracted. newest_ns: when the newest command left,
+    own or of another controller. output_ns: stamp of the newest output that was used; reports up to
+    the first one belong to nothing.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class Driver(NamedTuple):
 
 
 @dataclass
-class Heard:
+class Newest:
     """What has come last: y_m; when it and y came, on the steady clock [s], None before.
 
     unanswered: outputs, as long as nobody knew v. before_reports: estimate at the first report.
@@ -69,7 +69,7 @@ class ControlLoop:
         estimate: Estimate | None, counter: SampleCounter, v: float | None = None,
         executor: Executor | None = None,
     ) -> None:
-        self.counter, self.heard, self.phase = counter, Heard(), Phase.BEGINS
+        self.counter, self.heard, self.phase = counter, Newest(), Phase.BEGINS
         # Within six deviations of its noise y stands still.
         counts = LoopStatistics(still_band=6.0 * p.estimator.output_noise_std)
         self.commands = CommandHistory(p.sample_period, report_use(p), counts)

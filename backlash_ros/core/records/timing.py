@@ -256,6 +256,7 @@ def _true_instants(rows: Rows, period: float, said: str) -> Record:
     count = int(max(rows.t[-1] / step + 0.5, index[-1])) + 1
     full = np.full(count, np.nan)
     full[index] = values
+
     def over(values: Array) -> Array:
         times, v = (rows.t, values) if values.ndim == 1 else values
         return averaged(times, v, step, count)
