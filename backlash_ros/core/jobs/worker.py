@@ -31,6 +31,8 @@ LENGTH = Struct('<Q')  # of an answer, in bytes, before it
 # Wait before a worker is replaced [s] that died without an answer, as the one before it did: the
 # first, and the longest, by doubling.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 10.0
+_APART: dict[str, Any] = {'process_group': 0} if sys.version_info >= (3, 11) \
+    else {'start_new_session': True}
 
 
 @dataclass
@@ -197,8 +199,8 @@ def _start(preload: tuple[str, ...]) -> subprocess.Popen[bytes]:
         f'from {__name__} import serve; serve({preload!r})'
     process = subprocess.Popen(
         [sys.executable, '-c', code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
-        # In a session of its own it gets no Ctrl-C, not even while it starts.
-        start_new_session=True,
+        # So it gets no Ctrl-C, not even while it starts. Between sessions niceness would not count.
+        **_APART,
         # A second thread of a fit would take the core on which the loop runs.
         env={**os.environ, 'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'},
     )
