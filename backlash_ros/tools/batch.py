@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from importlib.metadata import version
 from math import inf, nan
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import yaml
@@ -30,9 +30,6 @@ from backlash_ros.tools.cli import BrokenOffError, InputError, StopRequests, num
 from backlash_ros.tools.runs.read_run import run_loop
 from backlash_ros.tools.runs.summary import summarise
 from backlash_ros.topics import BACKLASH
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 CLUSTER_ANSWER_S = 10.0  # for a scheduler to answer, and for a first worker to be there
 # What an outcome has of m, c_r and c_l: the beginning of a column, and the group in a summary.
@@ -72,30 +69,29 @@ class ParameterStatistics(NamedTuple):
     nees_interval: tuple[float, float]
 
 
-def parse_sweep(text: str) -> tuple[str, tuple[Value, ...]]:
-    """Return name and values of `KEY=v1,v2,...`; the values are written as in a YAML list."""
-    name, equals, listed = text.partition('=')
-    name = name.strip()
-    if not equals or not listed.strip():
-        raise InputError(f'--sweep {text!r} must be KEY=v1,v2,...')
-    check_names([name])
-    try:
-        values = yaml.safe_load(f'[{listed}]')
-    except yaml.YAMLError:
-        raise InputError(f'--sweep {text!r}: the values are no list in YAML') from None
-    if isinstance(BY_NAME[name].default, str):
-        values = [str(value) for value in values]
-    return name, tuple(check_value(BY_NAME[name], value) for value in values)
-
-
 def combinations(texts: Sequence[str]) -> list[dict[str, Value]]:
-    """Every combination of the values of sweeps, the last one changing fastest."""
-    sweeps = [parse_sweep(text) for text in texts]
-    names = [name for name, _ in sweeps]
-    if len(set(names)) < len(names):
-        raise InputError(f'--sweep names {max(names, key=names.count)} twice')
-    products = itertools.product(*(values for _, values in sweeps))
-    return [dict(zip(names, values, strict=True)) for values in products]
+    """Every combination of the values of sweeps `KEY=v1,v2,...`, the last one changing fastest.
+
+    The values are written as in a YAML list. Raises InputError and ParameterError.
+    """
+    sweeps: dict[str, list[Value]] = {}
+    for text in texts:
+        name, _, listed = map(str.strip, text.partition('='))
+        if not listed:
+            raise InputError(f'--sweep {text!r} must be KEY=v1,v2,...')
+        if name in sweeps:
+            raise InputError(f'--sweep names {name} twice')
+        check_names([name])
+        try:
+            values = yaml.safe_load(f'[{listed}]')
+        except yaml.YAMLError:
+            raise InputError(f'--sweep {text!r}: the values are no list in YAML') from None
+        of_words = isinstance(BY_NAME[name].default, str)
+        sweeps[name] = [
+            check_value(BY_NAME[name], str(value) if of_words else value) for value in values
+        ]
+    products = itertools.product(*sweeps.values())
+    return [dict(zip(sweeps, values, strict=True)) for values in products]
 
 
 def make_jobs(
@@ -139,15 +135,10 @@ def run_jobs(
     Dask scheduler, whose workers are used instead. Call it from the main thread, which alone
     receives signals. Raises BrokenOffError if a worker was killed.
     """
-    if workers is None:
-        workers = len(os.sched_getaffinity(0)) if hasattr(os, 'sched_getaffinity') else (
-            os.cpu_count() or 1)
-    if cluster is not None:
-        finished = _on_cluster(jobs, cluster)
-    elif min(workers, len(jobs)) > 1:
-        finished = _in_processes(jobs, min(workers, len(jobs)))
-    else:
-        finished = ((i, run_job(job)) for i, job in enumerate(jobs))
+    workers = min(workers or len(os.sched_getaffinity(0)), len(jobs))
+    finished = _on_cluster(jobs, cluster) if cluster is not None else \
+        _in_processes(jobs, workers) if workers > 1 else \
+        ((i, run_job(job)) for i, job in enumerate(jobs))
     # disable=None: no bar where stderr is not a terminal.
     bar = tqdm(finished, desc=label, total=len(jobs), unit='run', disable=None)
     with closing(finished), bar:
@@ -201,61 +192,53 @@ def _on_cluster(jobs: Sequence[Job], address: str) -> Generator[tuple[int, Outco
     Raises InputError where there is no such cluster, or one with other libraries; BrokenOffError
     where it ends before the runs do, or a run has ended several workers.
     """
+    def refused(why: str) -> InputError:
+        return InputError(f'--cluster {address}: {why}')
+
     try:
         from distributed import Client, KilledWorker
+        from distributed import TimeoutError as NoWorkerError
         from distributed import as_completed as completed
     except ImportError:
         raise InputError(
             "--cluster needs Dask, which is not installed: pip install 'backlash_ros[cluster]'"
         ) from None
-    # The error below says in one line what the user needs to know.
+    # The errors below say in one line what the user needs to know.
     logging.getLogger('distributed').setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=CLUSTER_ANSWER_S, set_as_default=False)
     except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(
-            f'--cluster {address}: no scheduler answers ({reason}): start one with '
-            '`dask scheduler --host HOST`, and workers with `dask worker tcp://HOST:8786`'
+        raise refused(
+            f'no scheduler answers ({reason}): start one with `dask scheduler --host HOST`, and '
+            'workers with `dask worker tcp://HOST:8786`'
         ) from None
     with client:
-        _check_workers(client, address)
         try:
+            client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
+            for worker, found in client.run(libraries).items():
+                if found != libraries():
+                    raise refused(
+                        f'{worker} has {found}, here is {libraries()}: install the same versions, '
+                        'else the last digits differ'
+                    )
             # Not pure: runs of the same parameters are runs all the same.
             futures = client.map(run_job, jobs, pure=False)
             numbers = {future.key: i for i, future in enumerate(futures)}
             for future, outcome in completed(futures, loop=client.loop, with_results=True):
                 yield numbers[future.key], outcome
-        except KilledWorker:
-            why = 'a run has ended several workers: is there enough memory?'
+        except NoWorkerError:
+            raise refused(
+                f'no worker within {CLUSTER_ANSWER_S:g} s: start some with `dask worker {address}`'
+            ) from None
+        except ImportError as error:
+            raise refused(
+                f'a worker says {error}: install the same backlash_ros there') from None
+        except (KilledWorker, CancelledError) as error:
+            why = 'a run has ended several workers: is there enough memory?' \
+                if isinstance(error, KilledWorker) else \
+                'the scheduler has ended: start it and simulate again'
             raise BrokenOffError(f'--cluster {address}: {why}') from None
-        except CancelledError:
-            why = 'the scheduler has ended: start it and simulate again'
-            raise BrokenOffError(f'--cluster {address}: {why}') from None
-
-
-def _check_workers(client: Client, address: str) -> None:
-    """Raise InputError unless there are workers, with the libraries of this process."""
-    from distributed import TimeoutError as NoWorkerError
-    here = libraries()
-    try:
-        client.wait_for_workers(1, timeout=CLUSTER_ANSWER_S)
-        there: dict[str, Any] = client.run(libraries)
-    except NoWorkerError:
-        raise InputError(
-            f'--cluster {address}: no worker within {CLUSTER_ANSWER_S:g} s: start some with '
-            f'`dask worker {address}`'
-        ) from None
-    except ImportError as error:
-        raise InputError(
-            f'--cluster {address}: a worker says {error}: install the same backlash_ros there'
-        ) from None
-    for worker, found in there.items():
-        if found != here:
-            raise InputError(
-                f'--cluster {address}: {worker} has {found}, here is {here}: install the same '
-                'versions, else the last digits differ'
-            )
 
 
 def libraries() -> dict[str, str]:
@@ -271,23 +254,21 @@ def statistics(outcomes: Sequence[Outcome]) -> dict[str, ParameterStatistics]:
     whole = [outcome for outcome in outcomes if not outcome['problem']]
     if not whole:
         raise InputError(f'every run broke off, the first one with: {outcomes[0]["problem"]}')
-    return {name: _statistics(whole, name) for name in BACKLASH}
-
-
-def _statistics(outcomes: Sequence[Outcome], name: str) -> ParameterStatistics:
-    final, std, truth, settling = (
-        np.array([one[f'{prefix}{name}'] for one in outcomes], dtype=float)
-        for prefix in OUTCOME_GROUPS
-    )
-    error, n = final - truth, len(outcomes)
-    settling = np.sort(np.where(np.isnan(settling), inf, settling))
-    known = bool(np.all(np.isfinite(std) & (std > 0.0)))
+    n, found = len(whole), {}
     # Quantiles of chi squared with n degrees of freedom: n times the mean has that distribution.
     low, high = chdtri(n, [0.975, 0.025]) / n
-    return ParameterStatistics(
-        float(error.mean()), float(np.sqrt(np.mean(error**2))),
-        # The median of a number and "never" is never, not the nan of inf - inf.
-        float(settling[n // 2]), float(settling[-1]),
-        float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),
-        float(np.mean((error / std) ** 2)) if known else nan, (float(low), float(high)),
-    )
+    for name in BACKLASH:
+        final, std, truth, settling = (
+            np.array([one[f'{prefix}{name}'] for one in whole], dtype=float)
+            for prefix in OUTCOME_GROUPS
+        )
+        error, settling = final - truth, np.sort(np.where(np.isnan(settling), inf, settling))
+        known = bool(np.all(np.isfinite(std) & (std > 0.0)))
+        found[name] = ParameterStatistics(
+            float(error.mean()), float(np.sqrt(np.mean(error**2))),
+            # The median of a number and "never" is never, not the nan of inf - inf.
+            float(settling[n // 2]), float(settling[-1]),
+            float(np.mean(np.abs(error) <= SETTLING_TOLERANCE * np.abs(truth))),
+            float(np.mean((error / std) ** 2)) if known else nan, (float(low), float(high)),
+        )
+    return found

@@ -38,46 +38,40 @@ class Span(NamedTuple):
 WHOLE_SPAN = Span()
 
 
-def add_common_options(parser: argparse.ArgumentParser) -> None:
-    """Add what `bringup` and `simulate` have in common."""
-    parser.add_argument(
-        '--config', type=Path, metavar='FILE',
-        help="ROS 2 parameter file, or the name of a shipped one (default: the paper's example)",
-    )
-    parser.add_argument(
-        '--set', action='append', default=[], metavar='[AXIS/]KEY=VALUE', dest='settings',
-        help='change one parameter, of all axes or of one; may be given again',
-    )
-    parser.add_argument(
-        '--axis', default='', metavar='NAME',
-        help='take this axis alone from a file with several axes',
-    )
-    parser.add_argument('--seed', type=int, metavar='N', help='seed of the simulated noise')
-    add_out_option(parser)
+# What several tools offer, by the name of the option.
+OPTIONS: dict[str, dict[str, Any]] = {
+    '--config': {
+        'type': Path, 'metavar': 'FILE', 'help': 'ROS 2 parameter file, or the name of a shipped '
+        "one (default: the paper's example)"},
+    '--set': {
+        'action': 'append', 'default': [], 'metavar': '[AXIS/]KEY=VALUE', 'dest': 'settings',
+        'help': 'change one parameter, of all axes or of one; may be given again'},
+    '--sweep': {
+        'action': 'append', 'default': [], 'metavar': 'KEY=v1,v2,...',
+        'help': 'run every value of a parameter; given again, every combination'},
+    '--axis': {
+        'default': '', 'metavar': 'NAME', 'help': 'of several axes or joints: the one that is '
+        'meant'},
+    '--seed': {'type': int, 'metavar': 'N', 'help': 'seed of the simulated noise'},
+    '--duration': {
+        'type': float, 'metavar': 'SECONDS',
+        'help': 'length of a run (default: the parameter samples, or 10 s)'},
+    '--from': {
+        'type': float, 'default': 0.0, 'metavar': 'S', 'dest': 'from_s',
+        'help': 'leave out what was before this time [s]'},
+    '--to': {
+        'type': float, 'default': inf, 'metavar': 'S', 'dest': 'to_s',
+        'help': 'leave out what was from this time [s] on'},
+    '--out': {
+        'type': Path, 'metavar': 'DIR', 'help': 'folder of the results (default: results/<UTC '
+        'time>, and results/latest points at it)'},
+}
 
 
-def add_out_option(parser: argparse.ArgumentParser) -> None:
-    """Add --out, for `files.result_directory`."""
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR',
-        help='folder of the results (default: results/<UTC time>, and results/latest points at it)',
-    )
-
-
-def add_duration_option(parser: argparse.ArgumentParser, further: str = '') -> None:
-    """Add --duration, for `number_of_samples`; further: a sentence on other values."""
-    parser.add_argument(
-        '--duration', type=float, metavar='SECONDS',
-        help=f'length of a run (default: the parameter samples, or 10 s){further}',
-    )
-
-
-def add_span_options(parser: argparse.ArgumentParser) -> None:
-    """Add --from and --to, for `span_of`."""
-    parser.add_argument('--from', type=float, default=0.0, metavar='S', dest='from_s',
-                        help='leave out what was before this time [s]')
-    parser.add_argument('--to', type=float, default=inf, metavar='S', dest='to_s',
-                        help='leave out what was from this time [s] on')
+def add_options(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add some of the OPTIONS."""
+    for name in names:
+        parser.add_argument(name, **OPTIONS[name])
 
 
 def span_of(parser: argparse.ArgumentParser, options: argparse.Namespace) -> Span:

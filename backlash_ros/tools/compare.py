@@ -158,9 +158,7 @@ def comparison_document(scenario: Parameters, results: Sequence[Result], figure:
 def make_parser() -> argparse.ArgumentParser:
     """The options of `compare`."""
     parser = OptionParser('compare', description=__doc__)
-    cli.add_common_options(parser)
-    parser.add_argument('--duration', type=float, default=10.0, metavar='SECONDS',
-                        help='length of each run (default: 10)')
+    cli.add_options(parser, '--config', '--set', '--axis', '--seed', '--out', '--duration')
     return parser
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
+import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -34,15 +35,7 @@ LINE_STYLES = {'m': '-', 'c_r': '--', 'c_l': '-.'}
 BACKLASH_UNITS = {'m': 'unit of u/v', 'c_r': 'unit of v', 'c_l': 'unit of v'}
 WHOLE_RUN = Part('Whole run', slice(None))
 
-matplotlib.rcParams.update({
-    'axes.axisbelow': True, 'axes.grid': True, 'axes.spines.right': False,
-    'axes.spines.top': False, 'axes.titlelocation': 'left', 'axes.titlesize': 11,
-    'axes.titleweight': 'bold', 'axes.formatter.useoffset': False,
-    'axes.formatter.limits': (-5, 6), 'figure.constrained_layout.use': True, 'figure.dpi': 130,
-    'grid.color': '#dddddd', 'grid.linewidth': 0.6, 'legend.fontsize': 10,
-    'legend.frameon': False, 'lines.linewidth': 1.3,
-    'agg.path.chunksize': 20_000,  # of a curve with more points than the eye resolves
-})
+matplotlib.style.use(Path(__file__).with_suffix('.mplstyle'))
 
 
 def new_figure(height: float) -> Figure:

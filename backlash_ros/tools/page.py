@@ -6,31 +6,8 @@ import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-
-STYLE = """
-body { font: 16px/1.5 system-ui, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif;
-       color: #222; background: #f6f6f4; margin: 0; }
-main { max-width: 1060px; margin: 0 auto; padding: 24px; }
-h1 { font-size: 26px; margin: 0 0 4px; }
-h2 { font-size: 19px; margin: 0 0 4px; }
-p { margin: 0 0 12px; }
-section { background: #fff; border: 1px solid #ddd; border-radius: 8px; padding: 18px 20px;
-          margin-top: 18px; }
-sub { line-height: 0; }
-table { border-collapse: collapse; width: 100%; }
-th, td { padding: 5px 10px; text-align: right; border-bottom: 1px solid #e6e6e6;
-         font-variant-numeric: tabular-nums; }
-th:first-child, td:first-child { text-align: left; }
-th { font-weight: 600; color: #555; }
-.facts { margin-top: 18px; }
-.facts td { width: 25%; text-align: left; }
-.facts td:nth-child(odd) { color: #555; }
-.lead { color: #444; }
-.warning { background: #fff4e0; border-left: 4px solid #E69F00; padding: 8px 12px; }
-img { width: 100%; height: auto; display: block; }
-pre { overflow-x: auto; font-size: 13px; background: #f6f6f4; padding: 12px; }
-summary { cursor: pointer; font-weight: 600; }
-"""
+from pathlib import Path
+from string import Template
 
 
 @dataclass(frozen=True)
@@ -60,15 +37,11 @@ def page(
     if folded is not None:
         summary, text = map(escape, folded)
         sections.append(f'<details><summary>{summary}</summary><pre>{text}</pre></details>')
-    return '\n'.join([
-        '<!DOCTYPE html>', '<html lang="en">', '<head>', '<meta charset="utf-8">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f'<title>{escape(title)}</title>', f'<style>{STYLE}</style>', '</head>', '<body>', '<main>',
-        f'<h1>{escape(title)}</h1>', f'<p class="lead">{lead}</p>',
+    template = Template(Path(__file__).with_suffix('.html').read_text(encoding='utf-8'))
+    return template.substitute(title=escape(title), lead=lead, content='\n'.join([
         *(f'<p class="warning">{escape(warning)}</p>' for warning in warnings),
         *(f'<section>\n{section}\n</section>' for section in sections),
-        '</main>', '</body>', '</html>', '',
-    ])
+    ]))
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -71,11 +71,7 @@ def make_parser() -> argparse.ArgumentParser:
                         help='parameters (default: parameters.yaml beside the run)')
     parser.add_argument('--set', action='append', default=[], metavar='KEY=VALUE',
                         dest='settings', help='change one parameter; may be given again')
-    parser.add_argument('--sweep', action='append', default=[], metavar='KEY=V1,V2,...',
-                        help='once for each value; several sweeps: for each combination')
-    parser.add_argument('--axis', default='', metavar='NAME', help='of a bag with several')
-    cli.add_span_options(parser)
-    cli.add_out_option(parser)
+    cli.add_options(parser, '--sweep', '--axis', '--from', '--to', '--out')
     return parser
 
 

@@ -37,7 +37,13 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
     samples.
     """
     summary = summarise(run.record, run.parameters, run.latency_s)
-    notes = [*run.notes, *_losses(summary, run.parameters)]
+    notes, lost = list(run.notes), summary['lost_samples']
+    if lost > 0.01 * (total := lost + summary['samples']) \
+            and not (run.parameters and run.parameters.output_loss):
+        notes.append(
+            f'{lost} of {total} samples were lost: what the figures show at these times is not the '
+            'doing of the law; is the machine too busy for this sample period?'
+        )
     # Of a log, which has no estimates, it is what was made of its rows.
     of_log = np.isnan(run.record.column('m')[-1])
     for note in notes:
@@ -59,15 +65,6 @@ def write_report(run: files.Run, out: Path) -> dict[str, Any]:
         [f'{note[0].upper()}{note[1:]}.' for note in notes], [_tables(summary)], pictures, folded,
     ))
     return summary
-
-
-def _losses(summary: Mapping[str, Any], parameters: Parameters | None) -> Iterator[str]:
-    """A sentence on lost samples, where they are many and nobody has asked for them."""
-    lost = summary['lost_samples']
-    total = lost + summary['samples']
-    if lost > 0.01 * total and not (parameters and parameters.output_loss):
-        yield (f'{lost} of {total} samples were lost: what the figures show at these times is not '
-               'the doing of the law; is the machine too busy for this sample period?')
 
 
 def _figures(
@@ -204,10 +201,7 @@ def make_parser() -> argparse.ArgumentParser:
         '--config', type=Path, metavar='FILE',
         help='parameters of the run (default: parameters.yaml beside it)',
     )
-    cli.add_out_option(parser)
-    cli.add_span_options(parser)
-    parser.add_argument('--axis', default='', metavar='NAME',
-                        help='of a bag with several: the one to report (default: the first)')
+    cli.add_options(parser, '--axis', '--from', '--to', '--out')
     return parser
 
 

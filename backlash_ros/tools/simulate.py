@@ -26,15 +26,12 @@ from backlash_ros.topics import BACKLASH
 def make_parser() -> argparse.ArgumentParser:
     """The options of `simulate`."""
     parser = OptionParser('simulate', description=__doc__)
-    cli.add_common_options(parser)
-    cli.add_duration_option(parser)
+    cli.add_options(
+        parser, '--config', '--set', '--axis', '--seed', '--out', '--duration', '--sweep'
+    )
     parser.add_argument(
         '--seeds', type=int, metavar='N',
         help='run N seeds, from --seed on, in parallel and print their statistics',
-    )
-    parser.add_argument(
-        '--sweep', action='append', default=[], metavar='KEY=v1,v2,...',
-        help='run every value of a parameter; given again, every combination',
     )
     parser.add_argument(
         '--cluster', metavar='ADDRESS',
@@ -49,14 +46,12 @@ def _simulate(args: Sequence[str] | None) -> None:
     parameters = effective_parameters(
         options.config, options.settings, options.seed, options.axis
     )
+    many = options.seeds is not None or options.sweep
     if options.seeds is not None and options.seeds < 1:
         raise InputError(f'--seeds={options.seeds} must be >= 1')
-    if options.seeds is not None or options.sweep:
-        _many(parameters, options)
-    elif options.cluster is not None:
+    if options.cluster is not None and not many:
         raise InputError('--cluster does many runs: give --seeds or --sweep as well')
-    else:
-        _once(parameters, options)
+    (_many if many else _once)(parameters, options)
 
 
 def _once(parameters: Parameters, options: argparse.Namespace) -> None:
@@ -85,8 +80,7 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     swept = list(changes[0])
     if 'seed' in swept and options.seeds is not None:
         raise InputError('--seeds and --sweep seed=... exclude each other')
-    first = parameters.seed
-    seeds = range(first, first + (options.seeds or 1))
+    seeds = range(parameters.seed, parameters.seed + (options.seeds or 1))
     jobs = batch.make_jobs(parameters, changes, seeds, options.duration)
     _refuse_bad_out(options)
     outcomes = batch.run_jobs(jobs, cluster=options.cluster, label='simulate')
@@ -101,11 +95,11 @@ def _many(parameters: Parameters, options: argparse.Namespace) -> None:
     if swept:
         # The jobs of one change stand together.
         size = len(outcomes) // len(changes)
-        header = [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %']
-        print(format_table(header, [
-            [*map(as_yaml, change.values()), *_sweep_row(outcomes[i * size:][:size])]
-            for i, change in enumerate(changes)
-        ]))
+        print(format_table(
+            [*swept, *(f'RMSE {name}' for name in BACKLASH), 'settled, median', 'within 1 %'],
+            [[*map(as_yaml, change.values()), *_sweep_row(outcomes[i * size:][:size])]
+             for i, change in enumerate(changes)],
+        ))
     else:
         print(_seeds_table(outcomes))
     _print_shortfalls(jobs, outcomes)

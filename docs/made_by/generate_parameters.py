@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from math import isfinite
 from pathlib import Path
 
 from backlash_ros.core.parameters.parameter import Parameter, as_yaml
@@ -38,14 +37,7 @@ def _allowed(p: Parameter) -> str:
         return ', '.join(f'`{choice}`' for choice in p.choices)
     if isinstance(p.default, bool):
         return '`true`, `false`'
-    rules = []
-    if isfinite(p.low):
-        rules.append(f'{">" if p.above else "≥"} {p.low:g}')
-    if isfinite(p.high):
-        rules.append(f'≤ {p.high:g}')
-    if p.length is not None:
-        rules.append(f'{p.length} numbers')
-    return ', '.join(rules)
+    return ', '.join(filter(None, (p.rules, f'{p.length} numbers' if p.length else '')))
 
 
 def write_parameters() -> None:

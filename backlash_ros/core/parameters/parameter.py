@@ -159,28 +159,23 @@ def _numbers(parameter: Parameter, value: object) -> tuple[float, ...]:
     return numbers
 
 
-def _number(parameter: Parameter, value: object) -> float:
+def _number(parameter: Parameter, value: Any) -> float:
     refused = partial(ParameterError, parameter.name)
-    if isinstance(value, str):
-        # YAML 1.1 reads 1e-5 (no point, no sign) as a text, and tools of ROS 2 send .inf as one.
-        try:
-            value = float(value.replace('.inf', 'inf'))
-        except ValueError:
-            raise refused(value, 'must be a number') from None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise refused(value, 'must be a number')
     try:
-        number = float(value)
+        # YAML 1.1 reads 1e-5 (no point, no sign) as a text, and tools of ROS 2 send .inf as one.
+        number = float(value.replace('.inf', 'inf') if isinstance(value, str) else value)
     except OverflowError:
         raise refused('...', 'is too large for a number') from None
+    except (TypeError, ValueError):
+        number = None
+    if number is None or isinstance(value, bool):
+        raise refused(value, 'must be a number')
     if isnan(number) or not (isfinite(number) or parameter.infinite):
         raise refused(number, 'must be finite')
     if isfinite(number) and abs(number) > 1e100:  # squares, and products of two, still are numbers
         raise refused(number, 'must be within ±1e+100', 'choose another unit')
-    unit = f' [{parameter.unit}]' if parameter.unit else ''
-    if number < parameter.low or (parameter.above and number == parameter.low):
-        sign = '>' if parameter.above else '>='
-        raise refused(number, f'must be {sign} {parameter.low:g}{unit}')
-    if number > parameter.high:
-        raise refused(number, f'must be <= {parameter.high:g}{unit}')
+    excluded = parameter.above and number == parameter.low
+    if excluded or not parameter.low <= number <= parameter.high:
+        unit = f' [{parameter.unit}]' if parameter.unit else ''
+        raise refused(number, f'must be {parameter.rules}{unit}')
     return number

@@ -27,8 +27,6 @@ silence = partial(option, unit='s', low=0.0, high=3600.0, live=True, per_node=Tr
 
 @dataclass(frozen=True)
 class PlantModel:
-    """G(z), as far as it is known."""
-
     numerator: tuple[float, ...] = of_both(
         (1e-05, 4e-05, 1e-05), 'numerator of G(z), descending powers of z')
     denominator: tuple[float, ...] = of_both(
@@ -41,8 +39,6 @@ class PlantModel:
 
 @dataclass(frozen=True)
 class ActuatorModel:
-    """A position loop between the command and the gap."""
-
     numerator: tuple[float, ...] = of_both(
         (), 'numerator of L(z), from control to the motor encoder that applied_control reports; '
         'empty: the command is what acts on the gap')
@@ -54,8 +50,6 @@ class ActuatorModel:
 
 @dataclass(frozen=True)
 class InitialEstimate:
-    """Where learning begins."""
-
     m: float = option(0.696, 'first estimate of the slope', 'u/v', low=0.0, above=True)
     c_r: float = option(0.5, 'first estimate of the right crossing', 'v')
     c_l: float = option(-0.5, 'first estimate of the left crossing', 'v')
@@ -63,8 +57,6 @@ class InitialEstimate:
 
 @dataclass(frozen=True)
 class EstimateBounds:
-    """No estimate leaves these intervals."""
-
     m: tuple[float, float] = option(
         (0.01, 100.0), 'interval of the slope', 'u/v', low=0.0, above=True)
     c_r: tuple[float, float] = option(
@@ -75,8 +67,6 @@ class EstimateBounds:
 
 @dataclass(frozen=True)
 class EstimatorOptions:
-    """How m, c_r, c_l are learned."""
-
     law: str = option(
         'moving_horizon', 'law that learns m, c_r, c_l; kalman: a former name of moving_horizon',
         choices=('moving_horizon', 'kalman', 'lms', 'printed', 'fixed', 'gradient'),
@@ -104,8 +94,6 @@ class EstimatorOptions:
 
 @dataclass(frozen=True)
 class LmsSteps:
-    """Law lms."""
-
     step: float = option(
         1.0, 'step of the normalised LMS on (m, m c_r, m c_l)', low=0.0, high=2.0, above=True,
         live=True)
@@ -115,23 +103,17 @@ class LmsSteps:
 
 @dataclass(frozen=True)
 class GradientStep:
-    """Law gradient."""
-
     step: float = option(1.0, 'gradient: step on (m, m c_r, m c_l)', low=0.0, high=2.0, above=True)
 
 
 @dataclass(frozen=True)
 class ProportionalGain:
-    """Structure proportional (3.2)."""
-
     f: float = option(0.22, 'gain f of u_d = y_m + f v (3.2)', 'u/v')
     bounds: tuple[float, float] = option((-0.5, 0.5), 'interval of f when the law adapts it', 'u/v')
 
 
 @dataclass(frozen=True)
 class TrackingWeights:
-    """Structure tracking."""
-
     preview: int = option(
         60, 'tracking: samples of y_m looked at ahead; y follows y_m delayed by as many',
         'samples', low=0, high=10000)
@@ -147,16 +129,12 @@ class TrackingWeights:
 
 @dataclass(frozen=True)
 class PolePlacementFilter:
-    """Structure pole_placement."""
-
     filter_pole: float = option(
         0.6, 'pole_placement: pole of the filters of u_d and y', low=0.0, high=0.999)
 
 
 @dataclass(frozen=True)
 class InverseOptions:
-    """The inverse of the backlash."""
-
     caution: float = option(
         1.0, 'tracking: standard deviations by which the crossings are shrunk', low=0.0,
         high=100.0, live=True)
@@ -169,16 +147,12 @@ class InverseOptions:
 
 @dataclass(frozen=True)
 class FixedDoubt:
-    """Law fixed."""
-
     doubt: float = option(
         0.0, 'fixed: how much of the motion of u the given constants may get wrong', low=0.0)
 
 
 @dataclass(frozen=True)
 class ControlLimits:
-    """Limits of v, and its delay."""
-
     delay_samples: int = of_both(
         0, 'samples between control and its effect', 'samples', low=0, high=100)
     min: float = option(-inf, 'smallest v', 'v', live=True)
@@ -194,8 +168,6 @@ class ControlLimits:
 
 @dataclass(frozen=True)
 class Timeouts:
-    """How long silences and the last ramp may be."""
-
     plant_output: float = silence(
         0.5, 'longest silence of plant_output before on_timeout is done, 0 for never')
     reference: float = silence(
@@ -206,8 +178,6 @@ class Timeouts:
 
 @dataclass(frozen=True)
 class SavedEstimates:
-    """Estimates that outlive the process."""
-
     file: str = option(
         '', 'file that learned estimates are saved in, empty for none', per_node=True)
     load: bool = option(
@@ -219,8 +189,6 @@ class SavedEstimates:
 
 @dataclass(frozen=True)
 class DriverMessages:
-    """Messages from and to the driver."""
-
     style: str = of_node(
         'native', 'native: Float64 on plant_output and control; ros2_control: JointState on '
         'joint_states and Float64MultiArray on forward_command_controller/commands; '
@@ -248,8 +216,6 @@ class DriverMessages:
 
 @dataclass(frozen=True)
 class SimulatedBacklash:
-    """The hidden backlash of the simulated plant."""
-
     m: float = simulated(1.3, 'simulated slope', 'u/v', low=0.0, above=True, live=True)
     c_r: float = simulated(3.0, 'simulated right crossing', 'v', live=True)
     c_l: float = simulated(-3.0, 'simulated left crossing', 'v', live=True)
@@ -264,8 +230,6 @@ class SimulatedBacklash:
 
 @dataclass(frozen=True)
 class TruePlant:
-    """How the simulated G(z) differs from the one that is known."""
-
     numerator: tuple[float, ...] = simulated(
         (), 'numerator of the simulated G(z), empty: plant.numerator')
     denominator: tuple[float, ...] = simulated(
@@ -295,8 +259,7 @@ class ParameterTree:
     plant: PlantModel = PlantModel()
     actuator: ActuatorModel = ActuatorModel()
     lockstep: bool = of_node(
-        False,
-        'run as fast as the machine allows: each sample waits for its reference and its control',
+        False, 'run as fast as the machine allows: each sample waits for reference and control',
         used_by=(CONTROLLER, PLANT, REFERENCE_NODE, RECORDER))
     wait_for_subscribers: int = of_node(
         0, 'start only when the main topic has this many listeners', low=0,

@@ -45,8 +45,7 @@ class ParameterNode(Node):
                 name, entry = change.name, entry_of(change.name)
                 present = self.get_parameter(name).value if self.has_parameter(name) else None
                 if entry is None or present is None:
-                    if present is None or change.value != present:
-                        changes.append(change)
+                    changes += [change] * (present is None or change.value != present)
                 elif (value := check_value(entry, _given_value(change))) \
                         != check_value(entry, present):
                     changes.append(_ros_parameter(name, value, entry))
@@ -142,14 +141,12 @@ def _description(entry: Parameter, name: str, reconfigurable: bool) -> Parameter
         else entry.rules,
         read_only=not (entry.live or (reconfigurable and not entry.fixed)),
     )
-    low, high = entry.low, entry.high
-    if isfinite(low) and isfinite(high):
-        if isinstance(entry.default, float):
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-        elif isinstance(entry.default, int):
-            descriptor.integer_range = [
-                IntegerRange(from_value=int(low), to_value=int(high), step=1)
-            ]
+    bounds = {'from_value': entry.low, 'to_value': entry.high}
+    if isinstance(entry.default, float) and isfinite(entry.high - entry.low):
+        descriptor.floating_point_range = [FloatingPointRange(**bounds)]
+    elif isfinite(entry.high - entry.low) and isinstance(entry.default, int):
+        whole = {end: int(value) for end, value in bounds.items()}
+        descriptor.integer_range = [IntegerRange(**whole, step=1)]
     return descriptor
 
 
@@ -203,21 +200,17 @@ def unused(sections: Sequence[str], executable: str, full_name: str) -> Iterator
     *namespace, own = full_name.strip('/').split('/')
     last = {section: section.rpartition('/')[2] for section in sections}
     meant = [section for section in sections if last[section] in (own, executable)]
-    if any(_reaches(section, full_name) for section in meant):
-        meant = []
+    for section in meant:
+        # ** stands for any namespaces.
+        pattern = re.escape(f'/{section.strip("/")}').replace(r'/\*\*', '(/[^/]+)*')
+        if re.fullmatch(pattern.replace(r'/\*', '/[^/]+'), full_name):
+            meant = []
     for section in sections:
         of_another_axis = namespace and section.strip('/') != own == last[section]
         misspelt = last[section] not in (own, *NODES) and '*' not in last[section] \
             and difflib.get_close_matches(last[section], [executable], cutoff=0.8)
         if (section in meant and not of_another_axis) or misspelt:
             yield section
-
-
-def _reaches(section: str, full_name: str) -> bool:
-    """Whether ROS 2 gives the node the values of a section; ** stands for any namespaces."""
-    parts = ['(/[^/]+)*' if part == '**' else '/[^/]+' if part == '*' else '/' + re.escape(part)
-             for part in section.strip('/').split('/')]
-    return re.fullmatch(''.join(parts), full_name) is not None
 
 
 def _section_names(content: Any, prefix: str = '') -> Iterator[str]:

@@ -34,6 +34,8 @@ own in the namespace of that name and a folder DIR/NAME. Values stand under /**,
 joints: a file with the parameter joints is one controller for all of them, with its recorder. It
 needs --driver; y_m comes from whoever plans the motion. Each joint gets a report in DIR/JOINT.
 
+--duration inf runs until Ctrl-C.
+
 exit codes: 0 done, 2 bad input, 1 anything else (a process died, nothing moves, interrupted).
 
 A first Ctrl-C (SIGTERM, SIGHUP) stops all processes in order and reports what was recorded, a
@@ -56,8 +58,7 @@ def parse_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         'bringup', description=__doc__, epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    cli.add_common_options(parser)
-    cli.add_duration_option(parser, '; inf runs until Ctrl-C')
+    cli.add_options(parser, '--config', '--set', '--axis', '--seed', '--out', '--duration')
     parser.add_argument(
         '--driver', metavar='COMMAND',
         help='start this command instead of the simulated plant; none: it is started elsewhere',
@@ -97,9 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with StopRequests() as requests:
             # numpy and scipy take a second to load, in which a Ctrl-C is to be heard already.
             from backlash_ros.tools.bringup.plan import prepare
-            plan = prepare(options)
-            watch = run(plan, requests)
-        reported = [watch.has_samples(axis) and report(axis) for axis in plan.axes]
+            watch = run(prepare(options), requests)
+        reported = [axis.made > 0 and report(axis.plan) for axis in watch.axes.values()]
         code = DONE if all(reported) and not watch.failure else FAILED
 
     return cli.run_tool('bringup', bringup) or code
@@ -152,7 +152,7 @@ def report(axis: AxisPlan) -> bool:
     # Drawing libraries take a second to load: not before bad input is refused.
     from backlash_ros.tools.bringup.watch import complain
     from backlash_ros.tools.report import REPORT_PAGE, write_report
-    from backlash_ros.tools.runs.read_run import read_run
+    from backlash_ros.tools.runs.read_run import BAG, read_run
     from backlash_ros.tools.runs.summary import estimate_table
     if not axis.record:
         print(axis.titled(f'no bag and no report (--no-record), logs in {axis.logs}'))
@@ -163,7 +163,7 @@ def report(axis: AxisPlan) -> bool:
         out = axis.out / joint
         try:
             out.mkdir(exist_ok=True)
-            summary = write_report(read_run(axis.bag, axis=joint), out)
+            summary = write_report(read_run(axis.out / BAG, axis=joint), out)
         except (InputError, OSError) as error:
             complain(axis.titled(f'no report: {error}'))
             good = False

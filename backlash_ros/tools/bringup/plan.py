@@ -39,24 +39,19 @@ class AxisPlan:
     record: bool
 
     @property
-    def bag(self) -> Path:
-        """Folder of the bag."""
-        return self.out / BAG
-
-    @property
     def logs(self) -> Path:
         """Folder of the logs."""
         return self.out / 'logs'
 
-    def waits(self, process: str) -> bool:
-        """Whether one of its processes waits for somebody who may come at any time."""
+    @property
+    def waiting(self) -> set[str]:
+        """Those of its processes that wait for somebody who may come at any time."""
         p = self.parameters
-        waiting = {
+        return {self.process_name(node) for node, waits in {
             # The plant begins when the controller listens.
             'controller': p.driver == ELSEWHERE or not p.autostart, 'plant': not p.autostart,
-            'recorder': bool(p.joints),  # begins when the motion is planned
-        }
-        return any(waits and process == self.process_name(node) for node, waits in waiting.items())
+            'recorder': p.joints,  # begins when the motion is planned
+        }.items() if waits}
 
     def titled(self, text: str) -> str:
         """The text, with the name of the axis where there are axes."""
@@ -208,7 +203,7 @@ def _node(axis: AxisPlan, node: str, domain: int | None) -> ProcessPlan:
     lockstep = axis.parameters.lockstep
     if node == 'recorder':
         # In YAML, whatever stands in the path.
-        bag = str(axis.bag).replace("'", "''") if axis.record else ''
+        bag = str(axis.out / BAG).replace("'", "''") if axis.record else ''
         settings = ['-p', 'wait_for_publishers:=true', '-p', f"bag:='{bag}'"]
     else:
         # The loop and the recorder; in real time the reference follows plant_output as well, in

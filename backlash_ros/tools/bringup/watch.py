@@ -127,25 +127,21 @@ class AxisProgress:
 class RunWatch:
     """Watches the processes of a run from start to end.
 
-    failure: what went wrong, empty as long as nothing did.
+    axes: how far each has come, by name. failure: what went wrong, empty as long as nothing did.
     """
 
     def __init__(
         self, plan: RunPlan, supervisor: ProcessSupervisor, requests: StopRequests,
     ) -> None:
-        self._plan, self._supervisor, self._requests = plan, supervisor, requests
-        self._axes = {axis.name: AxisProgress(axis) for axis in plan.axes}
+        self._supervisor, self._requests = supervisor, requests
+        self.axes = {axis.name: AxisProgress(axis) for axis in plan.axes}
         self._ready: set[str] = set()
         self._gone: set[str] = set()  # spectators that have died
         self.failure = ''
 
-    def has_samples(self, axis: AxisPlan) -> bool:
-        """Whether at least one sample of the axis went round the loop."""
-        return self._axes[axis.name].made > 0
-
     def execute(self) -> None:
         """Wait until all samples are made, then stop everything; sets failure."""
-        axes = self._axes.values()
+        axes = self.axes.values()
         try:
             self._wait_until_ready()
             for axis in axes:
@@ -160,22 +156,19 @@ class RunWatch:
                 complain(f'{self._requests.last} ends the run')
         except BrokenOffError as error:
             # Said before the processes are stopped, which may take a while.
-            self._fail(str(error))
+            self.failure = str(error)
+            complain(self.failure)
         for plan, content in self._supervisor.stop():
             self._note(plan, content)
         if not self.failure:
             self._judge_exits()
 
-    def _fail(self, reason: str) -> None:
-        self.failure = reason
-        complain(reason)
-
     @property
     def _over(self) -> bool:
         """Whether the user ends a run that has no other end."""
-        endless = any(axis.parameters.samples == 0 for axis in self._plan.axes)
-        begun = all(axis.made > 0 for axis in self._axes.values())
-        return self._requests.count > 0 and endless and begun
+        axes = self.axes.values()
+        return self._requests.count > 0 and all(axis.made > 0 for axis in axes) \
+            and any(axis.plan.parameters.samples == 0 for axis in axes)
 
     def _wait_until_ready(self) -> None:
         deadline = time.monotonic() + READY_DEADLINE_S
@@ -187,11 +180,11 @@ class RunWatch:
         while missing():
             self._listen()
             late = [child for child in missing()
-                    if not self._axes[child.plan.axis].plan.waits(child.plan.name)]
+                    if child.plan.name not in self.axes[child.plan.axis].plan.waiting]
             if late and time.monotonic() > deadline:
                 names = ', '.join(child.plan.name for child in late)
                 hint = ' (a controller waits until the driver subscribes to its command)' \
-                    if any(axis.parameters.driver for axis in self._plan.axes) else ''
+                    if any(axis.plan.parameters.driver for axis in self.axes.values()) else ''
                 logs = '\n'.join(f'the end of {child.end_of_log()}' for child in late)
                 raise BrokenOffError(
                     f'not ready within {READY_DEADLINE_S:g} s: {names}{hint}\n{logs}'
@@ -203,10 +196,10 @@ class RunWatch:
         # its own settings every 3 s.
         deadline = time.monotonic() + 10.0
         while not self._over and time.monotonic() < deadline and any(
-            axis.unheard for axis in self._axes.values()
+            axis.unheard for axis in self.axes.values()
         ):
             self._listen()
-        for axis in self._axes.values():
+        for axis in self.axes.values():
             if axis.unheard:
                 missing = ', '.join(f'{count} {what}' for what, count in axis.unheard.items())
                 complain(axis.plan.titled(
@@ -232,7 +225,7 @@ class RunWatch:
             raise BrokenOffError('\n'.join(dead))
 
     def _note(self, plan: ProcessPlan, content: Mapping[str, Any]) -> None:
-        axis, kind = self._axes[plan.axis], content['event']
+        axis, kind = self.axes[plan.axis], content['event']
         if kind == 'ready':
             self._ready.add(plan.name)
             if 'address' in content:
@@ -256,7 +249,6 @@ class RunWatch:
 
     def _judge_exits(self) -> None:
         """Check the exit codes of the processes that were asked to end."""
-        bad = []
         # A driver may end so of the signal that stops it; a shell adds 128 to its number.
         stopped = -signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM
         for child in self._supervisor.children:
@@ -264,9 +256,8 @@ class RunWatch:
             if code == 0 or child.plan.name in self._gone:
                 continue
             if not child.plan.foreign or code == -signal.SIGKILL:
-                bad.append(child.describe_end('did not stop cleanly'))
+                self.failure = child.describe_end('did not stop cleanly')
+                complain(self.failure)
             elif code not in stopped:
                 # How a program of the user says good-bye is its own affair.
                 complain(child.describe_end('was stopped'))
-        if bad:
-            self._fail('\n'.join(bad))

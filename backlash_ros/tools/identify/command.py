@@ -10,7 +10,7 @@ from pathlib import Path
 
 from backlash_ros.core.parameters.parameter import Value
 from backlash_ros.options import FAILED, OptionParser, positive
-from backlash_ros.tools.cli import add_out_option, add_span_options, run_tool, span_of
+from backlash_ros.tools.cli import add_options, run_tool, span_of
 from backlash_ros.tools.records.columns import parse_columns
 
 
@@ -30,8 +30,6 @@ def make_parser() -> argparse.ArgumentParser:
                         help='time from sample to sample [s] (default: told by the stamps)')
     parser.add_argument('--config', type=Path, metavar='FILE',
                         help='parameter file that the result goes on from: limits, topics, axes')
-    parser.add_argument('--axis', default='', metavar='NAME',
-                        help='of several: the one that is meant')
     parser.add_argument('--order', type=lambda text: _numbers(text, 6), default=(0, 1, 2, 3, 4),
                         metavar='N[-N]', help='numbers of poles that are compared (default: 0-4)')
     parser.add_argument('--delay', type=lambda text: _numbers(text, 40), default=(),
@@ -43,8 +41,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument('--slope', type=positive, default=1.0, metavar='M',
                         help='m, a gear ratio for instance; it cannot be told from the gain of G '
                              '(default: 1)')
-    add_span_options(parser)
-    add_out_option(parser)
+    add_options(parser, '--axis', '--from', '--to', '--out')
     drive = parser.add_argument_group('with --drive')
     drive.add_argument('--drive', action='store_true',
                        help='move the actuator within control.min, control.max and '

@@ -133,29 +133,27 @@ def read_samples(path: Path, sample_period: float | None = None) -> RunRecord:
     sample_period: None takes the smallest distance of two rows. Raises InputError.
     """
     try:
-        first, *lines = path.read_text(encoding='utf-8').splitlines() or ['']
+        header, *lines = path.read_text(encoding='utf-8').splitlines() or ['']
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f'{path}: cannot be read: {error}') from None
-    header = tuple(first.split(','))
+    names = tuple(header.split(','))
     # It once ended with f.
-    if header not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:10]):
+    if names not in (SAMPLE_COLUMNS, SAMPLE_COLUMNS[:10]):
         raise InputError(f'{path}: line 1: must be the header {",".join(SAMPLE_COLUMNS)}')
+    if not lines:
+        raise InputError(f'{path}: holds no sample')
     rows = np.full((len(lines), len(COLUMNS)), np.nan)
-    places = [COLUMNS.index(name) for name in header]
+    places = [COLUMNS.index(name) for name in names]
     for i, line in enumerate(lines):
         try:
             rows[i, places] = [float(cell or 'nan') for cell in line.split(',')]
         except ValueError:
-            raise InputError(f'{path}: line {i + 2}: must hold {len(header)} numbers') from None
+            raise InputError(f'{path}: line {i + 2}: must hold {len(names)} numbers') from None
     t = rows[:, COLUMNS.index('t')]
     steps = np.diff(t)
-    if not len(t):
-        raise InputError(f'{path}: holds no sample')
     if falls := np.flatnonzero(~(steps > 0.0)).tolist():
         raise InputError(f'{path}: line {falls[0] + 3}: t must rise from row to row')
-    if sample_period is None:
-        if not len(steps):
-            raise InputError(f'{path}: needs two samples to tell the sample period')
-        sample_period = float(steps.min())
-    lost = max(round((t[-1] - t[0]) / sample_period) + 1 - len(t), 0)
-    return RunRecord(rows, sample_period, lost)
+    if sample_period is None and not len(steps):
+        raise InputError(f'{path}: needs two samples to tell the sample period')
+    period = sample_period or float(steps.min())
+    return RunRecord(rows, period, max(round((t[-1] - t[0]) / period) + 1 - len(t), 0))

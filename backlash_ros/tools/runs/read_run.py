@@ -36,12 +36,10 @@ def read_run(
     period = parameters.sample_period if parameters else None
     if bag := find_bag(path):
         return replace(read_bag(bag, period, span, axis), parameters=parameters)
-    file = path
-    if path.is_dir():
-        found = [path / name for name in (RECORD_FILE, SAMPLES_FILE) if (path / name).is_file()]
-        if not found:
-            raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
-        file = found[0]
+    inside = (path / name for name in (RECORD_FILE, SAMPLES_FILE) if (path / name).is_file())
+    file = next(inside, None) if path.is_dir() else path
+    if file is None:
+        raise InputError(f'{path}: holds no bag, no {RECORD_FILE} and no {SAMPLES_FILE}')
     if file.suffix not in ('.npz', '.csv'):
         raise InputError(
             f'{path}: is neither a bag (its folder, .mcap or .db3) nor a folder of results, '
@@ -70,12 +68,10 @@ def find_bag(path: Path) -> Path | None:
 
 def _parameters(path: Path, config: Path | None, axis: str) -> Parameters | None:
     """Those of the file, or of the one beside the run, None without; of the first joint if any."""
-    places = [path if path.is_dir() else path.parent]
-    if is_bag(path):
-        # A bag lies in the folder of the results to which the parameters belong.
-        places.append(places[0].parent)
-    beside = (place / CONFIG_FILE for place in places if (place / CONFIG_FILE).is_file())
-    file = config or next(beside, None)
+    folder = path if path.is_dir() else path.parent
+    # A bag lies in the folder of the results to which the parameters belong.
+    beside = [folder / CONFIG_FILE, *[folder.parent / CONFIG_FILE] * is_bag(path)]
+    file = config or next(filter(Path.is_file, beside), None)
     if file is None:
         return None
     configuration = read_configuration(file)

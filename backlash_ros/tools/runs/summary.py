@@ -37,12 +37,10 @@ def summarise(
     t, status = run.column('t'), run.column('status')
     status = status[np.isfinite(status)]
     words = {float(state): state.word for state in Status}
+    latency = np.empty(0) if latency_s is None else latency_s[np.isfinite(latency_s)]
 
     def last(name: str) -> float:
         return float(run.column(name)[-1])
-
-    def of_truth(name: str) -> float | None:
-        return last(f'true_{name}') if run.has_truth else None
 
     learned = run.learned
     return {
@@ -54,7 +52,7 @@ def summarise(
         'began_with': _beginning(run, parameters),
         'final': {name: last(name) for name in (*BACKLASH, 'f')},
         'final_std': {name: last(f'std_{name}') for name in BACKLASH},
-        'truth': {name: of_truth(name) for name in BACKLASH},
+        'truth': {name: last(f'true_{name}') if run.has_truth else None for name in BACKLASH},
         'settling_time_s': {
             name: settling_time(t, run.column(name), run.column(f'true_{name}'))
             if run.has_truth else None for name in BACKLASH
@@ -63,7 +61,9 @@ def summarise(
         'tracking_error_rms': delayed_tracking_error_rms(
             run, reference_delay(parameters), float(t[run.samples // 2])
         ),
-        'loop_latency_ms': _latency_ms(latency_s),
+        'loop_latency_ms': {
+            f'p{q}': 1e3 * float(np.percentile(latency, q)) for q in (50, 99)
+        } if latency.size else None,
         'final_status': words.get(last('status')),
         'status_share': {word: float(np.mean(status == state)) for state, word in words.items()}
         if status.size else None,
@@ -85,15 +85,6 @@ def _beginning(run: RunRecord, parameters: Parameters | None) -> dict[str, Any]:
     guessed = all(first[name] == getattr(guess, name) for name in BACKLASH)
     loaded = parameters.estimates.load and not guessed
     return {**first, 'from': parameters.estimates.file if loaded else 'estimator.initial'}
-
-
-def _latency_ms(latency_s: NDArray[np.float64] | None) -> dict[str, float] | None:
-    """Quantiles [ms] of latencies [s], shape (samples,); None where none is known."""
-    known = latency_s[np.isfinite(latency_s)] if latency_s is not None else np.empty(0)
-    if known.size == 0:
-        return None
-    p50, p99 = np.percentile(known, [50, 99]) * 1e3
-    return {'p50': float(p50), 'p99': float(p99)}
 
 
 def reference_delay(parameters: Parameters | None) -> int:

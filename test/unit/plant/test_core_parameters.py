@@ -75,10 +75,10 @@ def test_value_beyond_a_bound_is_refused_and_the_bound_itself_unless_excluded(pa
     count = len(parameter.default) if isinstance(parameter.default, tuple) else 0
     rules = []
     if parameter.low > -inf:
-        rule = f'must be {">" if parameter.above else ">="} {parameter.low:g}'
+        rule = f'{">" if parameter.above else ">="} {parameter.low:g}'
         rules = [(parameter.low - 1.0, rule), (parameter.low - 1e9, rule)]
     if parameter.high < inf:
-        rules.append((parameter.high + 1.0, f'must be <= {parameter.high:g}'))
+        rules.append((parameter.high + 1.0, f'<= {parameter.high:g}'))
     for value, rule in rules:
         assert rule in refusal_of(parameter.name, [value] * count if count else value)
     if parameter in NUMBERS and parameter.above:

@@ -164,7 +164,7 @@ def check_tool(program: str, arguments: list[str]) -> None:
     else:
         assert options.config is None or (ROOT / options.config).is_file()
     for sweep in getattr(options, 'sweep', []):
-        batch.parse_sweep(sweep)
+        batch.combinations([sweep])
 
 
 @pytest.mark.usefixtures('undrawn')
