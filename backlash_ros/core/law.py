@@ -31,6 +31,14 @@ class Interval(NamedTuple):
     other: float = nan
 
 
+class OutOfBounds(NamedTuple):
+    """A quantity, as its bound is named, that was found beyond it."""
+
+    name: str
+    value: float
+    bound: tuple[float, float]
+
+
 @dataclass(frozen=True)
 class LawReport:
     """What a law knows of its own work; the defaults are those of a law that does not learn it.
@@ -40,7 +48,8 @@ class LawReport:
     is no better estimate because the load runs on within the gap. unconfirmed: the estimate was
     learned before this run, and its samples do not confirm it yet. wrong_sign: there is no
     estimate because y moves against v. undecided: there is none though v went back and forth, as
-    several gaps explain y alike. waiting: samples that no fit has taken in yet. outliers:
+    several gaps explain y alike. forbidden: what keeps an estimate that is good otherwise from
+    being published. waiting: samples that no fit has taken in yet. outliers:
     readings rejected so far. reattributed: intervals so far over which another v acted than
     the one commanded. failed_fits: fits so far without a result.
     """
@@ -51,6 +60,7 @@ class LawReport:
     unconfirmed: bool = False
     wrong_sign: bool = False
     undecided: bool = False
+    forbidden: OutOfBounds | None = None
     waiting: int = 0
     outliers: int = 0
     reattributed: int = 0

@@ -9,6 +9,8 @@ from math import isfinite
 
 from tqdm import tqdm
 
+from backlash_ros.core.estimate import Status
+from backlash_ros.core.loop.diagnosis import LoopFigures, state_beside
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.parameter import as_yaml
 from backlash_ros.core.simulation.closed_loop import build_closed_loop
@@ -66,6 +68,11 @@ def _once(parameters: Parameters, options: argparse.Namespace) -> None:
         run = run_loop(loop, samples, lambda _: bar.update())
     directory = result_directory(options.out)
     print(estimate_table(write_report(Run(run, parameters), directory)))
+    law = loop.controller.estimator
+    state = state_beside(set(), LoopFigures(
+        sample_period=parameters.sample_period, status=law.estimate.status, law=law.report))
+    if law.estimate.status != Status.TRACKING:
+        print(f'at the end: {state.text}')
     print(f'report: {directory / REPORT_PAGE}')
 
 

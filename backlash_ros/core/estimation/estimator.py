@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from backlash_ros.core.estimate import Bounds, Estimate, Status
 from backlash_ros.core.estimation.belief import Belief, Inherited
-from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Setup, Window
+from backlash_ros.core.estimation.explanations import SMALLEST_NOISE, Setup, Window, forbidden
 from backlash_ros.core.estimation.observer import Following, Gains, Place, gains_of, place_of
 from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.settings import FEWEST, FIRST_FIT, HELD_REVERSALS, LONGEST
@@ -176,6 +176,8 @@ class MovingHorizon(Law):
             wrong_sign=belief.tried is not None and belief.tried.m < 0.0,
             undecided=belief.published is None and belief.tried is not None
             and belief.tried.m > 0.0 and belief.tried.turns >= HELD_REVERSALS,
+            forbidden=None if belief.tried is None
+            else forbidden(self._setup, belief.tried, belief.tried.turns),
             waiting=self._channel.record.end - belief.end,
             outliers=self._following.outliers,
             reattributed=self._reattributed,

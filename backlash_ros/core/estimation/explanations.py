@@ -17,6 +17,7 @@ from backlash_ros.core.estimation.plant_family import PlantFamily
 from backlash_ros.core.estimation.play import engaged, play, reversals
 from backlash_ros.core.estimation.posterior import Prior, Start, WindowFit
 from backlash_ros.core.estimation.search import search
+from backlash_ros.core.law import OutOfBounds
 
 Array = NDArray[np.float64]
 
@@ -300,9 +301,23 @@ def is_known(setup: Setup, f: WindowFit, turns: int) -> bool:
     deviations must be smaller: what causes that does not average out. A gap is also known where
     its upper end is small beside the first guess: there is none.
     """
-    if not f.valid or turns < _turns_needed(setup):
-        return False
-    if any(outside_bounds(setup.bounds, f)) or moves_unexplained(setup, f):
+    return forbidden(setup, f, turns) is None and _is_precise(setup, f, turns)
+
+
+def forbidden(setup: Setup, f: WindowFit, turns: int) -> OutOfBounds | None:
+    """What keeps a fit that would be known otherwise from being it; None for nothing."""
+    if not _is_precise(setup, f, turns):
+        return None
+    outside = outside_bounds(setup.bounds, f)
+    return next((
+        OutOfBounds(name, value, getattr(setup.bounds, name))
+        for name, value, out in zip(('m', 'c_r', 'c_l'), f.crossings.tolist(), outside, strict=True)
+        if out
+    ), None)
+
+
+def _is_precise(setup: Setup, f: WindowFit, turns: int) -> bool:
+    if not f.valid or turns < _turns_needed(setup) or moves_unexplained(setup, f):
         return False
     factor = 1.0 / settings.SYSTEMATIC if f.systematic else 1.0
     std_m, std_c_r, std_c_l = f.crossings_std.tolist()

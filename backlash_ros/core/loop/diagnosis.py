@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast
 
 from backlash_ros.core.estimate import Status
 from backlash_ros.core.estimates_file import was_given
-from backlash_ros.core.law import LawReport
+from backlash_ros.core.law import LawReport, OutOfBounds
 from backlash_ros.core.loop.control_loop import ControlLoop
 from backlash_ros.core.loop.driver_period import UNKNOWN_PERIOD, Period
 from backlash_ros.core.loop.finding import Finding, Level
@@ -196,7 +196,7 @@ def findings_of(f: LoopFigures) -> list[Finding]:
     """
     causes = [_finding(row) for row in causes_of(f) if row[2]]
     kinds = {cause.kind for cause in causes}
-    state = next(_finding(row) for row in _states_beside(kinds, f) if row[2])
+    state = state_beside(kinds, f)
     if state.kind == 'model':
         # What the fit has found out itself says more than what is late or missing; a wrong sign
         # drives v into its limits besides, and comes of no clock.
@@ -208,6 +208,11 @@ def findings_of(f: LoopFigures) -> list[Finding]:
         late = [cause for cause in causes if cause.kind in lesser]
         return [cause for cause in causes if cause not in late] + [state, *late]
     return [*causes, state] if state.level != OK or not causes else causes
+
+
+def state_beside(causes: set[str], f: LoopFigures) -> Finding:
+    """How the learning goes where causes of these kinds were found."""
+    return next(_finding(row) for row in _states_beside(causes, f) if row[2])
 
 
 def _finding(row: Row) -> Finding:
@@ -317,6 +322,14 @@ def causes_of(f: LoopFigures) -> tuple[Row, ...]:
     )
 
 
+def _beyond(found: OutOfBounds | None) -> str:
+    if found is None:
+        return ''
+    name, value, (low, high) = found
+    return f'{name} is {value:.4g}, beyond estimator.bounds.{name} [{low:g}, {high:g}]: widen it' \
+        + ('' if name == 'm' else ', or correct the zero of y')
+
+
 def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
     """The table of states where causes of these kinds were found: the first that holds counts."""
     y, status, share = f.output, f.status, 100.0 * f.law.unexplained
@@ -338,6 +351,8 @@ def _states_beside(causes: set[str], f: LoopFigures) -> tuple[Row, ...]:
          'estimates held as ~/freeze_adaptation asked; v is still answered'),
         ('known', OK, f.law.unconfirmed and status == Status.ACQUIRING,
          'estimates of before hold: only a v at several speeds could confirm them'),
+        ('bound', WARN, f.law.forbidden is not None and status == Status.ACQUIRING,
+         _beyond(f.law.forbidden)),
         ('undecided', OK, f.law.undecided and status == Status.ACQUIRING,
          'learning: several gaps explain y alike: let v move between more than two values'),
         ('acquiring', OK, status == Status.ACQUIRING,

@@ -110,3 +110,20 @@ def test_two_values_of_v_leave_open_whether_slope_or_gap_is_larger() -> None:
     run = loop.run(1600)
     assert not (run.column('status') == Status.TRACKING).any()
     assert loop.controller.estimator.report.undecided
+
+
+@pytest.mark.parametrize(('name', 'value', 'bound'), [
+    ('c_r', -2.51, (-1.0, 3.0)), ('c_l', -3.41, (-3.0, 3.0)), ('m', 0.098, (0.1, 0.2)),
+])
+def test_a_bound_that_keeps_a_good_estimate_back_is_named_with_what_was_found(name, value, bound):
+    p = Parameters({
+        **motor(), 'input_disturbance': 0.3, 'frequency': 4.0, f'estimator.bounds.{name}': bound,
+        'estimator.initial.m': 0.15, 'estimator.initial.c_r': 0.5,
+    })
+    loop = build_closed_loop(p)
+    run = loop.run(round(2 * 2.0 * np.pi / 4.0 / p.sample_period))
+    assert (run.column('status') == Status.ACQUIRING).all()
+    found = loop.controller.estimator.report.forbidden
+    assert found is not None
+    assert (found.name, found.bound) == (name, bound)
+    assert found.value == pytest.approx(value, rel=0.01)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from backlash_ros.core.estimate import Status
-from backlash_ros.core.law import LawReport
+from backlash_ros.core.law import LawReport, OutOfBounds
 from backlash_ros.core.loop.diagnosis import (
     LONGEST_TEXT,
     UNNAMED,
@@ -160,6 +160,17 @@ def test_a_contradiction_is_named_by_what_the_fit_has_found(changes, text):
     assert len(text) <= LONGEST_TEXT
     # An estimate that holds is not doubted.
     assert findings_of(replace(WELL, **changes)) == [LEARNED]
+
+
+@pytest.mark.parametrize(('forbidden', 'text'), [
+    (OutOfBounds('c_r', -9.65432, (-3.0, 3.0)), 'c_r is -9.654, beyond estimator.bounds.c_r '
+     '[-3, 3]: widen it, or correct the zero of y'),
+    (OutOfBounds('m', 0.3, (0.05, 0.2)), 'm is 0.3, beyond estimator.bounds.m [0.05, 0.2]: widen '
+     'it'),
+])
+def test_a_bound_that_forbids_an_estimate_is_a_warning_with_what_was_found(forbidden, text):
+    figures = replace(WELL, status=Status.ACQUIRING, law=LawReport(forbidden=forbidden))
+    assert findings_of(figures) == [Finding(Level.WARN, 'bound', text)]
 
 
 @pytest.mark.parametrize(('late', 'kinds'), [(20, ['model', 'late']), (90, ['late', 'held'])])
