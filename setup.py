@@ -17,7 +17,7 @@ setup(
     packages=find_packages(exclude=['test*']),
     package_data={
         f'{PACKAGE}.middleware': ['loopback.xml', 'network.xml'],
-        f'{PACKAGE}.nodes.watching': ['page.html'],
+        f'{PACKAGE}.nodes': ['live.html'],
         f'{PACKAGE}.tools': ['page.html', 'figures.mplstyle'],
     },
     data_files=[

@@ -5,27 +5,110 @@ The page is served to this machine alone, at an address that is printed.
 
 from __future__ import annotations
 
-import argparse
+import json
 import sys
-import threading
 import time
+from collections import deque
 from collections.abc import Sequence
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from math import isfinite
+from pathlib import Path
+from threading import Lock, Thread
+from typing import Any
 
 from rclpy.utilities import remove_ros_args
 
+from backlash_ros.nodes.followed import (
+    ControllerState,
+    FollowedControllers,
+    give_way,
+    viewer_options,
+)
 from backlash_ros.nodes.runtime.executor import PromptExecutor
 from backlash_ros.nodes.runtime.process import ENABLED, ProcessNode, emit, ros_arguments, run
-from backlash_ros.nodes.watching.followed import ControllerState, FollowedControllers, give_way
-from backlash_ros.nodes.watching.page_server import CurvePoints, PageServer, rounded
-from backlash_ros.options import LARGEST_PORT, OptionParser
+from backlash_ros.options import LARGEST_PORT
 from backlash_ros.topics import BACKLASH
 
-LIVE = 'live'
+LIVE, HOST = 'live', '127.0.0.1'
 SHOWN_S, PAGE_PERIOD_S = 10.0, 0.1  # width of the curves, time between two looks
 LIVE_LABELS = (
     *BACKLASH, *(f'{name}_{end}' for name in BACKLASH for end in ('low', 'high')),
     'y_m', 'y', 'u_d', 'v', 'u_hat',
 )
+
+
+class PageServer(ThreadingHTTPServer):
+    """Answers each browser in a thread of its own, so that a slow one holds up nobody.
+
+    port: 0 for a free one; raises OSError. kept: portions of curves for who has asked last so long
+    ago. began: tells this server from one that was here before.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, port: int, kept: int) -> None:
+        super().__init__((HOST, port), PageRequest)
+        self.address = f'http://{HOST}:{self.server_address[1]}'
+        self._began = time.time_ns()
+        self._state, self._count = '{}', 0  # the newest state, how many portions there were
+        self._portions: deque[str] = deque(maxlen=kept)
+        self._lock = Lock()
+
+    def add(self, state: object, portion: object) -> None:
+        """Have this ready for whoever asks: what the page says, and the newest points of curves."""
+        texts = [json.dumps(each, separators=(',', ':'), allow_nan=False)
+                 for each in (state, portion)]
+        with self._lock:
+            self._state, self._count = texts[0], self._count + 1
+            self._portions.append(texts[1])
+
+    def frame(self, known: int) -> str:
+        """The state and the portions that somebody is missing who has so many, as JSON."""
+        with self._lock:
+            first = len(self._portions) - self._count + known if known <= self._count else 0
+            missing = ','.join(list(self._portions)[max(first, 0):])
+            return (f'{{"state":{self._state},"began":{self._began},"count":{self._count},'
+                    f'"portions":[{missing}]}}')
+
+
+class PageRequest(BaseHTTPRequestHandler):
+    """What a browser asks for: / is the page, /frame?known=N what it is missing."""
+
+    server: PageServer
+    protocol_version = 'HTTP/1.1'  # one connection for all frames
+    timeout = 10.0  # [s] for a browser that has fallen silent
+
+    def do_GET(self) -> None:
+        """Answer it; called by the library."""
+        path, _, known = self.path.partition('?known=')
+        # A page from elsewhere may let a name of its own point here, and read along.
+        if self.headers.get('Host', '').partition(':')[0] not in (HOST, 'localhost'):
+            self.send_error(HTTPStatus.FORBIDDEN, f'only {HOST} is served')
+        elif path == '/':
+            self._answer('text/html', Path(__file__).with_suffix('.html').read_bytes())
+        elif path == '/frame':
+            frame = self.server.frame(int(known) if known.isdecimal() else 0)
+            self._answer('application/json', frame.encode())
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def handle(self) -> None:
+        """Answer until the browser has gone."""
+        with suppress(OSError):
+            super().handle()
+
+    def log_message(self, *message: Any) -> None:
+        """Nobody reads of each request."""
+
+    def _answer(self, kind: str, content: bytes) -> None:
+        self.send_response(HTTPStatus.OK)
+        for name, value in (('Content-Type', f'{kind}; charset=utf-8'),
+                            ('Content-Length', str(len(content))), ('Cache-Control', 'no-store')):
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
 
 
 class LiveNode(ProcessNode):
@@ -40,13 +123,10 @@ class LiveNode(ProcessNode):
         self._followed = FollowedControllers(self, wanted, LIVE_LABELS, depth=30)
         self._server = server
         self._start_ns = time.time_ns()
-        self._points: dict[str, CurvePoints] = {}
 
     def work(self, executor: PromptExecutor) -> None:
         """Serve the page until a signal ends it."""
-        threading.Thread(
-            target=self._server.serve_forever, args=[PAGE_PERIOD_S], daemon=True
-        ).start()
+        Thread(target=self._server.serve_forever, args=[PAGE_PERIOD_S], daemon=True).start()
         if ENABLED:
             emit('ready', address=self._server.address)
         else:
@@ -55,22 +135,32 @@ class LiveNode(ProcessNode):
         while not self.stopping:
             executor.spin_once(timeout_sec=0.0)  # the look for further controllers
             self._followed.take_diagnostics()
-            self._server.add(self._state(), {
-                name: self._points.setdefault(name, CurvePoints(self._start_ns))
-                .take(state.watch()) for name, state in self._followed.by_name.items()
-            })
+            states, now_s = self._followed.by_name, time.monotonic()
+            curves = {name: self._points_of(state) for name, state in states.items()}
+            self._server.add({
+                'now': self._seconds(time.time_ns()), 'shown': SHOWN_S,
+                'awaited': self._followed.awaited,
+                'controllers': [content_of(states[name], now_s) for name in sorted(states)],
+            }, curves)
             now_s = time.monotonic()
             due_s = max(due_s + PAGE_PERIOD_S, now_s)
             time.sleep(due_s - now_s)
         self._server.shutdown()
 
-    def _state(self) -> dict[str, object]:
-        by_name, now_s = self._followed.by_name, time.monotonic()
-        return {
-            'now': round(1e-9 * (time.time_ns() - self._start_ns), 3), 'shown': SHOWN_S,
-            'awaited': self._followed.awaited,
-            'controllers': [content_of(by_name[name], now_s) for name in sorted(by_name)],
-        }
+    def _points_of(self, state: ControllerState) -> dict[str, list[tuple[float, float | None]]]:
+        """What has come of each curve: time of arrival [s] and value."""
+        points: dict[str, list[tuple[float, float | None]]] = {}
+        for label, at_ns, value in state.watch():
+            points.setdefault(label, []).append((self._seconds(at_ns), rounded(value)))
+        return points
+
+    def _seconds(self, at_ns: int) -> float:
+        return round(1e-9 * (at_ns - self._start_ns), 6)
+
+
+def rounded(value: float) -> float | None:
+    """A number for JSON, which has no nan: None."""
+    return float(f'{value:.7g}') if isfinite(value) else None
 
 
 def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
@@ -80,24 +170,17 @@ def content_of(state: ControllerState, now_s: float) -> dict[str, object]:
         # Nobody knows how somebody is who says nothing any more.
         'level': 2 if state.silent_s(now_s) else state.level,
         'estimates': {name: [*map(rounded, pair)] for name, pair in state.estimates.items()},
-        'excitation': rounded(state.excitation),
-        'rate': rounded(state.number('rate [Hz]')),
-        'latency': [rounded(state.number(f'latency {which} [ms]')) for which in ('p50', 'p99')],
-        'counts': {name: state.values.get(name, '') for name in ('samples', 'lost', 'late')},
-        'learning': state.is_on('learning'), 'compensating': state.is_on('compensating'),
-        'events': [*map(list, state.events)],
+        'values': state.values, 'events': [*state.events],
     }
 
 
 def main(args: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     arguments = sys.argv[1:] if args is None else args
-    parser = OptionParser(
-        LIVE, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog='From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
+    parser = viewer_options(
+        LIVE, __doc__,
+        'From elsewhere: ssh -L PORT:127.0.0.1:PORT HOST, then open the same address there.',
     )
-    parser.add_argument('name', nargs='*', metavar='NAME',
-                        help='a controller or a namespace, as /pan (default: all there are)')
     parser.add_argument('--port', type=int, default=0, metavar='PORT',
                         help='of the page (default: a free one)')
     options = parser.parse_args(remove_ros_args(['', *arguments])[1:])

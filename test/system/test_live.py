@@ -53,14 +53,16 @@ def test_a_page_shows_every_axis_to_this_machine_alone_and_a_run_goes_on_without
         for portion in frame['portions']:
             for name, curves in portion.items():
                 heard.setdefault(name, set()).update(curves)
-        complete = [labels for labels in heard.values() if {*LIVE_LABELS, 'loop'} <= labels]
-        if len(complete) == 2 and all(each['rate'] for each in frame['state']['controllers']):
+        complete = [labels for labels in heard.values() if set(LIVE_LABELS) <= labels]
+        if len(complete) == 2 and all(
+            each['values'].get('rate [Hz]') for each in frame['state']['controllers']
+        ):
             break
     assert set(heard) == {'/pan/controller', '/tilt/controller'}
     assert [each['name'] for each in frame['state']['controllers']] == sorted(heard)
     for state in frame['state']['controllers']:
         assert state['word']
-        assert int(state['counts']['samples']) > 0
+        assert int(state['values']['samples']) > 0
         assert set(state['estimates']) == {'m', 'c_r', 'c_l'}
         assert state['events']
     assert listening_addresses(run.node('live')) == {'127.0.0.1'}

@@ -16,7 +16,7 @@ from pathlib import Path
 from drivers.paced_driver import PacedDriver, controller_and_driver
 from ros_processes import DEADLINE_S, RosWorld, ros_world
 
-from backlash_ros.nodes.watching.screen import BAR
+from backlash_ros.nodes.monitor import BAR
 
 MODULE = 'monitor'
 COMMAND = [sys.executable, '-m', f'backlash_ros.nodes.{MODULE}']

@@ -4,12 +4,11 @@ import json
 import socket
 import threading
 from collections.abc import Iterator
-from math import nan
 
 import pytest
 from live_pages import frames
 
-from backlash_ros.nodes.watching.page_server import HOST, CurvePoints, PageServer
+from backlash_ros.nodes.live import HOST, PageServer
 
 
 @pytest.fixture
@@ -42,13 +41,3 @@ def test_a_reader_gets_the_newest_portions_and_each_of_them_once(served):
     assert next(seen)['portions'] == []
     # Who has seen more than there ever was has seen another server.
     assert len(json.loads(served.frame(99))['portions']) == 3
-
-
-def test_v_and_the_u_after_it_make_a_point_whatever_is_missing() -> None:
-    points = CurvePoints(0)
-    assert points.take([('v', 10, 1.0), ('u_hat', 20, 0.1)])['loop'] == [1.0, 0.1]
-    # The u of a v that is under way still, or was lost.
-    assert 'loop' not in points.take([('u_hat', 30, 0.2)])
-    assert 'loop' not in points.take([('v', 40, 3.0)])
-    assert points.take([('v', 50, 4.0), ('u_hat', 60, nan)])['loop'] == [4.0, None]
-    assert points.take([('m', 2_000_000_000, 0.098)]) == {'m': [2.0, 0.098]}

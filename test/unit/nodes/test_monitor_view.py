@@ -9,8 +9,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rich.console import Console
 
-from backlash_ros.nodes.watching.followed import ControllerState
-from backlash_ros.nodes.watching.screen import bar, screen
+from backlash_ros.nodes.followed import ControllerState
+from backlash_ros.nodes.monitor import bar, screen
 
 VALUES = {
     'state': 'tracking', 'm': '1.3', 'c_r': '3', 'c_l': '-3', 'std_m': '0.1', 'std_c_r': '0.2',

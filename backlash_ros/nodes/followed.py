@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
+from argparse import RawDescriptionHelpFormatter
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
@@ -21,6 +22,7 @@ from backlash_ros import topics
 from backlash_ros.nodes.runtime.executor import serve_polled
 from backlash_ros.nodes.runtime.messages import SILENT_S
 from backlash_ros.nodes.runtime.process import ProcessNode
+from backlash_ros.options import OptionParser
 from backlash_ros.topics import BACKLASH
 
 # By which a controller is known, or a joint of it.
@@ -181,6 +183,15 @@ class FollowedControllers:
         return not self._wanted or any(
             name == wanted or name.startswith(f'{wanted.rstrip("/")}/') for wanted in self._wanted
         )
+
+
+def viewer_options(name: str, description: str | None, epilog: str) -> OptionParser:
+    """The options of whoever shows controllers."""
+    parser = OptionParser(name, description=description, epilog=epilog,
+                          formatter_class=RawDescriptionHelpFormatter)
+    parser.add_argument('name', nargs='*', metavar='NAME',
+                        help='a controller or a namespace, as /pan (default: all there are)')
+    return parser
 
 
 def give_way() -> None:

@@ -1,1 +1,0 @@
-"""What `monitor` and `live` share: running controllers, and how they are shown."""
