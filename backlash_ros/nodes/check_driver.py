@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -14,8 +13,8 @@ import yaml
 from rclpy.utilities import remove_ros_args
 
 from backlash_ros.core.driver_check.drive import waves
-from backlash_ros.core.driver_check.evidence import Evidence
-from backlash_ros.core.driver_check.faults import WRONG, Judgement, all_fit, judge, table
+from backlash_ros.core.driver_check.heard import timing_of
+from backlash_ros.core.driver_check.verdict import WRONG, Judgement, all_fit, judge, table
 from backlash_ros.nodes.drive.motion_node import MotionNode, add_motion_options
 from backlash_ros.nodes.runtime.process import ros_arguments, run
 from backlash_ros.options import DONE, FAILED, OptionParser
@@ -31,8 +30,7 @@ class CheckDriverNode(MotionNode):
         super().__init__(CHECK_DRIVER, options, waves)
 
     def tell(self) -> None:
-        evidence = Evidence(self.graph.in_the_end(), self.heard, self.settings)
-        findings = judge(evidence)
+        findings = judge(self.graph.in_the_end(), self.heard, self.settings)
         if self.ended:
             findings.append(Judgement(
                 'drive', WRONG, f'{self.ended}: drive ended',
@@ -40,23 +38,24 @@ class CheckDriverNode(MotionNode):
             ))
         print(table(findings), flush=True)
         if self.options.save is not None:
-            self._save(self.options.save, evidence)
+            self._save(self.options.save)
         self.exit_code = DONE if all_fit(findings) else FAILED
 
-    def _save(self, path: Path, evidence: Evidence) -> None:
-        if evidence.v is None:
+    def _save(self, path: Path) -> None:
+        timing = timing_of(self.heard, self.settings.sample_period)
+        acted = timing.v_acted(self.heard.applied, True)
+        acted = timing.v_acted(self.heard.controls, False) if acted is None else acted
+        if acted is None:
             self.say(f'nothing to save in {path}: v and y were not both heard')
             return
+        v, y = timing.record(acted)
+        rows = np.column_stack([self.settings.sample_period * np.arange(len(v)), v, y])
         try:
-            with path.open('w', newline='', encoding='utf-8') as file:
-                writer = csv.writer(file)
-                writer.writerow(('t', 'v', 'y'))
-                t = self.settings.sample_period * np.arange(len(evidence.record[0]))
-                writer.writerows(zip(t, *evidence.record, strict=True))
+            np.savetxt(path, rows, '%.12g', ',', header='t,v,y', comments='')
         except OSError as error:
             self.say(f'{path}: cannot be written: {error.strerror}')
             return
-        print(f'saved {len(evidence.record[0])} samples of v and y in {path}')
+        print(f'saved {len(v)} samples of v and y in {path}')
 
 
 def parse_options(plain: Sequence[str]) -> argparse.Namespace:

@@ -7,9 +7,8 @@ from scipy.signal import cont2discrete
 
 from backlash_ros.core.assembly import build_plant
 from backlash_ros.core.driver_check.drive import Drive, Range, waves
-from backlash_ros.core.driver_check.evidence import Evidence
-from backlash_ros.core.driver_check.faults import FLOAT64, WRONG, Judgement, judge
 from backlash_ros.core.driver_check.heard import Graph, Heard, Message
+from backlash_ros.core.driver_check.verdict import FLOAT64, WRONG, Judgement, judge
 from backlash_ros.core.parameters import Parameters
 
 PERIOD_S = 0.04  # long enough that a busy machine does not disturb it
@@ -83,7 +82,7 @@ def heard_from_driver(
 
 
 def faults(heard: Heard, graph: Graph = GOOD_GRAPH, **changes: object) -> list[Judgement]:
-    findings = judge(Evidence(graph, heard, Parameters(parameters(**changes))))
+    findings = judge(graph, heard, Parameters(parameters(**changes)))
     return [finding for finding in findings if finding.mark == WRONG]
 
 

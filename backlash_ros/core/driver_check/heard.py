@@ -12,7 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from backlash_ros.core.control.limits import plausible
+from backlash_ros.core.loop.command_history import v_of_intervals
 from backlash_ros.core.loop.sample_counter import UNNUMBERED, SampleCounter
+
+Array = NDArray[np.float64]
 
 FEWEST_SAMPLES = 20  # for a judgement of the timing
 MOST_LATE = 0.5  # of a period: beyond 0.85 the controller takes it for a loss
@@ -66,23 +70,37 @@ class Timing(NamedTuple):
     outputs: list[Message]
     numbers: NDArray[np.int64]
     period_s: float
-    missing: int
-    repeated: int
-    early: int
-    lateness: float
-    fits: bool
+    missing: int = 0
+    repeated: int = 0
+    early: int = 0
+    lateness: float = 0.0
+    fits: bool = True
 
-    @property
-    def total(self) -> int:
-        """Samples, missing ones as well."""
-        return len(self.outputs) + self.missing
+    def v_acted(self, messages: Sequence[Message], reported: bool) -> Array | None:
+        """v over each sample interval (N,), nan before any; None where nothing tells it.
+
+        reported: whether the messages are those of applied_control.
+        """
+        usable = [message for message in messages if plausible(message.value)]
+        if not usable or not self.outputs:
+            return None
+        v = v_of_intervals(self.numbers, stamps_of(self.outputs), stamps_of(usable),
+                           np.array([message.value for message in usable]), reported)
+        return v if np.isfinite(v).any() else None
+
+    def record(self, v: Array) -> tuple[Array, Array]:
+        """v from sample k to k+1 and y at k, nan where lost, from the first known v on."""
+        y = np.full(len(v), np.nan)
+        y[self.numbers] = [m.value if plausible(m.value) else np.nan for m in self.outputs]
+        known = int(np.argmax(np.isfinite(v)))
+        return v[known:], y[known:]
 
 
 def timing_of(heard: Heard, sample_period_s: float) -> Timing:
     """Sort out what came twice or early, and count the samples; none where they are too few."""
     outputs, repeated = _without_doubles(heard.outputs, sample_period_s)
     if len(outputs) < FEWEST_SAMPLES:
-        return Timing([], np.zeros(0, dtype=np.int64), sample_period_s, 0, repeated, 0, 0.0, True)
+        return Timing([], np.zeros(0, dtype=np.int64), sample_period_s, repeated=repeated)
     rough = max(float(np.median(np.diff(stamps_of(outputs)))), 1.0)
     counter = SampleCounter(rough * 1e-9)
     index, missing, samples = [], 0, []
@@ -94,18 +112,15 @@ def timing_of(heard: Heard, sample_period_s: float) -> Timing:
             samples.append(message)
     times = (stamps_of(samples) - samples[0].stamp_ns) * 1e-9
     numbers = np.array(index, dtype=np.int64) - index[0]
-    slope, offset = np.polyfit(numbers, times, 1)
-    late = times - slope * numbers - offset
-    lateness = float(np.quantile(late, 0.99) - np.quantile(late, 0.01)) / float(slope)
+    slope = float(np.polyfit(numbers, times, 1)[0])
+    lateness = float(np.ptp(np.quantile(times - slope * numbers, [0.01, 0.99]))) / slope
     # A driver that fell silent for good loses samples as well.
     missing += max(int((heard.end_ns - samples[-1].stamp_ns) / rough) - 1, 0)
     # Amid bursts the samples cannot be counted for certain; most intervals tell the period still.
-    steady = lateness <= MOST_LATE
-    period = float(slope) if steady else rough * 1e-9
-    return Timing(
-        samples, numbers, period, missing, repeated, len(outputs) - len(samples), lateness,
-        abs(period / sample_period_s - 1.0) <= (0.01 if steady else 0.1),
-    )
+    period, most_off = (slope, 0.01) if lateness <= MOST_LATE else (rough * 1e-9, 0.1)
+    fits = abs(period / sample_period_s - 1.0) <= most_off
+    early = len(outputs) - len(samples)
+    return Timing(samples, numbers, period, missing, repeated, early, lateness, fits)
 
 
 def stamps_of(messages: Sequence[Message]) -> NDArray[np.int64]:

@@ -26,7 +26,8 @@ from backlash_ros.core.estimation.posterior import WindowFit
 from backlash_ros.core.estimation.settings import REVERSALS, STD_GAP, STD_SLOPE
 from backlash_ros.core.plant.state_model import StateModel
 from backlash_ros.core.plant.transfer_function import TransferFunction
-from backlash_ros.core.records.samples import check_record, frequencies_of, outliers
+from backlash_ros.core.records.samples import check_record, outliers
+from backlash_ros.core.simulation.metrics import turns
 
 Array = NDArray[np.float64]
 
@@ -39,8 +40,8 @@ class RecordFit:
     for another one; both without `delay` [samples]. doubts: why the backlash is not known from this
     record, a sentence each. fit: values and deviations, None where there is no fit, for a G of this
     sign. margins: log-likelihood by which each of the delays that were compared falls behind.
-    predicted: share of the motion of y that it predicts. reversals: of the play output.
-    frequencies: between which y moves [rad/sample].
+    predicted: share of the motion of y that it predicts. reversals: of the play output, by more
+    than the gap is uncertain.
     """
 
     nominal: TransferFunction
@@ -52,15 +53,15 @@ class RecordFit:
     margins: dict[int, float] = field(default_factory=dict)
     predicted: float = nan
     reversals: int = 0
-    frequencies: tuple[float, float] = (nan, nan)
 
     @property
     def estimates(self) -> dict[str, tuple[float, float]]:
         """Values and standard deviations of m (negative where G has the wrong sign), c_r, c_l."""
         if self.fit is None:
             return dict.fromkeys(('m', 'c_r', 'c_l'), (nan, nan))
-        m, c_r, c_l = zip(self.fit.crossings.tolist(), self.fit.crossings_std.tolist(), strict=True)
-        return {'m': (self.sign * m[0], m[1]), 'c_r': c_r, 'c_l': c_l}
+        values = self.fit.crossings * [self.sign, 1.0, 1.0]
+        return dict(zip(('m', 'c_r', 'c_l'), zip(
+            values.tolist(), self.fit.crossings_std.tolist(), strict=True), strict=True))
 
     @property
     def gap(self) -> float:
@@ -108,42 +109,45 @@ def fit_record(
     if not delays or min(delays) < 0:
         raise ValueError(f'delays={delays!r} must name at least one, none of them negative')
     nominal = model.transfer_function if isinstance(model, StateModel) else model
-    longest, swing = max(delays), float(np.ptp(v)) if len(v) else 0.0
+    longest = max(delays)
     # y(k+1) follows v(k - delay); all delays are compared over the same samples of y.
     after = y[longest + 1:]
     if np.count_nonzero(np.isfinite(after)) < 10 * (nominal.order + 2):
         text = f'too few samples: {len(after)} after the longest delay'
         return RecordFit(nominal, nominal, (text,))
-    if swing == 0.0:
+    if np.ptp(v) == 0.0:
         return RecordFit(nominal, nominal, ('v stood still',))
-    found = {delay: each for delay in delays if (each := _with_delay(
-        v[longest - delay:len(v) - 1 - delay], after, nominal, uncertainty, noise_std, bounds,
-    )) is not None}
+    found: dict[int, RecordFit] = {}
+    evidence = dict.fromkeys(delays, -inf)
+    for delay in delays:
+        acted = v[longest - delay:len(v) - 1 - delay]
+        each = _with_delay(acted, after, nominal, uncertainty, noise_std, bounds)
+        if each.fit is not None:
+            found[delay], evidence[delay] = each, each.fit.evidence
     if not found:
         return RecordFit(
-            nominal, nominal, (f'y shows nothing of v, which swung by {swing:.4g}',))
-    evidence = {delay: each.fit.evidence for delay, each in found.items() if each.fit}
-    delay = max(evidence, key=lambda each: evidence[each])
+            nominal, nominal, (f'y shows nothing of v, which swung by {np.ptp(v):.4g}',))
+    delay = max(found, key=lambda each: evidence[each])
     return replace(found[delay], delay=delay, margins={
-        each: evidence[delay] - evidence.get(each, -inf) for each in delays})
+        each: evidence[delay] - value for each, value in evidence.items()})
 
 
 def _with_delay(
     v: Array, y: Array, nominal: TransferFunction, uncertainty: float, noise_std: float,
     bounds: Bounds | None,
-) -> RecordFit | None:
-    """Fit v (N,) and y (N,) after it; None where a constant u explains y as well."""
-    noise_std, wide = max(noise_std, SMALLEST_NOISE), (-1e300, 1e300)
+) -> RecordFit:
+    """Fit v (N,) and y (N,) after it; without a fit where a constant u explains y as well."""
+    noise_std, wide, swing = max(noise_std, SMALLEST_NOISE), (-1e300, 1e300), float(np.ptp(v))
     record = Window(0, v, y, np.full(len(v), nan))
     for sign in (1.0, -1.0):
         family = PlantFamily(_times(nominal, sign), uncertainty)
-        setup = Setup(family, noise_std, Bounds((1e-300, 1e300), wide, wide), inf,
-                      float(np.ptp(v)), 0.0, np.zeros(3))
+        setup = Setup(family, noise_std, Bounds((1e-300, 1e300), wide, wide), inf, swing, 0.0,
+                      np.zeros(3))
         fit = afresh(setup, record)
         if fit is None or fit.m > 0.0:
             break
     if fit is None or not fit.valid:
-        return None
+        return RecordFit(nominal, nominal)
     problem = problem_of(setup, record)
     wild = outliers(problem.residual(fit), noise_std)
     if wild.any():
@@ -152,35 +156,23 @@ def _with_delay(
     learned = nominal
     if family.count and fit.behind(np.zeros(family.count)) > 1.0:
         learned = _times(family.model_at(fit.xi), sign)
+    p = np.append(fit.p0, problem.input(fit)[0])
     result = RecordFit(
         nominal, learned, fit=fit, sign=sign,
         predicted=1.0 - fit.rms / max(float(np.nanstd(record.y)), 1e-300),
-        reversals=_reversals(problem.input(fit)[0], fit), frequencies=frequencies_of(record.y),
-    )
-    return replace(result, doubts=tuple(_doubts(result, fit, bounds, float(np.ptp(v)))))
+        reversals=turns(p, 5.0 * fit.gap_std))
+    return replace(result, doubts=_doubts(result, fit, bounds, swing))
 
 
-def _reversals(p: Array, fit: WindowFit) -> int:
-    """How often the play output p (N,) turned by more than the gap is uncertain.
-
-    A side that is engaged without moving the play output, as one at the very start may be, tells
-    nothing of its crossing.
-    """
-    moves = np.diff(p, prepend=fit.p0)
-    moves = moves[moves != 0.0]
-    turns = np.flatnonzero(np.diff(np.sign(moves))) + 1
-    ways = np.add.reduceat(moves, np.append(0, turns)) if len(moves) else moves
-    ways = ways[np.abs(ways) > 5.0 * fit.gap_std]
-    return int(np.count_nonzero(np.diff(np.sign(ways))))
-
-
-def _doubts(found: RecordFit, fit: WindowFit, bounds: Bounds | None, swing: float) -> list[str]:
+def _doubts(
+    found: RecordFit, fit: WindowFit, bounds: Bounds | None, swing: float,
+) -> tuple[str, ...]:
     """What keeps it from being precise enough for the loop."""
     wanted = REVERSALS if len(fit.xi) else 1
     rest = f': {fit.unexplained:.0%} of its motion follows from no backlash and no G' \
         if fit.correlation > 0.0 and isfinite(fit.unexplained) else ''
     std_m, beyond = float(fit.crossings_std[0]), outside_bounds(bounds, fit) if bounds else []
-    return [text for true, text in (
+    return tuple(text for true, text in (
         (found.reversals < wanted,
          f'v crossed the gap {found.reversals} times; {wanted} at least are needed to tell both '
          'crossings'),
@@ -190,7 +182,7 @@ def _doubts(found: RecordFit, fit: WindowFit, bounds: Bounds | None, swing: floa
          f'the gap, about {fit.gap:.4g}, is known to {fit.gap_std:.2g} only{rest}'),
         *((far, f'{name} would be {value:.4g}, outside of its bounds')
           for (name, (value, _)), far in zip(found.estimates.items(), beyond, strict=False)),
-    ) if true]
+    ) if true)
 
 
 def _times(model: TransferFunction, sign: float) -> TransferFunction:

@@ -21,9 +21,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from backlash_ros.core.driver_check.drive import Drive, Range, drive_range, waves
-from backlash_ros.core.driver_check.evidence import Evidence
-from backlash_ros.core.driver_check.faults import FLOAT64, UNKNOWN, all_fit, judge, table
 from backlash_ros.core.driver_check.heard import Heard, Message
+from backlash_ros.core.driver_check.verdict import FLOAT64, UNKNOWN, all_fit, judge, table
 from backlash_ros.core.identification.motion import strokes
 from backlash_ros.core.parameters import Parameters
 from backlash_ros.core.parameters.errors import ParameterError
@@ -32,7 +31,7 @@ from backlash_ros.nodes.drive.driver_graph import similar_topics
 
 
 def test_a_good_driver_fits_and_its_backlash_is_told() -> None:
-    findings = judge(Evidence(GOOD_GRAPH, heard_from_driver(), Parameters(parameters())))
+    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters()))
     assert all_fit(findings), table(findings)
     told = findings[-1].found
     values = [float(part.split(' = ')[1].split(' ±')[0]) for part in told.split(', ')]
@@ -60,8 +59,8 @@ def test_best_effort_is_fine_where_the_controller_accepts_it() -> None:
 
 
 def test_nothing_is_judged_from_the_mixture_of_two_publishers() -> None:
-    findings = judge(Evidence(
-        replace(GOOD_GRAPH, publishers=2), heard_from_driver(), Parameters(parameters())))
+    findings = judge(
+        replace(GOOD_GRAPH, publishers=2), heard_from_driver(), Parameters(parameters()))
     assert {f.mark for f in findings if f.subject in ('rate', 'G(z)', 'values')} == {UNKNOWN}
     assert not all_fit(findings)
 
@@ -202,8 +201,8 @@ def test_applied_control_that_leaves_samples_out_is_told(use: str) -> None:
 @pytest.mark.parametrize('ratio', [0.8, 1.2])
 def test_a_model_that_is_off_by_a_fifth_fits_and_the_finding_says_how_far(ratio: float) -> None:
     numerator, denominator = model(ratio * PERIOD_S)  # the same as another natural frequency
-    findings = judge(Evidence(GOOD_GRAPH, heard_from_driver(), Parameters(parameters(
-        plant__numerator=numerator, plant__denominator=denominator))))
+    findings = judge(GOOD_GRAPH, heard_from_driver(), Parameters(parameters(
+        plant__numerator=numerator, plant__denominator=denominator)))
     assert all_fit(findings), table(findings)
     found = next(f.found for f in findings if f.subject == 'G(z)')
     told, true = TransferFunction(numerator, denominator), TransferFunction(*model())
